@@ -1,0 +1,1 @@
+"""Every default value of gsx, as Hydra configuration files."""

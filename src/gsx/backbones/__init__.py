@@ -1,0 +1,1 @@
+"""Representations that hand explicit Gaussians to the rasterizer."""

@@ -1,0 +1,310 @@
+"""The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
+
+import argparse
+import logging
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsx import __version__
+from gsx.core.errors import ConfigError, GsxError, InputError, nearest
+
+if TYPE_CHECKING:
+    from gsx.core.config import Settings
+    from gsx.core.plugins import Plugins
+    from gsx.core.run import Run
+
+logger = logging.getLogger("gsx.cli")
+
+HELP = """\
+gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.
+
+  gsx                                            train the built-in scene (start here; a few minutes on a laptop)
+  gsx scene=photos scene.path=FOLDER             train from nothing but photos
+  gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
+
+  gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
+  gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
+  gsx eval RUN [K=V ...]    evaluate a run again, for example with 'eval.zoom=[1,2,4]'
+  gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif|.webp|.mp4
+  gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
+  gsx report DIR            report.html of a run, or of all runs below a folder
+  gsx scenes PATH           what is this folder: format, cameras, images, points, problems
+  gsx plugins               what is installed, from where, and what failed to load
+
+  gsx --cfg job             print the configuration instead of training
+  gsx -m K=V1,V2 ...        a run for every combination
+  gsx --version, gsx --help
+
+Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
+"""
+HYDRA_FLAGS = (
+    "-m",
+    "--multirun",
+    "-sc",
+    "--shell-completion",
+    "--info",
+    "--hydra-help",
+    "--cfg",
+    "-c",
+    "-p",
+    "--package",
+)
+"""Flags that are handed to Hydra as they are."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return dispatch(words)
+    except GsxError as error:
+        return complain(str(error))
+    except OSError as error:
+        return complain(os_sentence(error))
+    except KeyboardInterrupt:
+        sys.stderr.write("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n")
+        return 130
+
+
+def complain(sentence: str) -> int:
+    """Show an error as one sentence."""
+    sys.stderr.write(f"gsx: {sentence}\n")
+    return 2
+
+
+def os_sentence(error: OSError) -> str:
+    """A failure of the file system with its remedy."""
+    where = f" ({error.filename})" if error.filename else ""
+    return f"{error.strerror or error}{where}: free some space or choose a writable place, for example output=FOLDER"
+
+
+def dispatch(words: list[str]) -> int:
+    """Find the verb and run it."""
+    if words and words[0] in ("--help", "-h", "help"):
+        sys.stdout.write(HELP)
+        return 0
+    if words == ["--version"]:
+        sys.stdout.write(f"gsx {__version__}\n")
+        return 0
+    if not words or words[0].startswith(("-", "+", "~")) or "=" in words[0]:
+        return verb_train(words)
+    if words[0] not in VERBS:
+        raise ConfigError(f"'{words[0]}' is no verb of gsx.{nearest(words[0], VERBS)} See gsx --help")
+    set_up_logging()
+    return VERBS[words[0]](words[1:])
+
+
+def set_up_logging() -> None:
+    """Plain messages of gsx on standard error, warnings marked."""
+
+    class Plain(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            mark = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
+            return mark + record.getMessage()
+
+    root = logging.getLogger("gsx")
+    root.setLevel(logging.INFO)
+    root.propagate = False
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(Plain())
+    root.handlers = [handler]
+
+
+def log_to(folder: Path) -> None:
+    """Also write messages to the run's log.txt."""
+    handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logging.getLogger("gsx").addHandler(handler)
+
+
+def plugins() -> "Plugins":
+    """Built-in and installed plugins."""
+    from gsx import builtin
+    from gsx.core.plugins import load_plugins
+
+    return load_plugins([("gsx", builtin)])
+
+
+@contextmanager
+def interruptible(run: "Run") -> Iterator[None]:
+    """The first Ctrl-C ends training after the current step; a second one ends the program."""
+
+    def stop(number: int, frame: Any) -> None:
+        run.stopping = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# -- verbs ---------------------------------------------------------------------------------------------------------
+
+
+def verb_train(words: list[str]) -> int:
+    """gsx OVERRIDES..."""
+    set_up_logging()
+    if words and words[0].startswith("-"):
+        if words[0] not in HYDRA_FLAGS:
+            raise ConfigError(f"'{words[0]}' is no option of gsx.{nearest(words[0], HYDRA_FLAGS)} See gsx --help")
+        return hand_to_hydra(words)
+    from gsx.core.config import compose
+
+    return train(compose(words, loaded := plugins()), loaded)
+
+
+def hand_to_hydra(words: list[str]) -> int:
+    """Multirun, completion and information flags, by Hydra's own command line."""
+    from gsx.core.config import check_overrides, hydra_main
+
+    loaded = plugins()
+    check_overrides([word for word in words if "=" in word and not word.startswith("-")], loaded)
+    return hydra_main(words, loaded, lambda settings: train(settings, loaded))
+
+
+def train(settings: "Settings", loaded: "Plugins") -> int:
+    """Train one composed experiment in a new run folder."""
+    from gsx.core.session import start
+
+    run = start(settings, loaded)
+    log_to(run.folder)
+    return carry_out(run, settings, loaded)
+
+
+def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
+    """Train to the end or to Ctrl-C, and say where things are."""
+    from gsx.core.session import execute
+
+    with interruptible(run):
+        execute(run, settings, loaded)
+    if not run.complete:
+        sys.stderr.write(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n")
+        return 130
+    sys.stdout.write(f"{run.folder / 'report.html'}\n")
+    return 0
+
+
+def run_words(verb: str, words: list[str]) -> tuple[Path, list[str]]:
+    """The run folder and the overrides after it."""
+    if not words or "=" in words[0]:
+        raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
+    return Path(words[0]), words[1:]
+
+
+def verb_resume(words: list[str]) -> int:
+    """gsx resume RUN [KEY=VALUE ...]"""
+    from gsx.core.config import write_config
+    from gsx.core.session import open_run
+
+    folder, overrides = run_words("resume", words)
+    loaded = plugins()
+    run, settings = open_run(folder, loaded, overrides)
+    if run.complete:
+        raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
+    write_config(folder / "config.yaml", settings.resolved)
+    log_to(folder)
+    logger.info("resuming %s at step %d", folder, run.step)
+    return carry_out(run, settings, loaded)
+
+
+def verb_eval(words: list[str]) -> int:
+    """gsx eval RUN [KEY=VALUE ...]"""
+    from gsx.core.report import write_report
+    from gsx.core.session import evaluate, open_run
+
+    folder, overrides = run_words("eval", words)
+    loaded = plugins()
+    run, settings = open_run(folder, loaded, overrides)
+    loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
+    sys.stdout.write(f"{write_report(folder)}\n")
+    return 0
+
+
+def verb_render(words: list[str]) -> int:
+    """gsx render RUN [--orbit FILE] ..."""
+    parser = argparse.ArgumentParser(prog="gsx render", description="Render test views, or an orbit as an animation.")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("--orbit", type=Path, metavar="FILE", help="animate a closed orbit: .gif, .webp or .mp4")
+    parser.add_argument("--frames", type=int, default=60, help="frames of the orbit (60)")
+    parser.add_argument("--fps", type=float, default=20, help="frames per second (20)")
+    parser.add_argument("--zoom", type=float, default=1, help="times the training resolution (1)")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for test views (RUN/renders/test)")
+    given = parser.parse_args(words)
+    from gsx.core.session import open_run, render_orbit, render_test_views
+
+    run, settings = open_run(given.run, plugins())
+    if given.orbit:
+        render_orbit(run, settings, given.orbit, given.frames, given.fps, given.zoom)
+        sys.stdout.write(f"{given.orbit}\n")
+    else:
+        folder = given.to or given.run / "renders" / "test"
+        render_test_views(run, settings, folder, given.zoom)
+        sys.stdout.write(f"{folder}\n")
+    return 0
+
+
+def verb_export(words: list[str]) -> int:
+    """gsx export RUN [FILE.ply]"""
+    from gsx.core.session import export, open_run, reimport_psnr
+
+    folder, rest = run_words("export", words)
+    run, settings = open_run(folder, plugins())
+    path = Path(rest[0]) if rest else folder / "point_cloud.ply"
+    export(run, path)
+    logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path))
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def verb_report(words: list[str]) -> int:
+    """gsx report DIR"""
+    from gsx.core.report import write_overview, write_report
+
+    folder, _ = run_words("report", words)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder: give a run, or a folder with runs below it")
+    write = write_report if (folder / "config.yaml").is_file() else write_overview
+    sys.stdout.write(f"{write(folder)}\n")
+    return 0
+
+
+def verb_scenes(words: list[str]) -> int:
+    """gsx scenes PATH"""
+    if len(words) != 1:
+        raise InputError("gsx scenes needs one folder: gsx scenes PATH")
+    from gsx.core.scenes.inspect import describe
+
+    sys.stdout.write("\n".join(describe(Path(words[0]))) + "\n")
+    return 0
+
+
+def verb_plugins(words: list[str]) -> int:
+    """gsx plugins"""
+    from gsx.core.plugins import KINDS
+
+    loaded = plugins()
+    for kind in KINDS:
+        parts = [f"{name} ({loaded.registry.find(kind, name).provider})" for name in loaded.registry.names(kind)]
+        sys.stdout.write(f"{kind + ':':13} {', '.join(parts) or '-'}\n")
+    for name, plugin_version in loaded.versions.items():
+        sys.stdout.write(f"plugin {name} {plugin_version}\n")
+    for failure in loaded.failures:
+        sys.stdout.write(f"failed to load: {failure.plugin}: {failure.reason}\n")
+    return 0
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {
+    "resume": verb_resume,
+    "eval": verb_eval,
+    "render": verb_render,
+    "export": verb_export,
+    "report": verb_report,
+    "scenes": verb_scenes,
+    "plugins": verb_plugins,
+}

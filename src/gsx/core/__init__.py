@@ -1,0 +1,1 @@
+"""The core: scenes, rasterizer, training, evaluation. It knows no plugin by name."""

@@ -1,0 +1,107 @@
+"""What the trainer asks of a backbone, and what a backbone is given to start from."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.rasterizer import Rendering
+from gsx.core.scene import Scene
+from gsx.core.schedule import Schedule
+from gsx.core.shapes import Float
+from gsx.core.splats import Splats
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Beginning:
+    """What a backbone is built from."""
+
+    scene: Scene
+    iterations: int
+    device: torch.device
+    generator: torch.Generator
+    """The run's only source of randomness (a CPU generator)."""
+
+    def schedule(self, published_iterations: int) -> Schedule:
+        """Maps steps of a published run of that length onto this run."""
+        return Schedule(
+            iterations=self.iterations, published_iterations=published_iterations, views=len(self.scene.train)
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gaussians:
+    """Explicit Gaussians in the raw parameters of a standard splat file."""
+
+    means: Float[Tensor, "N 3"]
+    log_scales: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    opacity_logits: Float[Tensor, "N"]
+    sh_constant: Float[Tensor, "N 3"]
+    sh_rest: Float[Tensor, "N B 3"]
+
+
+class Backbone(Protocol):
+    """A scene representation that trains itself and hands out splats.
+
+    A step calls, in this order: `begin`, `splats`, `regulariser`, (backward), `observe`, `adapt`, `update`.
+    """
+
+    def begin(self, step: int) -> None:
+        """Set learning rates and whatever else depends on the step (1-based)."""
+        ...
+
+    def splats(self, camera: Camera) -> Splats:
+        """Explicit Gaussians for this camera, differentiable."""
+        ...
+
+    def regulariser(self) -> Float[Tensor, ""] | None:
+        """A term to add to the loss for the splats handed out last, or None."""
+        ...
+
+    def observe(self, rendering: Rendering, step: int) -> None:
+        """Gather statistics of a training render after the backward pass."""
+        ...
+
+    def adapt(self, step: int) -> dict[str, int]:
+        """Change the number of primitives; returns what was done, for the log, empty when nothing."""
+        ...
+
+    def update(self) -> None:
+        """Let the optimiser move the parameters, and clear their gradients."""
+        ...
+
+    def gradients(self) -> Iterable[tuple[str, Tensor]]:
+        """Name and gradient of every parameter that has one."""
+        ...
+
+    def discard(self) -> None:
+        """Clear the gradients without moving anything."""
+        ...
+
+    def size(self) -> tuple[int, int]:
+        """(primitives, bytes of the parameters needed to render)."""
+        ...
+
+    def explicit(self) -> Gaussians:
+        """Explicit Gaussians for export.
+
+        Raises:
+            GsxError: there is no camera-independent explicit form.
+        """
+        ...
+
+    def plan(self) -> dict[str, Any]:
+        """The rescaled schedule in absolute steps, for the log and the report."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything needed to go on exactly: parameters, optimiser state, statistics."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take back what `tensors` gave, whatever its number of primitives."""
+        ...

@@ -1,0 +1,158 @@
+"""Pinhole cameras and their exact algebra.
+
+Conventions (docs/conventions.md): x right, y down, z forward (OpenCV); pixel centres at +0.5, so the raster covers
+[0, width] x [0, height]; `cx`, `cy` are honoured everywhere and may lie outside the raster (crops).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsx.core.shapes import Float
+
+NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """The raster a crop was cut from, in px, relative to which tiles are laid and slopes are clamped.
+
+    It makes the render of a crop the crop of the render, bit for bit.
+    """
+
+    left: int
+    """Column of the frame at which the raster begins; may be negative."""
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """A pinhole camera: x_camera = rotation @ x_world + translation, pixel = (fx x/z + cx, fy y/z + cy)."""
+
+    rotation: Float[Tensor, "3 3"]
+    """Rotation camera_from_world."""
+    translation: Float[Tensor, "3"]
+    """Translation camera_from_world, in scene units."""
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float = NEAR
+    """Splats at this camera depth or nearer are not drawn, in scene units."""
+    cut_from: Frame | None = None
+    """The frame this raster was cropped from; None: it is its own."""
+
+    @property
+    def frame(self) -> Frame:
+        """The frame the raster lies in."""
+        return self.cut_from or Frame(left=0, top=0, width=self.width, height=self.height)
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        """Camera centre in world coordinates, -R^T t."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width, self.height
+
+    def resize(self, width: int, height: int) -> "Camera":
+        """The same field of view on another raster; intrinsics scale per axis."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            width=width,
+            height=height,
+            cut_from=self.cut_from and resized(self.cut_from, sx, sy),
+        )
+
+    def zoom(self, factor: float) -> "Camera":
+        """`factor` times the focal length and the raster: the same view sampled more finely."""
+        return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """The window with its upper left corner at pixel (left, top); it may reach past the raster."""
+        frame = self.frame
+        return replace(
+            self,
+            cx=self.cx - left,
+            cy=self.cy - top,
+            width=width,
+            height=height,
+            cut_from=replace(frame, left=frame.left + left, top=frame.top + top),
+        )
+
+    def narrow(self, fraction: float) -> "Camera":
+        """The centre `fraction` of the raster at unchanged focal length."""
+        width, height = max(1, round(self.width * fraction)), max(1, round(self.height * fraction))
+        return self.crop((self.width - width) // 2, (self.height - height) // 2, width, height)
+
+    def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
+        """Pixel positions and depths of world points; positions mean nothing where depth <= 0."""
+        camera_points = points @ self.rotation.T.to(points) + self.translation.to(points)
+        depth = camera_points[:, 2]
+        focal, centre = points.new_tensor([self.fx, self.fy]), points.new_tensor([self.cx, self.cy])
+        return camera_points[:, :2] / depth[:, None] * focal + centre, depth
+
+
+def resized(frame: Frame, sx: float, sy: float) -> Frame:
+    """The frame on a raster scaled by sx, sy, to whole pixels."""
+    return Frame(
+        left=round(frame.left * sx),
+        top=round(frame.top * sy),
+        width=round(frame.width * sx),
+        height=round(frame.height * sy),
+    )
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    *,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    fov_x: float,
+    width: int,
+    height: int,
+    near: float = NEAR,
+) -> Camera:
+    """A camera at `eye` looking at `target`, `up` pointing up in the picture, horizontal field of view in radians.
+
+    Raises:
+        ValueError: `eye` equals `target`, or `up` is parallel to the viewing direction.
+    """
+    position, goal = torch.tensor(eye, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)
+    forward = goal - position
+    right = torch.linalg.cross(forward, torch.tensor(up, dtype=torch.float64))
+    if not (forward.norm() > 0 and right.norm() > 1e-9 * forward.norm()):
+        raise ValueError(f"look_at needs eye, target and up in general position, got {eye}, {target}, {up}")
+    forward, right = forward / forward.norm(), right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    focal = width / (2 * math.tan(fov_x / 2))
+    return Camera(
+        rotation=rotation,
+        translation=-rotation @ position,
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        width=width,
+        height=height,
+        near=near,
+    )
+
+
+def centred(camera: Camera) -> Camera:
+    """The camera with its principal point at the middle of the raster, as 3D-GS assumes (spec 2.1)."""
+    return replace(camera, cx=camera.width / 2, cy=camera.height / 2)

@@ -1,0 +1,116 @@
+"""Checkpoints: safetensors and a JSON sidecar with its sha256, written atomically, no pickle.
+
+A checkpoint holds everything a resumed run needs to continue bit for bit. The sidecar is written last: a checkpoint
+without one does not exist. A damaged checkpoint is named, and the one before it is used.
+"""
+
+import hashlib
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.errors import CheckpointError
+from gsx.core.run import Run, read_json
+
+logger = logging.getLogger(__name__)
+
+SCHEMA = 1
+GENERATOR = "run.generator"
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file so that it is either wholly there or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save(run: Run) -> Path:
+    """Write the checkpoint of the current step and drop all but the newest `training.checkpoints_kept`."""
+    from safetensors.torch import save as to_bytes
+
+    folder = run.folder / "checkpoints"
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in run.backbone.tensors().items()}
+    tensors[GENERATOR] = run.generator.get_state()
+    data = to_bytes(tensors)
+    path = folder / f"step_{run.step:07d}.safetensors"
+    replace_file(path, data)
+    sidecar = {
+        "schema": SCHEMA,
+        "step": run.step,
+        "seconds": run.seconds,
+        "sampler": run.sampler.order,
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    replace_file(path.with_suffix(".json"), json.dumps(sidecar).encode())
+    for old in sidecars(folder)[: -run.training.checkpoints_kept]:
+        old.unlink()
+        old.with_suffix(".safetensors").unlink(missing_ok=True)
+    return path
+
+
+def sidecars(folder: Path) -> list[Path]:
+    """Sidecars of a checkpoint folder, oldest first."""
+    return sorted(folder.glob("step_*.json"))
+
+
+def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Sidecar and tensors of one checkpoint.
+
+    Raises:
+        CheckpointError: it is missing, truncated, altered, or of another schema.
+    """
+    from safetensors.torch import load as from_bytes
+
+    path = sidecar.with_suffix(".safetensors")
+    try:
+        meta, data = read_json(sidecar), path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+    if meta.get("schema") != SCHEMA:
+        raise CheckpointError(
+            f"checkpoint {path} has schema {meta.get('schema')}, this gsx reads schema {SCHEMA}: "
+            "use the version of gsx named in the run's environment.json"
+        )
+    if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
+        raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
+    return meta, from_bytes(data)
+
+
+def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The newest undamaged checkpoint of a run folder; damaged ones are named in the log.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    problems = []
+    for sidecar in reversed(sidecars(folder / "checkpoints")):
+        try:
+            return read(sidecar)
+        except CheckpointError as error:
+            logger.warning("%s", error)
+            problems.append(str(error))
+    if problems:
+        raise CheckpointError(f"no checkpoint in {folder / 'checkpoints'} is usable: {problems[0]}")
+    raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
+
+
+def restore(run: Run) -> None:
+    """Bring a freshly built run to the state of its newest checkpoint."""
+    meta, tensors = newest(run.folder)
+    run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
+    run.backbone.restore(tensors)
+    run.sampler.order = list(meta["sampler"])
+    run.step, run.seconds = int(meta["step"]), float(meta["seconds"])

@@ -1,0 +1,293 @@
+"""From overrides to typed options: Hydra composes, dataclasses check, mistakes get the nearest match.
+
+Everything that touches hydra or omegaconf is in this module.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsx.core.errors import ConfigError, nearest
+from gsx.core.evaluate import EvalOptions
+from gsx.core.plugins import Component, Plugins
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.run import TrainingOptions
+
+MODULE = "gsx.conf"
+COMPONENT_KINDS = ("scene", "backbone")
+"""Groups whose node names a registered component."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneralOptions:
+    """Top-level values; conf/config.yaml gives them."""
+
+    iterations: int
+    seed: int
+    device: str
+    output: str
+    folder: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """A component and its typed options."""
+
+    component: Component
+    options: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """A composed and checked experiment."""
+
+    general: GeneralOptions
+    training: TrainingOptions
+    evaluation: EvalOptions
+    raster: RasterSettings
+    scene: Chosen
+    backbone: Chosen
+    resolved: dict[str, Any]
+    """The same as plain values, for config.yaml."""
+
+
+@contextmanager
+def hydra_session(plugins: Plugins) -> Iterator[None]:
+    """Hydra initialised on the packaged configuration and the plugins' search paths, and cleared afterwards."""
+    from hydra import initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+
+    register_search_paths(plugins)
+    GlobalHydra.instance().clear()
+    with initialize_config_module(MODULE, version_base="1.3"):
+        yield
+
+
+def register_search_paths(plugins: Plugins) -> None:
+    """Let Hydra search the configuration packages of plugins."""
+    from hydra.core.config_search_path import ConfigSearchPath
+    from hydra.core.plugins import Plugins as HydraPlugins
+    from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+    paths = plugins.config_paths()
+
+    class PluginPaths(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+            for path in paths:
+                search_path.append(provider="gsx", path=path)
+
+    if paths:
+        HydraPlugins.instance().register(PluginPaths)
+
+
+def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
+    """Compose and check an experiment.
+
+    Raises:
+        ConfigError: a group, option, key or value is wrong; the nearest right one is named.
+    """
+    with hydra_session(plugins):
+        config = compose_raw(overrides)
+        if config.scene.get("path"):  # a run folder must open from anywhere
+            config.scene.path = str(Path(config.scene.path).expanduser().resolve())
+        return settings_from(config, plugins)
+
+
+def compose_raw(overrides: Sequence[str]) -> DictConfig:
+    """Hydra's composition inside a `hydra_session`, with its errors turned into ours."""
+    from hydra import compose as hydra_compose
+    from hydra.errors import HydraException
+
+    check_groups(overrides)
+    try:
+        return hydra_compose("config", overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error, overrides)) from error
+
+
+def check_groups(overrides: Sequence[str]) -> None:
+    """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    loader = GlobalHydra.instance().config_loader()
+    groups = [group for group in loader.list_groups("") if not group.startswith("hydra")]
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError(f"override cannot be read: {first_line(error)} (quote it for the shell)") from error
+    for override in parsed:
+        if override.key_or_group not in groups or override.is_sweep_override():
+            continue
+        options = loader.get_group_options(override.key_or_group)
+        value = override.value()
+        for name in value if isinstance(value, list) else [value]:
+            if str(name) not in options:
+                raise ConfigError(
+                    f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
+                    f"choose from {', '.join(options)}.{nearest(str(name), options)}"
+                )
+
+
+def explain(error: Exception, overrides: Sequence[str]) -> str:
+    """One sentence for an error of composition, with the nearest key where a key is unknown."""
+    found = re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", str(error))
+    if not found:
+        return f"the configuration cannot be composed: {first_line(error)}"
+    key = (found.group(1) or found.group(2)).lstrip("+~")
+    known = known_keys(overrides)
+    return f"'{key}' is no configuration key.{nearest(key, known) or ' `gsx --cfg job` lists all keys.'}"
+
+
+def known_keys(overrides: Sequence[str]) -> list[str]:
+    """Dotted keys of the composition made from the group choices alone."""
+    from hydra import compose as hydra_compose
+
+    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],]+$", o) and is_group(o.split("=")[0])]
+    return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
+
+
+def is_group(key: str) -> bool:
+    """Whether a key names a configuration group."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    return key in GlobalHydra.instance().config_loader().list_groups("")
+
+
+def dotted(node: Any, prefix: str = "") -> Iterator[str]:
+    """Dotted paths of all keys, inner nodes included."""
+    for key, value in node.items() if isinstance(node, dict) else ():
+        yield f"{prefix}{key}"
+        yield from dotted(value, f"{prefix}{key}.")
+
+
+def first_line(error: Exception) -> str:
+    """First line of an error's message."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Settings:
+    """Check a composed configuration, or one read back from a run folder, against the schemas.
+
+    Raises:
+        ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
+    """
+    raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)  # type: ignore[call-overload]
+    assert isinstance(raw, dict)
+    values = dict(raw)
+    parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
+    evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
+    return Settings(
+        general=typed(GeneralOptions, values, ""),
+        training=typed(TrainingOptions, parts["training"], "training"),
+        evaluation=typed(EvalOptions, evaluation, "eval"),
+        raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
+        scene=chosen("scene", parts["scene"], plugins),
+        backbone=chosen("backbone", parts["backbone"], plugins),
+        resolved=raw,  # type: ignore[arg-type]
+    )
+
+
+def chosen(kind: str, node: Any, plugins: Plugins) -> Chosen:
+    """The component a node names, and its options."""
+    component = plugins.registry.find(kind, str((node or {}).get("name", "")))
+    return Chosen(component=component, options=typed(component.options, node, kind))
+
+
+def typed(schema: type, values: Any, path: str) -> Any:
+    """An instance of a dataclass from plain values; see `settings_from` for errors."""
+    try:
+        merged = OmegaConf.merge(writable(OmegaConf.structured(schema)), OmegaConf.create(values or {}))
+        return OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise ConfigError(complaint(error, schema, path)) from error
+    except ValueError as error:  # a dataclass refused the combination
+        raise ConfigError(str(error)) from error
+
+
+def writable(node: DictConfig) -> DictConfig:
+    """Frozen dataclasses make read-only nodes, which OmegaConf cannot merge into."""
+    OmegaConf.set_readonly(node, False)
+    for key in node:
+        child = node._get_node(key)
+        if isinstance(child, DictConfig):
+            writable(child)
+    return node
+
+
+def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
+    """What is wrong at which key, in one sentence."""
+    inner = str(error.full_key or "")
+    key = ".".join(part for part in (path, inner) if part)
+    if type(error).__name__ == "ConfigKeyError":
+        options = [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)]
+        return f"'{key}' is no configuration key.{nearest(key, options)}"
+    return f"{key}: {first_line(error)}"
+
+
+def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
+    """Dotted field names of a dataclass and of those inside it."""
+    for field in dataclasses.fields(schema):
+        yield f"{prefix}{field.name}"
+        if dataclasses.is_dataclass(field.type):
+            yield from schema_keys(field.type, f"{prefix}{field.name}.")  # type: ignore[arg-type]
+
+
+def write_config(path: Path, resolved: dict[str, Any]) -> None:
+    """Save a resolved configuration as YAML."""
+    from gsx.core.checkpoint import replace_file
+
+    replace_file(path, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
+
+
+def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
+    """Settings of an existing run, with `key=value` overrides of existing keys.
+
+    Raises:
+        ConfigError: the file is unreadable, or an override names no key of it.
+    """
+    try:
+        config = OmegaConf.load(path)
+    except Exception as error:
+        raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
+    known = list(dotted(OmegaConf.to_container(config)))
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or key not in known:
+            raise ConfigError(f"'{key}' is no key of {path}.{nearest(key, known)}")
+        OmegaConf.update(config, key, OmegaConf.create(f"value: {value}")["value"])
+    return settings_from(config, plugins)  # type: ignore[arg-type]
+
+
+def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:
+    """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    with hydra_session(plugins):
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        compose_raw([o.input_line for o in parsed if o.input_line and not o.is_sweep_override()])
+
+
+def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> int:
+    """Hydra's own command line on our configuration; `task` is called for every composed experiment."""
+    import sys
+
+    import hydra
+
+    register_search_paths(plugins)
+
+    @hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")
+    def entry(config: DictConfig) -> int:
+        return task(settings_from(config, plugins))
+
+    sys.argv = ["gsx", *arguments]
+    entry()
+    return 0

@@ -1,0 +1,30 @@
+"""Errors a user can act on: one sentence that names value, place and remedy. The command line exits with 2 on them."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class GsxError(Exception):
+    """Base of every error that is the user's to mend; its message is shown without a traceback."""
+
+
+class ConfigError(GsxError):
+    """A key, value or group of the configuration is wrong."""
+
+
+class InputError(GsxError):
+    """A file or folder given to gsx cannot be used."""
+
+
+class CheckpointError(GsxError):
+    """A checkpoint is missing, truncated, altered or of another schema."""
+
+
+class TrainingError(GsxError):
+    """Training cannot go on, for example after three non-finite steps in a row."""
+
+
+def nearest(word: str, options: Iterable[str]) -> str:
+    """` Did you mean 'x'?` for the closest option, or an empty string when nothing is close."""
+    close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
+    return f" Did you mean '{close[0]}'?" if close else ""

@@ -1,0 +1,201 @@
+"""Evaluation on held-out views: image quality, zoomed views against true finer pixels, size and speed.
+
+Beside each zoomed figure stands the naive competitor, the x1 render enlarged by bicubic interpolation: a zoomed render
+that loses to it adds artefacts, not detail.
+"""
+
+import hashlib
+import json
+import math
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.lpips import LpipsOptions, load_lpips
+from gsx.core.metrics import bicubic, psnr, quantise, ssim
+from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
+from gsx.core.run import Run
+from gsx.core.scene import View
+from gsx.core.shapes import Float
+from gsx.core.splats import Splats
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions:
+    """Options; values in conf/config.yaml. They are the protocol: saved and hashed with every result."""
+
+    zoom: list[int]
+    quantise: bool
+    ssim: str
+    tile_pixels: int
+    lpips: LpipsOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Tiled:
+    """A picture rendered piece by piece."""
+
+    image: Float[Tensor, "3 H W"]
+    visible: int
+    """Splats with a radius on the whole raster."""
+
+
+def pieces(width: int, height: int, pixels: int) -> list[tuple[int, int, int, int]]:
+    """(left, top, width, height) of pieces of at most about `pixels` px, whole tiles of 16 px."""
+    edge = max(16, int(math.sqrt(pixels)) // 16 * 16)
+    return [
+        (x, y, min(edge, width - x), min(edge, height - y))
+        for y in range(0, height, edge)
+        for x in range(0, width, edge)
+    ]
+
+
+@torch.no_grad()
+def render_tiled(
+    splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"], pixels: int
+) -> Tiled:
+    """Render in pieces of at most `pixels`, so that memory does not grow with the picture; clamped to [0, 1]."""
+    picture = torch.empty(3, camera.height, camera.width)
+    seen = torch.zeros(len(splats), dtype=torch.bool)
+    for left, top, width, height in pieces(camera.width, camera.height, pixels):
+        part: Rendering = rasterize(splats, camera.crop(left, top, width, height), raster, background=background)
+        picture[:, top : top + height, left : left + width] = part.image.clamp(0, 1).cpu()
+        seen[part.screen.ids[part.screen.visible].cpu()] = True
+    return Tiled(picture, int(seen.sum()))
+
+
+@torch.no_grad()
+def render_view(run: Run, view: View, pixels: int) -> Tiled:
+    """The run's model from a view's camera."""
+    run.backbone.begin(max(1, run.step))
+    return render_tiled(run.backbone.splats(view.camera), view.camera, run.raster, run.background, pixels)
+
+
+def render_seconds(run: Run, views: Sequence[View], pixels: int) -> float:
+    """Median time of one render over up to 10 views after one to warm up, files and metrics excluded."""
+    times = []
+    for view in [views[0], *views[:10]]:
+        begun = time.perf_counter()
+        render_view(run, view, pixels)
+        times.append(time.perf_counter() - begun)
+    return statistics.median(times[1:])
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes)."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
+    """What two results must share to be compared, and its hash."""
+    protocol = {
+        "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
+        "test_views": [view.name for view in run.scene.test],
+        "train_views": len(run.scene.train),
+        "size": list(run.scene.test[0].camera.size),
+        "background": run.scene.background.tolist(),
+        "quantised_to_8_bit": options.quantise,
+        "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
+        "ssim": options.ssim,
+        "lpips": lpips_name,
+        "zoom": list(options.zoom),
+        "enlarged": "x1 render, antialiased Keys bicubic",
+    }
+    text = json.dumps(protocol, sort_keys=True, default=str)
+    return protocol | {"hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """Mean, or None where a value is missing."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+class Evaluator:
+    """Measures one run by one protocol."""
+
+    def __init__(self, run: Run, options: EvalOptions) -> None:
+        self.run, self.options = run, options
+        self.lpips = load_lpips(options.lpips)
+
+    def picture(self, view: View) -> Tiled:
+        """The render as it is measured."""
+        tiled = render_view(self.run, view, self.options.tile_pixels)
+        return Tiled(quantise(tiled.image), tiled.visible) if self.options.quantise else tiled
+
+    def view(self, view: View) -> dict[str, Any]:
+        """Figures of one view at the training resolution."""
+        tiled, truth = self.picture(view), view.image()
+        return {
+            "name": view.name,
+            "group": view.group,
+            "psnr": psnr(tiled.image, truth),
+            "ssim": ssim(tiled.image, truth, self.options.ssim),
+            "lpips": None if self.lpips is None else self.lpips.distance(tiled.image, truth),
+            "visible": tiled.visible,
+        }
+
+    def zoomed(self, view: View, factor: int) -> dict[str, float] | None:
+        """Figures of one view at `factor` times the resolution, or None where there is no truth."""
+        finer = view.zoom(factor)
+        if finer is None:
+            return None
+        truth, render = finer.image(), self.picture(finer).image
+        enlarged = bicubic(self.picture(view).image, finer.camera.width, finer.camera.height)
+        enlarged = quantise(enlarged) if self.options.quantise else enlarged
+        kind = self.options.ssim
+        return {
+            "psnr": psnr(render, truth),
+            "ssim": ssim(render, truth, kind),
+            "enlarged_psnr": psnr(enlarged, truth),
+            "enlarged_ssim": ssim(enlarged, truth, kind),
+        }
+
+    def zoom(self, factor: int) -> dict[str, Any]:
+        """Mean figures at one zoom, with the verdict; or a reason why there are none."""
+        figures = [f for view in self.run.scene.test if (f := self.zoomed(view, factor)) is not None]
+        if not figures:
+            return {"unavailable": f"the images hold no truth at x{factor}: train on a larger scene.downscale"}
+        means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
+        gain = means["psnr"] - means["enlarged_psnr"]
+        return means | {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
+
+    def evaluate(self) -> dict[str, Any]:
+        """The content of evaluation.json."""
+        run, views = self.run, [self.view(view) for view in self.run.scene.test]
+        primitives, size = run.backbone.size()
+        groups = sorted({v["group"] for v in views if v["group"]})
+        by_group = {name: [v for v in views if v["group"] == name] for name in groups}
+        figures = ("psnr", "ssim", "lpips")
+        return {
+            "protocol": protocol_of(run, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
+            "step": run.step,
+            **{key: mean([v[key] for v in views]) for key in figures},
+            "primitives": primitives,
+            "visible_primitives": statistics.fmean(v["visible"] for v in views),
+            "megabytes": size / 1e6,
+            "render_fps": 1 / render_seconds(run, run.scene.test, self.options.tile_pixels),
+            "train_seconds": run.seconds,
+            "peak_memory_mb": peak_memory_mb(run.device),
+            "groups": {name: {key: mean([v[key] for v in vs]) for key in figures} for name, vs in by_group.items()},
+            "zoom": {str(factor): self.zoom(factor) for factor in self.options.zoom},
+            "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
+        }
+
+
+def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
+    """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
+    stride = max(1, len(run.scene.test) // count)
+    views = run.scene.test[::stride][:count]
+    return statistics.fmean(psnr(render_view(run, v, options.tile_pixels).image, v.image()) for v in views)

@@ -1,0 +1,87 @@
+"""Splat files: the standard 62-property PLY of 3D-GS (spec 8.3), written and read back."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.backbone import Gaussians
+from gsx.core.errors import InputError
+from gsx.core.ply import read_ply, write_ply
+from gsx.core.sh import colours_of
+from gsx.core.shapes import Float
+from gsx.core.splats import Splats
+
+
+def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
+    """Properties by name in file order; f_rest is channel-major: all red coefficients, then green, then blue."""
+    rest = gaussians.sh_rest.transpose(1, 2).flatten(1)
+    zeros = torch.zeros_like(gaussians.opacity_logits)
+    columns = dict(zip("xyz", gaussians.means.unbind(1), strict=True))
+    columns |= dict.fromkeys(("nx", "ny", "nz"), zeros)
+    columns |= {f"f_dc_{i}": value for i, value in enumerate(gaussians.sh_constant.unbind(1))}
+    columns |= {f"f_rest_{i}": value for i, value in enumerate(rest.unbind(1))}
+    columns["opacity"] = gaussians.opacity_logits
+    columns |= {f"scale_{i}": value for i, value in enumerate(gaussians.log_scales.unbind(1))}
+    columns |= {f"rot_{i}": value for i, value in enumerate(gaussians.quats.unbind(1))}
+    return columns
+
+
+def write_gaussians(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
+    """Write a splat file.
+
+    Raises:
+        InputError: a value is not finite; the property and the number of rows are named.
+    """
+    columns = {name: value.detach().float().cpu().numpy() for name, value in columns_of(gaussians).items()}
+    for name, value in columns.items():
+        bad = int((~np.isfinite(value)).sum())
+        if bad:
+            raise InputError(f"{path} is not written: {bad} of {len(value)} values of '{name}' are not finite")
+    write_ply(path, columns, comments)
+
+
+def read_gaussians(path: Path) -> Gaussians:
+    """Read a splat file of any SH degree.
+
+    Raises:
+        InputError: a property is missing.
+    """
+    columns = {name: torch.from_numpy(np.ascontiguousarray(value)).float() for name, value in read_ply(path).items()}
+
+    def stack(prefix: str, count: int) -> Tensor:
+        names = [f"{prefix}{i}" for i in range(count)]
+        missing = [name for name in names if name not in columns]
+        if missing:
+            raise InputError(f"{path} lacks property '{missing[0]}': it is no splat file of 3D-GS")
+        return torch.stack([columns[name] for name in names], 1)
+
+    bands = sum(name.startswith("f_rest_") for name in columns) // 3
+    rest = stack("f_rest_", 3 * bands) if bands else torch.zeros(len(columns["x"]), 0)
+    return Gaussians(
+        means=torch.stack([columns[axis] for axis in "xyz"], 1),
+        log_scales=stack("scale_", 3),
+        quats=stack("rot_", 4),
+        opacity_logits=columns["opacity"],
+        sh_constant=stack("f_dc_", 3),
+        sh_rest=rest.view(-1, 3, bands).transpose(1, 2),
+    )
+
+
+def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
+    """What a viewer of the file draws: all bands active (spec 1.3)."""
+    degree = round((gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
+    return Splats(
+        means=gaussians.means,
+        scales=gaussians.log_scales.exp(),
+        quats=gaussians.quats,
+        log_opacities=torch.nn.functional.logsigmoid(gaussians.opacity_logits),
+        colours=colours_of(
+            gaussians.sh_constant[:, None],
+            gaussians.sh_rest,
+            gaussians.means - camera_centre.to(gaussians.means),
+            degree,
+        ),
+    )

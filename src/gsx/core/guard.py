@@ -1,0 +1,52 @@
+"""Stops a run that has gone bad: skips steps with a non-finite loss or gradient and names the culprit."""
+
+import logging
+
+import torch
+
+from gsx.core.errors import TrainingError
+from gsx.core.plugins import hookimpl
+from gsx.core.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+PATIENCE = 3
+"""Bad steps in a row that end the run (DESIGN section 7)."""
+
+
+class Guard:
+    """Listener: vetoes bad steps; the run ends with a checkpoint after three in a row."""
+
+    def __init__(self) -> None:
+        self.in_a_row = 0
+
+    @hookimpl
+    def gsx_gradients_ready(self, run: Run, step: Step) -> str | None:
+        """The reason to skip the step, if any.
+
+        Raises:
+            TrainingError: this is the third bad step in a row.
+        """
+        reason = culprit(run, step)
+        if reason is None:
+            self.in_a_row = 0
+            return None
+        self.in_a_row += 1
+        logger.warning("step %d on view %s skipped: %s", step.number, step.view.name, reason)
+        if self.in_a_row >= PATIENCE:
+            raise TrainingError(
+                f"{PATIENCE} steps in a row were not finite, last at step {step.number}, view {step.view.name}: "
+                f"{reason}; look at that view, or lower the learning rates"
+            )
+        return reason
+
+
+def culprit(run: Run, step: Step) -> str | None:
+    """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
+    if not bool(torch.isfinite(step.loss)):
+        return f"the loss is {float(step.loss)}"
+    for name, gradient in run.backbone.gradients():
+        if not bool(torch.isfinite(gradient.sum())):
+            rows = int((~torch.isfinite(gradient)).view(len(gradient), -1).any(1).sum())
+            return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
+    return None

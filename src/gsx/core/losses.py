@@ -1,0 +1,63 @@
+"""The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (spec 5)."""
+
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from gsx.core.shapes import Float
+
+WINDOW, SIGMA = 11, 1.5
+"""SSIM window edge and standard deviation, px (Wang et al. 2004; spec 5)."""
+C1, C2 = 0.01**2, 0.03**2
+"""SSIM constants for values in [0, 1]."""
+
+
+@cache
+def window(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "11"]:
+    """The 1-D Gaussian window, sum 1."""
+    offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
+    return (weight / weight.sum()).to(device, dtype)
+
+
+def blur(maps: Float[Tensor, "M H W"], padding: int) -> Float[Tensor, "M h w"]:
+    """Separable Gaussian window over each map, zero-padded by `padding`. One group per map: 30 x faster on a CPU."""
+    weight = window(maps.device, maps.dtype).expand(len(maps), 1, 1, -1)
+    rows = conv2d(maps[None], weight, padding=(0, padding), groups=len(maps))
+    return conv2d(rows, weight.mT, padding=(padding, 0), groups=len(maps))[0]
+
+
+class Blur(torch.autograd.Function):
+    """Size-preserving blur. It is its own adjoint: the window is symmetric and the padding zero."""
+
+    @staticmethod
+    def forward(ctx, maps):
+        return blur(maps, WINDOW // 2)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return blur(gradient.contiguous(), WINDOW // 2)
+
+
+def ssim_map(
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = WINDOW // 2
+) -> Float[Tensor, "C h w"]:
+    """Structural similarity per channel and pixel; biased variances.
+
+    `padding` is 5 for INRIA's zero-padded windows (differentiable in `image`), 0 for whole windows only.
+    """
+    smooth = Blur.apply if padding == WINDOW // 2 else lambda maps: blur(maps, padding)
+    mean_x, xx, xy = smooth(torch.cat([image, image * image, image * target])).chunk(3)
+    with torch.no_grad():
+        mean_y, yy = smooth(torch.cat([target, target * target])).chunk(2)
+    variances, covariance = xx - mean_x**2 + yy - mean_y**2, xy - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    return luminance * (2 * covariance + C2) / (variances + C2)
+
+
+def photometric(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float) -> Float[Tensor, ""]:
+    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels."""
+    absolute = (image - target).abs().mean()
+    return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim_map(image, target).mean())

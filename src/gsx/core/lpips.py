@@ -1,0 +1,145 @@
+"""LPIPS (Zhang et al. 2018, v0.1) with weights from local files; nothing is ever downloaded.
+
+The trunk is torchvision's VGG16 or AlexNet state dict (`vgg16-397923af.pth`, `alexnet-owt-7be5be79.pth`), the head the
+linear layers of the lpips package (`vgg.pth`, `alex.pth`). Published 3D-GS figures feed images in [0, 1] although the
+network expects [-1, 1] (spec 8.2): `input_range` selects, and the name of the figure says which.
+"""
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from gsx.core.errors import InputError
+from gsx.core.shapes import Float
+
+logger = logging.getLogger(__name__)
+
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""LPIPS input normalisation for values in [-1, 1]."""
+VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+ALEX_LAYERS = ((64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1))
+"""AlexNet: channels, kernel, stride, padding; max pooling before the second and third."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LpipsOptions:
+    """Where the weights are; empty paths: LPIPS is not computed."""
+
+    trunk: str
+    head: str
+    net: str
+    input_range: str
+
+
+def vgg_stages() -> nn.ModuleList:
+    """VGG16 up to the last ReLU of each stage; children numbered as in torchvision's `features`."""
+    stages, number, channels = nn.ModuleList(), 0, 3
+    for index, widths in enumerate(VGG_STAGES):
+        stage = nn.Sequential()
+        if index:
+            stage.add_module(str(number), nn.MaxPool2d(2))
+            number += 1
+        for width in widths:
+            stage.add_module(str(number), nn.Conv2d(channels, width, 3, padding=1))
+            stage.add_module(str(number + 1), nn.ReLU())
+            number, channels = number + 2, width
+        stages.append(stage)
+    return stages
+
+
+def alex_stages() -> nn.ModuleList:
+    """AlexNet's five convolutions with their ReLUs; children numbered as in torchvision's `features`."""
+    stages, number, channels = nn.ModuleList(), 0, 3
+    for index, (width, kernel, stride, padding) in enumerate(ALEX_LAYERS):
+        stage = nn.Sequential()
+        if index in (1, 2):
+            stage.add_module(str(number), nn.MaxPool2d(3, 2))
+            number += 1
+        stage.add_module(str(number), nn.Conv2d(channels, width, kernel, stride, padding))
+        stage.add_module(str(number + 1), nn.ReLU())
+        number, channels = number + 2, width
+        stages.append(stage)
+    return stages
+
+
+class Lpips(nn.Module):
+    """Perceptual distance: weighted squared differences of unit-normalised features, averaged over space."""
+
+    def __init__(self, net: str, input_range: str) -> None:
+        super().__init__()
+        if net not in ("vgg", "alex") or input_range not in ("unit", "signed"):
+            raise InputError(
+                f"metrics.lpips has net '{net}' and input_range '{input_range}': "
+                "choose net vgg or alex, input_range unit ([0,1], as published) or signed ([-1,1])"
+            )
+        self.net, self.signed = net, input_range == "signed"
+        self.stages = vgg_stages() if net == "vgg" else alex_stages()
+        widths = [stage[-2].out_channels for stage in self.stages]
+        self.heads = nn.ParameterList([torch.zeros(width) for width in widths])
+        self.note = ""
+
+    @property
+    def name(self) -> str:
+        """Names the variant in results."""
+        return f"lpips_{self.net}, input in {'[-1,1]' if self.signed else '[0,1]'}{self.note}"
+
+    @torch.no_grad()
+    def distance(self, image: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]) -> float:
+        """LPIPS of two pictures with values in [0, 1]."""
+        pair = torch.stack([image, target]).to(self.heads[0])
+        features = (pair * 2 - 1 if self.signed else pair) - pair.new_tensor(SHIFT)[:, None, None]
+        features = features / pair.new_tensor(SCALE)[:, None, None]
+        total = 0.0
+        for stage, head in zip(self.stages, self.heads, strict=True):
+            features = stage(features)
+            unit = features / (features.norm(dim=1, keepdim=True) + 1e-10)
+            total += float(((unit[0] - unit[1]).square() * head[:, None, None]).sum(0).mean())
+        return total
+
+
+def load_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
+    """State dict and sha256 prefix of a weights file.
+
+    Raises:
+        InputError: the file is missing or no state dict.
+    """
+    try:
+        data = Path(path).expanduser().read_bytes()
+        weights = torch.load(Path(path).expanduser(), map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise InputError(f"{option}={path} cannot be read as weights ({error}): give a local .pth file") from error
+    return weights, hashlib.sha256(data).hexdigest()[:8]
+
+
+def fill(network: Lpips, trunk: dict[str, Tensor], head: dict[str, Tensor]) -> None:
+    """Copy torchvision trunk weights (`features.N.*`) and head weights (`linN.model.1.weight`) into the network."""
+    for stage in network.stages:
+        for number, layer in stage.named_children():
+            if isinstance(layer, nn.Conv2d):
+                layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
+    for index, parameter in enumerate(network.heads):
+        parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
+
+
+def load_lpips(options: LpipsOptions) -> Lpips | None:
+    """The network, or None without weights (said once in the log).
+
+    Raises:
+        InputError: a given file is missing, unreadable or of another network.
+    """
+    if not options.trunk or not options.head:
+        logger.info("LPIPS: n/a (no weights); give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE")
+        return None
+    network = Lpips(options.net, options.input_range)
+    trunk, trunk_hash = load_weights(options.trunk, "metrics.lpips.trunk")
+    head, head_hash = load_weights(options.head, "metrics.lpips.head")
+    try:
+        fill(network, trunk, head)
+    except (KeyError, RuntimeError) as error:
+        raise InputError(f"metrics.lpips weights do not fit net '{options.net}' ({error}): check both files") from error
+    network.note = f", trunk {trunk_hash}, head {head_hash}"
+    return network.eval()

@@ -1,0 +1,51 @@
+"""PSNR and SSIM by their published definitions (spec 8.2). Images are display values in [0, 1]."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from gsx.core.losses import WINDOW, ssim_map
+from gsx.core.shapes import Float
+
+SSIM_VARIANTS = ("inria", "torchmetrics")
+
+
+def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
+    """Rounded to 8 bits as a saved PNG would be: x 255, + 0.5, clamp, truncate."""
+    return (image * 255 + 0.5).clamp(0, 255).floor() / 255
+
+
+def psnr(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
+    """20 log10(1 / sqrt(MSE)) over all pixels and channels, dB; inf for equal images."""
+    error = float((image.double() - target.double()).square().mean())
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant: str) -> float:
+    """Structural similarity in [-1, 1].
+
+    `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release. `torchmetrics`: reflected windows,
+    mean over the pixels whose window lies inside, as torchmetrics and the original SSIM. They differ near borders.
+    """
+    if variant == "inria":
+        return float(ssim_map(image, target).double().mean())
+    if variant == "torchmetrics":
+        return float(whole_windows(image, target).double().mean())
+    raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
+
+
+def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+    """SSIM where the window fits; pictures smaller than a window are reflected at their borders first."""
+    missing = [max(0, WINDOW - size) for size in (image.shape[2], image.shape[1])]
+    margin = [half for size in missing for half in (size // 2, size - size // 2)]
+    if any(missing):
+        image, target = (pad(picture, margin, mode="replicate") for picture in (image, target))
+    return ssim_map(image, target, padding=0)
+
+
+def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C H W"]:
+    """Enlarged by Keys' cubic interpolation, clamped to [0, 1]: the naive competitor of a zoomed render."""
+    larger = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)
+    return larger[0].clamp(0, 1)

@@ -1,0 +1,250 @@
+"""Pictures of a run for people: test views beside their truth, error maps, and zoomed crops beside their competitor.
+
+Everything goes to the run's `renders/`, listed in `index.json`, from which the report is built again at any time.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from gsx.core.checkpoint import replace_file
+from gsx.core.evaluate import EvalOptions, render_view
+from gsx.core.images import write_image
+from gsx.core.metrics import bicubic, psnr, quantise
+from gsx.core.run import Run, read_json
+from gsx.core.scene import View
+from gsx.core.shapes import Float
+
+SHOWN = 6
+"""Test views that are drawn."""
+PICTURE_WIDTH = 1600
+"""Wider pictures are saved reduced to this, in px: they are for looking, and the report embeds them."""
+LOSSLESS_PIXELS = 400_000
+"""Larger pictures are saved as JPEG."""
+WINDOW = 224
+"""Edge of a zoomed crop on the finer raster, px: two stand side by side on a phone at full size."""
+WINDOW_STEP = 8
+"""Crops are looked for on a grid of this many px."""
+REACH = 4
+"""Pixels around a window that its enlargement draws on: 2 for Keys' cubic, the others for windows between pixels."""
+ERROR_FULL = 0.2
+"""Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
+ERROR_COLOURS = (
+    (0.00, (0, 0, 4)),
+    (0.15, (55, 14, 92)),
+    (0.32, (130, 28, 106)),
+    (0.47, (198, 51, 78)),
+    (0.60, (236, 94, 40)),
+    (0.72, (247, 145, 30)),
+    (0.87, (250, 205, 75)),
+    (1.00, (253, 250, 190)),
+)
+"""Error divided by ERROR_FULL and its display RGB. CIE lightness rises evenly, so equal steps look equal."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of a raster, px."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def cut(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        """The part of an image inside the window."""
+        return image[:, self.top : self.top + self.height, self.left : self.left + self.width]
+
+
+def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -> None:
+    """Draw up to SHOWN test views and their zoomed crops; `evaluation` is the content of evaluation.json."""
+    folder = run.folder / "renders"
+    folder.mkdir(parents=True, exist_ok=True)
+    forget(folder)
+    figures = evaluation["views"]
+    shown = spread([figure["psnr"] for figure in figures], SHOWN)
+    names = file_names([figures[i]["name"] for i in shown])
+    factors = [int(key) for key, entry in evaluation["zoom"].items() if int(key) > 1 and "unavailable" not in entry]
+    views, crops = [], []
+    for i, name in zip(shown, names, strict=True):
+        view, drawn = run.scene.test[i], Draw(run, options, folder, name)
+        picture = drawn.render(view)
+        views.append(figures[i] | drawn.whole(view, picture))
+        crops += [crop for factor in factors if (crop := drawn.crop(view, picture, factor)) is not None]
+    index = {"error_full": ERROR_FULL, "step": run.step, "views": views, "zoom": crops}
+    replace_file(folder / "index.json", json.dumps(without_infinities(index), indent=2).encode())
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """Writes the pictures of one view under one file name."""
+
+    run: Run
+    options: EvalOptions
+    folder: Path
+    name: str
+
+    def render(self, view: View) -> Float[Tensor, "3 H W"]:
+        """The run's model from a view's camera."""
+        return self.measured(render_view(self.run, view, self.options.tile_pixels).image)
+
+    def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """The picture as metrics see it."""
+        return quantise(image) if self.options.quantise else image
+
+    def whole(self, view: View, picture: Float[Tensor, "3 H W"]) -> dict[str, Any]:
+        """Truth, render and error of a view; returns their entry in the index."""
+        truth = view.image()
+        images = {"truth": truth, "render": picture, "error": error_map(picture, truth)}
+        files = {kind: self.save(f"{self.name}.{kind}", reduced(image)) for kind, image in images.items()}
+        return {"size": list(view.camera.size), "files": files}
+
+    def crop(self, view: View, picture: Float[Tensor, "3 H W"], factor: int) -> dict[str, Any] | None:
+        """The window with most detail at `factor` times the resolution: truth, render and the x1 render enlarged.
+
+        Returns its entry in the index, or None where there is no truth.
+        """
+        finer = view.zoom(factor)
+        if finer is None:
+            return None
+        whole = finer.image()
+        window = most_detailed(whole, WINDOW)
+        images = {
+            "truth": window.cut(whole),
+            "render": self.render(cropped(finer, window)),
+            "enlarged": self.measured(enlarged_window(picture, factor, window)),
+        }
+        files = {kind: self.save(f"{self.name}.x{factor}.{kind}", image, True) for kind, image in images.items()}
+        return {
+            "view": view.name,
+            "factor": factor,
+            "window": [window.left, window.top, window.width, window.height],
+            "psnr": psnr(images["render"], images["truth"]),
+            "enlarged_psnr": psnr(images["enlarged"], images["truth"]),
+            "files": files,
+        }
+
+    def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False) -> str:
+        """Write one picture and return its file name."""
+        small = image.shape[1] * image.shape[2] <= LOSSLESS_PIXELS
+        file = f"{stem}.png" if lossless or small else f"{stem}.jpg"
+        write_image(self.folder / file, image)
+        return file
+
+
+def forget(folder: Path) -> None:
+    """Remove the pictures that an earlier index lists, and first the index itself."""
+    index = folder / "index.json"
+    if not index.is_file():
+        return
+    try:
+        content = read_json(index)
+    except ValueError:
+        content = {"views": [], "zoom": []}
+    index.unlink()
+    for entry in [*content["views"], *content["zoom"]]:
+        for file in entry["files"].values():
+            (folder / Path(file).name).unlink(missing_ok=True)
+
+
+def spread(qualities: Sequence[float | None], count: int) -> list[int]:
+    """Up to `count` indices in order, evenly spread, the best and the worst (None is worst of all) among them."""
+    known = [-math.inf if quality is None else quality for quality in qualities]
+    total = len(known)
+    chosen = {known.index(max(known)), known.index(min(known))}
+    wanted = min(count, total)
+    # Nearest to even spacing first; what remains free is filled in order.
+    even = [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
+    for index in [*even, *range(total)]:
+        if len(chosen) < wanted:
+            chosen.add(index)
+    return sorted(chosen)
+
+
+def file_names(names: Iterable[str]) -> list[str]:
+    """View names as file names: without image suffix and odd characters, numbered where two would be equal."""
+    out: list[str] = []
+    for name in names:
+        plain = re.sub(r"\.(png|jpe?g|exr|webp|tiff?)$", "", name, flags=re.IGNORECASE)
+        safe = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_") or "view"
+        taken, number = safe, 2
+        while taken in out:
+            taken, number = f"{safe}_{number}", number + 1
+        out.append(taken)
+    return out
+
+
+def error_map(image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """Mean absolute error over the channels as a colour: black is none, the brightest is ERROR_FULL or more."""
+    return colour_ramp((image - truth).abs().mean(0) / ERROR_FULL)
+
+
+def colour_ramp(values: Float[Tensor, "H W"]) -> Float[Tensor, "3 H W"]:
+    """ERROR_COLOURS, linear in between; values are clamped to [0, 1]."""
+    places = torch.tensor([place for place, _ in ERROR_COLOURS])
+    colours = torch.tensor([colour for _, colour in ERROR_COLOURS]) / 255
+    clamped = values.clamp(0, 1)
+    upper = torch.searchsorted(places, clamped.contiguous()).clamp(1, len(places) - 1)
+    lower = upper - 1
+    fraction = (clamped - places[lower]) / (places[upper] - places[lower])
+    return torch.lerp(colours[lower], colours[upper], fraction[..., None]).permute(2, 0, 1)
+
+
+def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
+    """At most PICTURE_WIDTH wide."""
+    width, height = image.shape[2], image.shape[1]
+    if width <= PICTURE_WIDTH:
+        return image
+    size = (max(1, round(height * PICTURE_WIDTH / width)), PICTURE_WIDTH)
+    return interpolate(image[None], size=size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+
+def most_detailed(image: Float[Tensor, "3 H W"], edge: int) -> Window:
+    """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid."""
+    height, width = min(edge, image.shape[1]), min(edge, image.shape[2])
+    energy = gradient_energy(image)
+    means = avg_pool2d(energy[None], (height, width), stride=WINDOW_STEP)[0]
+    row, column = divmod(int(means.argmax()), means.shape[1])
+    return Window(column * WINDOW_STEP, row * WINDOW_STEP, width, height)
+
+
+def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
+    """Squared differences to the right and lower neighbours, summed over the channels."""
+    energy = torch.zeros_like(image[0])
+    energy[:, :-1] += (image[:, :, 1:] - image[:, :, :-1]).square().sum(0)
+    energy[:-1] += (image[:, 1:] - image[:, :-1]).square().sum(0)
+    return energy
+
+
+def cropped(view: View, window: Window) -> View:
+    """The view through a window of its raster."""
+    return replace(view, camera=view.camera.crop(window.left, window.top, window.width, window.height))
+
+
+def enlarged_window(picture: Float[Tensor, "3 H W"], factor: int, window: Window) -> Float[Tensor, "3 h w"]:
+    """A window of the picture enlarged `factor` times by `metrics.bicubic`.
+
+    Only its surroundings are enlarged: it may be a small part of a huge raster.
+    """
+    left, top = max(0, window.left // factor - REACH), max(0, window.top // factor - REACH)
+    right, bottom = (window.left + window.width) // factor + REACH, (window.top + window.height) // factor + REACH
+    part = picture[:, top:bottom, left:right]
+    larger = bicubic(part, part.shape[2] * factor, part.shape[1] * factor)
+    return replace(window, left=window.left - left * factor, top=window.top - top * factor).cut(larger)
+
+
+def without_infinities(content: Any) -> Any:
+    """The same with infinite PSNRs (equal images) as None, which JSON can hold."""
+    if isinstance(content, dict):
+        return {key: without_infinities(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [without_infinities(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -1,0 +1,98 @@
+"""PLY files with one table of scalars per vertex: splats and point clouds (3D-GS spec 8.3).
+
+Reads binary little-endian and ascii, writes binary little-endian. Elements after the vertices are ignored.
+"""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gsx.core.errors import InputError
+
+TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
+TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+"""numpy's names of PLY's types, under both generations of names; the first name of each is written."""
+
+
+def read_ply(path: str | Path) -> dict[str, np.ndarray]:
+    """The vertex properties by name, each an array [vertices] of the type stored.
+
+    Raises:
+        InputError: the file is missing, is no PLY of the kinds above, or ends early.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"Point file '{path}' does not exist, check the path.")
+    data = path.read_bytes()
+    body = data.find(b"\n", data.find(b"end_header")) + 1
+    if not data.startswith(b"ply") or not body or b"end_header" not in data[:body]:
+        raise InputError(f"'{path}' has no complete PLY header, export it anew as PLY.")
+    lines = [line.split() for line in data[:body].decode("latin-1").splitlines()]
+    layout, count, table = _layout(lines, path)
+    rows = _ascii(data[body:], count, table, path) if layout == "ascii" else _binary(data, body, count, table, path)
+    return {name: np.ascontiguousarray(rows[name]) for name in table.names or ()}
+
+
+def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = ()) -> None:
+    """Writes arrays [vertices] of equal length as vertex properties; the file appears whole or not at all.
+
+    Raises:
+        ValueError: the arrays differ in length, have more than one dimension, or a type that PLY lacks.
+    """
+    path = Path(path)
+    counts = {column.shape for column in columns.values()}
+    if len(counts) != 1 or len(next(iter(counts))) != 1:
+        raise ValueError(f"PLY columns need one dimension and one length, got shapes {sorted(counts)}")
+    names = {code: name for name, code in reversed(TYPES.items())}
+    codes = {name: column.dtype.str[1:] for name, column in columns.items()}
+    if not set(codes.values()) <= set(names):
+        raise ValueError(f"PLY knows the types {', '.join(names)}, got {codes}")
+    rows = np.empty(next(iter(counts)), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
+    for name, column in columns.items():
+        rows[name] = column
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header += [f"element vertex {len(rows)}", *(f"property {names[code]} {name}" for name, code in codes.items())]
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_bytes("\n".join([*header, "end_header", ""]).encode("latin-1") + rows.tobytes())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:
+    """Kind of body, number of vertices and the type of one of them."""
+    layout = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "missing")
+    if layout not in ("ascii", "binary_little_endian"):
+        raise InputError(f"'{path}' has format {layout}, save it as binary_little_endian.")
+    elements = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
+    if not elements or lines[elements[0]][1] != "vertex" or not lines[elements[0]][2].isdecimal():
+        raise InputError(f"'{path}' does not begin with vertices, save it as a plain point cloud.")
+    stop = elements[1] if len(elements) > 1 else len(lines)
+    properties = [words for words in lines[elements[0] : stop] if words[:1] == ["property"]]
+    unknown = next((words for words in properties if len(words) != 3 or words[1] not in TYPES), None)
+    if unknown is not None:
+        raise InputError(f"'{path}' has '{' '.join(unknown)}', only scalar vertex properties can be read.")
+    if not properties or len({name for _, _, name in properties}) < len(properties):
+        raise InputError(f"'{path}' names no vertex property or one twice, export it anew.")
+    return layout, int(lines[elements[0]][2]), np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
+
+
+def _binary(data: bytes, body: int, count: int, table: np.dtype, path: Path) -> np.ndarray:
+    if len(data) - body < count * table.itemsize:
+        present = (len(data) - body) // table.itemsize
+        raise InputError(f"'{path}' ends after {present} of {count} vertices, copy or export it anew.")
+    return np.frombuffer(data, table, count, body)
+
+
+def _ascii(body: bytes, count: int, table: np.dtype, path: Path) -> np.ndarray:
+    lines = [line for line in body.decode("latin-1").splitlines() if line.strip()][:count]
+    if len(lines) < count:
+        raise InputError(f"'{path}' ends after {len(lines)} of {count} vertices, copy or export it anew.")
+    try:
+        return np.loadtxt(lines, table, ndmin=1) if lines else np.empty(0, table)
+    except ValueError as problem:
+        raise InputError(f"'{path}' has an unreadable vertex ({problem}), export it anew.") from None

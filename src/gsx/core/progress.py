@@ -1,0 +1,134 @@
+"""Progress for people and files: one live line on a terminal, plain lines elsewhere, metrics.jsonl."""
+
+import json
+import sys
+import time
+from typing import IO, TextIO
+
+from gsx.core.evaluate import EvalOptions, peak_memory_mb, quick_psnr
+from gsx.core.plugins import hookimpl
+from gsx.core.run import Run, Step
+
+LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0
+"""Time between updates on a terminal, and elsewhere (a Slurm log stays readable)."""
+SMOOTHING = 0.05
+"""Weight of the newest step in the displayed loss, PSNR and speed."""
+
+
+def clock(seconds: float) -> str:
+    """m:ss, or h:mm:ss."""
+    whole = max(0, int(seconds))
+    hours, rest = divmod(whole, 3600)
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"
+
+
+class Progress:
+    """Listener: shows step, speed, loss, PSNR, primitives, memory and time left."""
+
+    def __init__(self, stream: TextIO = sys.stderr) -> None:
+        self.stream = stream
+        self.live = stream.isatty()
+        self.shown = 0.0
+        self.averages: dict[str, float] = {}
+        self.width = 0
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Update the averages, and the line when it is time."""
+        self.average("seconds", run.seconds - self.averages.get("until", run.seconds))
+        self.averages["until"] = run.seconds
+        now = time.monotonic()
+        if now - self.shown < (LIVE_SECONDS if self.live else PLAIN_SECONDS) and not run.complete:
+            return
+        self.average("loss", float(step.loss), 0.3)
+        self.average("psnr", step.psnr(), 0.3)
+        self.shown = now
+        self.show(self.line(run))
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Leave the last line standing."""
+        if self.live:
+            self.stream.write("\n")
+
+    def average(self, name: str, value: float, weight: float = SMOOTHING) -> None:
+        """Exponential average."""
+        old = self.averages.get(name) or value
+        self.averages[name] = old + weight * (value - old)
+
+    def line(self, run: Run) -> str:
+        """The line as shown."""
+        a, seconds = self.averages, max(self.averages["seconds"], 1e-9)
+        primitives = run.backbone.size()[0]
+        return (
+            f"step {run.step}/{run.iterations}  {1 / seconds:.1f} it/s  loss {a['loss']:.4f}  "
+            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {peak_memory_mb(run.device):,.0f} MB  "
+            f"ETA {clock((run.iterations - run.step) * seconds)}"
+        )
+
+    def show(self, text: str) -> None:
+        """Write over the last line on a terminal, below it elsewhere."""
+        end, start = ("", "\r") if self.live else ("\n", "")
+        self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
+        self.stream.flush()
+        self.width = len(text)
+
+
+class MetricsLog:
+    """Listener: appends to metrics.jsonl every `training.log_every` steps, test PSNR at evenly spaced points."""
+
+    def __init__(self, options: EvalOptions) -> None:
+        self.options = options
+        self.stream: IO[str] | None = None
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Open the file; a resumed run drops lines later than its checkpoint."""
+        path = run.folder / "metrics.jsonl"
+        lines = (
+            [json.loads(line) for line in path.read_text().splitlines() if complete_line(line)] if path.exists() else []
+        )
+        run.curves[:] = [line for line in lines if line["step"] <= run.step]
+        self.stream = path.open("w")
+        for line in run.curves:
+            self.stream.write(json.dumps(line) + "\n")
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Write a line when due, or when something noteworthy happened."""
+        points = run.training.test_points
+        tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
+        if not (run.step % run.training.log_every == 0 or step.changes or step.skipped or tested or run.step == 1):
+            return
+        line = self.entry(run, step)
+        if tested and run.scene.test:
+            line["test_psnr"] = quick_psnr(run, self.options)
+        run.curves.append(line)
+        assert self.stream is not None
+        self.stream.write(json.dumps(line) + "\n")
+        self.stream.flush()
+
+    def entry(self, run: Run, step: Step) -> dict:
+        """One line of metrics.jsonl."""
+        line = {
+            "step": run.step,
+            "seconds": round(run.seconds, 3),
+            "loss": float(step.loss),
+            "psnr": step.psnr(),
+            "primitives": run.backbone.size()[0],
+            "pairs": step.rendering.pairs,
+            "memory_mb": round(peak_memory_mb(run.device), 1),
+            **step.changes,
+        }
+        return line | ({"skipped": step.skipped} if step.skipped else {})
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Close the file."""
+        if self.stream is not None:
+            self.stream.close()
+
+
+def complete_line(line: str) -> bool:
+    """False for a line cut off by a crash."""
+    return line.endswith("}")

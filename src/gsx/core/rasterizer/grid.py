@@ -1,0 +1,66 @@
+"""The tiles of a raster. They are laid on the camera's frame, so that a crop sees the same tiles as the whole."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.shapes import Float, Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileGrid:
+    """Whole tiles covering a raster that begins at (left, top) of its frame."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    tile: int
+
+    @staticmethod
+    def of(camera: Camera, tile: int) -> "TileGrid":
+        """The grid of a camera's raster."""
+        frame = camera.frame
+        return TileGrid(left=frame.left, top=frame.top, width=camera.width, height=camera.height, tile=tile)
+
+    @property
+    def first(self) -> tuple[int, int]:
+        """Column and row of the first tile on the frame."""
+        return self.left // self.tile, self.top // self.tile
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Columns and rows."""
+        past_x, past_y = -(-(self.left + self.width) // self.tile), -(-(self.top + self.height) // self.tile)
+        return past_x - self.first[0], past_y - self.first[1]
+
+    def centres(self, tiles: Int[Tensor, "P"], like: Tensor) -> Float[Tensor, "P 2"]:
+        """Frame position of the middle of tiles, px, in the dtype of `like`."""
+        columns = self.shape[0]
+        position = torch.stack([tiles % columns + self.first[0], tiles // columns + self.first[1]], 1)
+        return position.to(like) * self.tile + self.tile / 2
+
+    def basis(self, like: Tensor) -> Float[Tensor, "3 P"]:
+        """x, y and 1 at the pixel centres of a tile, relative to its middle."""
+        offset = torch.arange(self.tile, device=like.device, dtype=like.dtype) + 0.5 - self.tile / 2
+        y, x = torch.meshgrid(offset, offset, indexing="ij")
+        return torch.stack([x.reshape(-1), y.reshape(-1), torch.ones_like(x).reshape(-1)])
+
+    def to_raster(self, tiles: Float[Tensor, "T P C"]) -> Float[Tensor, "C H W"]:
+        """Tiles laid out as a picture, cut to the raster."""
+        columns, rows = self.shape
+        blocks = tiles.view(rows, columns, self.tile, self.tile, -1).permute(4, 0, 2, 1, 3)
+        picture = blocks.reshape(-1, rows * self.tile, columns * self.tile)
+        x, y = self.left - self.first[0] * self.tile, self.top - self.first[1] * self.tile
+        return picture[:, y : y + self.height, x : x + self.width]
+
+    def to_tiles(self, raster: Float[Tensor, "C H W"]) -> Float[Tensor, "T C P"]:
+        """A picture cut into tiles; pixels beyond the raster are zero."""
+        columns, rows = self.shape
+        x, y = self.left - self.first[0] * self.tile, self.top - self.first[1] * self.tile
+        padding = (x, columns * self.tile - x - self.width, y, rows * self.tile - y - self.height)
+        padded = torch.nn.functional.pad(raster, padding)
+        blocks = padded.view(len(raster), rows, self.tile, columns, self.tile).permute(1, 3, 0, 2, 4)
+        return blocks.reshape(rows * columns, len(raster), self.tile**2)

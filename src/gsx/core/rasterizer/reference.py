@@ -1,0 +1,83 @@
+"""The slow float64 truth: every splat at every pixel, written from the equations (3D-GS, spec section 3), no tiles.
+
+Shares no code with the fast path; O(splats x pixels) memory. Differentiable by plain autograd.
+"""
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.quaternions import rotation_matrices
+from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
+from gsx.core.shapes import Bool, Float
+from gsx.core.splats import Splats
+
+
+def screen_covariances(
+    splats: Splats, points: Float[Tensor, "N 3"], camera: Camera, settings: RasterSettings
+) -> Float[Tensor, "N 2 2"]:
+    """J W Sigma W^T J^T + dilation (spec 3.2, off-centre form)."""
+    x, y, z = points.unbind(1)
+    widen_x = settings.jacobian_margin * camera.width / (2 * camera.fx)
+    widen_y = settings.jacobian_margin * camera.height / (2 * camera.fy)
+    x = z * (x / z).clamp(-camera.cx / camera.fx - widen_x, (camera.width - camera.cx) / camera.fx + widen_x)
+    y = z * (y / z).clamp(-camera.cy / camera.fy - widen_y, (camera.height - camera.cy) / camera.fy + widen_y)
+    zero = torch.zeros_like(z)
+    row_x = torch.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1)
+    row_y = torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1)
+    jacobian = torch.stack([row_x, row_y], 1) @ camera.rotation.double()
+    spread = rotation_matrices(splats.quats.double()) @ torch.diag_embed(splats.scales.double())
+    return jacobian @ spread @ spread.mT @ jacobian.mT + settings.dilation * torch.eye(2, dtype=torch.float64)
+
+
+def windows(
+    means: Float[Tensor, "N 2"], covariances: Float[Tensor, "N 2 2"], xy: Float[Tensor, "H W 2"]
+) -> Bool[Tensor, "N H W"]:
+    """Pixels inside the 16 px tiles that the published 3-sigma square touches (spec 3.1, steps 5 and 6)."""
+    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    middle = (a + c) / 2
+    largest = middle + torch.sqrt((middle**2 - (a * c - b * b)).clamp_min(0.1))
+    radius = torch.ceil(3 * largest.sqrt())[:, None]
+    first = torch.trunc((means - 0.5 - radius) / WINDOW_TILE)[:, None, None]
+    last = torch.trunc((means - 0.5 + radius + WINDOW_TILE - 1) / WINDOW_TILE)[:, None, None]
+    tile = torch.floor(xy / WINDOW_TILE)
+    return ((tile >= first) & (tile < last)).all(-1)
+
+
+def alpha_maps(
+    splats: Splats, camera: Camera, settings: RasterSettings, xy: Float[Tensor, "H W 2"]
+) -> tuple[Float[Tensor, "M H W"], Tensor]:
+    """Alpha of every splat in front of the camera at every pixel, nearest splat first, and their rows."""
+    points = splats.means.double() @ camera.rotation.double().T + camera.translation.double()
+    rows = (points[:, 2] > camera.near).nonzero()[:, 0]
+    rows = rows[torch.argsort(points[rows, 2].float(), stable=True)]
+    points = points[rows]
+    chosen = Splats(**{name: getattr(splats, name)[rows] for name in splats.__dataclass_fields__})
+    covariances = screen_covariances(chosen, points, camera, settings)
+    focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
+    means = points[:, :2] / points[:, 2:] * focal + torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
+    offset = xy - means[:, None, None]
+    distance = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(covariances), offset)
+    alpha = torch.exp(chosen.log_opacities.double()[:, None, None] - distance / 2)
+    clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (spec 4)
+    keep = clamped >= settings.alpha_min
+    if settings.cull == "published":
+        keep = keep & windows(means, covariances, xy)
+    return torch.where(keep, clamped, 0.0), rows
+
+
+def render_reference(
+    splats: Splats, camera: Camera, settings: RasterSettings, *, background: Float[Tensor, "C"] | None = None
+) -> tuple[Float[Tensor, "C H W"], Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """(image, alpha, depth) in float64; `depth` is the blending-weighted sum of camera z."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    alpha, rows = alpha_maps(splats, camera, settings, torch.stack([x, y], -1).double())
+    after = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    weight = alpha * before * (after >= settings.transmittance_stop)
+    depth = splats.means.double()[rows] @ camera.rotation.double()[2] + camera.translation.double()[2]
+    image = torch.einsum("nhw,nc->chw", weight, splats.colours.double()[rows])
+    coverage = weight.sum(0)
+    if background is not None:
+        image = image + (1 - coverage) * background.double()[:, None, None]
+    return image, coverage, torch.einsum("nhw,n->hw", weight, depth)

@@ -1,0 +1,116 @@
+"""`rasterize`: splats and a camera in, a `Rendering` out."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.rasterizer.composite import Blocks, composite, make_blocks
+from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.pairs import pair
+from gsx.core.rasterizer.projection import project
+from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.splats import Splats
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScreenStatistics:
+    """What happened to the M splats in front of the camera; gradients are there after the backward pass."""
+
+    ids: Int[Tensor, "M"]
+    """Row of the splat in the input."""
+    radii: Int[Tensor, "M"]
+    """Published radius, px; 0: touches no tile."""
+    shift: Float[Tensor, "M 2"]
+    """Zeros added to the screen means; their gradient is that of the means, px, blending path only (spec 4)."""
+    probe: Float[Tensor, "M 2"] | None
+    """Its gradient is the sum over pixels of absolute gradients, px; None unless asked for."""
+    heaviest: Float[Tensor, "M"] | None
+    """Largest blending weight over all pixels; None unless asked for."""
+    size: tuple[int, int]
+    """(width, height) of the raster."""
+
+    @property
+    def visible(self) -> Bool[Tensor, "M"]:
+        """Splats that touch a tile; no pixel need have been shaded (spec 3.1)."""
+        return self.radii > 0
+
+    def ndc_gradient(self, of: Tensor) -> Float[Tensor, "M 2"]:
+        """Gradient of `shift` or `probe` in NDC units: pixels times half the raster (spec 4)."""
+        gradient = of.grad if of.grad is not None else torch.zeros_like(of)
+        return gradient * gradient.new_tensor(self.size) / 2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rendering:
+    """A picture and what went into it."""
+
+    image: Float[Tensor, "C H W"]
+    """Blended colours over the background; not clamped."""
+    alpha: Float[Tensor, "H W"]
+    """Coverage in [0, 1]."""
+    depth: Float[Tensor, "H W"] | None
+    """Blending-weighted sum of camera z, scene units (divide by alpha for a mean); None unless asked for."""
+    screen: ScreenStatistics
+    pairs: int = 0
+    """Splat-tile pairs blended."""
+
+
+def heaviest_by_splat(by_entry: Float[Tensor, "S K"], blocks: Blocks, count: int) -> Float[Tensor, "M"]:
+    """Largest weight over a splat's list entries; 0 for splats in no list."""
+    zeros = by_entry.new_zeros(count + 1)
+    return zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
+
+
+def rasterize(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    background: Float[Tensor, "C"] | None = None,
+    depth: bool = False,
+    absolute_gradient: bool = False,
+    max_weight: bool = False,
+) -> Rendering:
+    """Render `splats` from `camera`; differentiable in every field of the splats and in the background.
+
+    Raises:
+        InputError: the picture needs more splat-tile pairs than `settings.max_pairs`.
+    """
+    screen = project(splats, camera, settings)
+    pairs = pair(screen, camera, settings)
+    blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
+    shift = torch.zeros_like(screen.means, requires_grad=torch.is_grad_enabled())
+    probe = torch.zeros_like(shift, requires_grad=True) if absolute_gradient else None
+    by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
+    blended = composite(
+        screen.means + shift,
+        screen.factors,
+        screen.log_opacities,
+        torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels,
+        blocks,
+        TileGrid.of(camera, settings.tile_size),
+        settings,
+        probe=probe,
+        heaviest=by_entry,
+    )
+    count = splats.colours.shape[1]
+    image, alpha = blended[:count], blended[-1]
+    if background is not None:
+        image = image + (1 - alpha) * background.to(image)[:, None, None]
+    return Rendering(
+        image=image,
+        alpha=alpha,
+        depth=blended[count] if depth else None,
+        pairs=len(pairs.splats),
+        screen=ScreenStatistics(
+            ids=screen.ids,
+            radii=pairs.radii,
+            shift=shift,
+            probe=probe,
+            heaviest=None if by_entry is None else heaviest_by_splat(by_entry, blocks, len(screen.ids)),
+            size=camera.size,
+        ),
+    )

@@ -1,0 +1,107 @@
+"""A run: everything that belongs to one training, and one step as listeners see it."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.backbone import Backbone
+from gsx.core.metrics import psnr
+from gsx.core.rasterizer import RasterSettings, Rendering
+from gsx.core.scene import Scene, View
+from gsx.core.shapes import Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """Options of the loop; values in conf/config.yaml."""
+
+    ssim_weight: float
+    random_background: bool
+    log_every: int
+    checkpoint_every: int
+    checkpoints_kept: int
+    test_points: int
+
+
+@dataclass(eq=False)
+class Sampler:
+    """Training views without replacement, reshuffled when all have been seen (spec 7)."""
+
+    count: int
+    generator: torch.Generator
+    order: list[int] = field(default_factory=list)
+
+    def next(self) -> int:
+        """Index of the next view."""
+        if not self.order:
+            self.order = torch.randperm(self.count, generator=self.generator).tolist()
+        return self.order.pop()
+
+
+@dataclass(eq=False, kw_only=True)
+class Run:
+    """State of one training. What must survive an interruption is in `checkpoint.py`."""
+
+    config: dict[str, Any]
+    """The composed configuration, resolved, JSON-serialisable."""
+    folder: Path
+    scene: Scene
+    backbone: Backbone
+    raster: RasterSettings
+    training: TrainingOptions
+    iterations: int
+    device: torch.device
+    generator: torch.Generator
+    sampler: Sampler
+    step: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Time spent in training steps, without evaluation and files."""
+    stopping: bool = False
+    """Set to end after the current step."""
+    curves: list[dict[str, float]] = field(default_factory=list)
+    """Lines of metrics.jsonl so far."""
+
+    @property
+    def complete(self) -> bool:
+        """All iterations are done."""
+        return self.step >= self.iterations
+
+    @property
+    def background(self) -> Float[Tensor, "3"]:
+        """The scene's background on the run's device."""
+        return self.scene.background.to(self.device)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step:
+    """One training step, after its backward pass."""
+
+    number: int
+    view: View
+    target: Float[Tensor, "3 H W"]
+    rendering: Rendering
+    loss: Float[Tensor, ""]
+    changes: dict[str, int] = field(default_factory=dict)
+    """What density control did."""
+    skipped: str = ""
+    """Why nothing was updated; empty for an ordinary step."""
+
+    def psnr(self) -> float:
+        """PSNR of the training view before the update, dB."""
+        return psnr(self.rendering.image.detach().clamp(0, 1), self.target)
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def views_of(scene: Scene) -> Sequence[View]:
+    """Training then test views."""
+    return [*scene.train, *scene.test]

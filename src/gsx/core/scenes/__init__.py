@@ -1,0 +1,1 @@
+"""Built-in scene loaders: one per format, one `Scene` out."""

@@ -1,0 +1,217 @@
+"""Structure from motion with pycolmap, in process and on the CPU.
+
+Features, matches and the incremental reconstruction are COLMAP's. What is set here is what makes two runs agree:
+numbers of photos are given out before threads start, every estimator has a seed, and one thread does the mapping.
+"""
+
+import logging
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gsx.core.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Sizes = Mapping[str, tuple[int, int]]
+"""(width, height) by name of photo, relative to their folder."""
+
+LOG_SECONDS = 5.0  # between progress lines
+PAIR_BLOCK = 10  # photos whose pairs COLMAP matches before writing them down, which is when progress shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmOptions:
+    """What decides about a reconstruction; values and sources in `conf/scene/photos.yaml`."""
+
+    matcher: str
+    """auto | exhaustive (every pair) | sequential (neighbours in order of name: video frames, walks)."""
+    exhaustive_limit: int
+    """`auto` matches every pair of up to this many photos, neighbours of more."""
+    overlap: int
+    """`sequential` matches photos at distances 1, 2, 3, ... overlap and 1, 2, 4, ... 2^(overlap - 1)."""
+    max_feature_size: int
+    """Features are found on photos reduced to this many pixels on the longer side; training is not affected."""
+    max_features: int
+    """Features kept of each photo."""
+    camera_mode: str
+    """auto (photos of one size share a camera) | single (all share one) | per_image."""
+    camera_model: str
+    """COLMAP's name of the lens model to estimate."""
+    num_threads: int
+    """For features and matches, which do not depend on it; 0: all cores."""
+    mapping_threads: int
+    """For the reconstruction, which is the same bit for bit only with 1; 0: all cores."""
+    seed: int
+
+
+def reconstruct(folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> Any:
+    """The largest pycolmap.Reconstruction of the photos in `folder`, None if there is none.
+
+    `work` is an empty folder for intermediate files.
+
+    Raises:
+        InputError: one camera is asked for photos of several sizes.
+    """
+    database, sparse = work / "database.db", work / "sparse"
+    sparse.mkdir()
+    with _quiet():
+        import_photos(database, folder, sizes, options)
+        _extract(database, folder, sizes, options)
+        _match(database, len(sizes), options)
+        models = _map(database, folder, sparse, len(sizes), options)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def import_photos(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) -> None:
+    """Number the photos in order of name and decide which of them share a camera."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.camera_model
+    shared = options.camera_mode != "per_image"
+    mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
+    pycolmap.Database.open(database).close()
+    for names in _camera_groups(sizes, options.camera_mode):
+        pycolmap.import_images(database, folder, camera_mode=mode, image_names=names, options=reader)
+
+
+def _camera_groups(sizes: Sizes, camera_mode: str) -> list[list[str]]:
+    if camera_mode == "per_image":
+        return [sorted(sizes)]
+    groups = [sorted(name for name in sizes if sizes[name] == size) for size in sorted(set(sizes.values()))]
+    if camera_mode == "single" and len(groups) > 1:
+        found = ", ".join(
+            f"{width}x{height} ({group[0]})"
+            for group, (width, height) in zip(groups, sorted(set(sizes.values())), strict=True)
+        )
+        raise InputError(f"One camera cannot take photos of several sizes, {found}: use scene.camera_mode=auto.")
+    return groups
+
+
+def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) -> None:
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = options.max_feature_size
+    extraction.num_threads = options.num_threads or -1
+    extraction.use_gpu = False
+    extraction.sift.max_num_features = options.max_features
+
+    def work(token: Any) -> None:
+        pycolmap.extract_features(
+            database, folder, image_names=sorted(sizes), extraction_options=extraction, device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )  # fmt: skip
+
+    _watched("features of photos", work, lambda: _rows(database, "keypoints"), len(sizes))
+
+
+def chosen_matcher(count: int, options: SfmOptions) -> str:
+    """`auto` resolved for a number of photos."""
+    if options.matcher != "auto":
+        return options.matcher
+    return "exhaustive" if count <= options.exhaustive_limit else "sequential"
+
+
+def pair_count(count: int, options: SfmOptions) -> int:
+    """How many pairs of photos are matched."""
+    if chosen_matcher(count, options) == "exhaustive":
+        return count * (count - 1) // 2
+    distances = set(range(1, options.overlap + 1)) | {2**k for k in range(options.overlap)}
+    return sum(max(0, count - distance) for distance in distances)
+
+
+def _match(database: Path, count: int, options: SfmOptions) -> None:
+    import pycolmap
+
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads = options.num_threads or -1
+    matching.use_gpu = False
+    verification.ransac.random_seed = options.seed
+    exhaustive = chosen_matcher(count, options) == "exhaustive"
+    match, pairing = pycolmap.match_sequential, _sequential(options)
+    if exhaustive:
+        match, pairing = pycolmap.match_exhaustive, pycolmap.ExhaustivePairingOptions()
+        pairing.block_size = PAIR_BLOCK
+
+    def work(token: Any) -> None:
+        match(
+            database, matching_options=matching, pairing_options=pairing, verification_options=verification,
+            device=pycolmap.Device.cpu, cancellation_token=token,
+        )  # fmt: skip
+
+    total = pair_count(count, options)
+    _watched("matches of pairs", work, lambda: _rows(database, "two_view_geometries"), total)
+
+
+def _sequential(options: SfmOptions) -> Any:
+    import pycolmap
+
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap = options.overlap
+    pairing.loop_detection = False  # it would need a vocabulary tree, which COLMAP downloads
+    return pairing
+
+
+def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOptions) -> dict[int, Any]:
+    import pycolmap
+
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.num_threads = pipeline.mapper.num_threads = options.mapping_threads or -1
+    pipeline.random_seed = pipeline.mapper.random_seed = pipeline.triangulation.random_seed = options.seed
+    placed: list[None] = []
+
+    def work(token: Any) -> dict[int, Any]:
+        pycolmap.set_random_seed(options.seed)  # of this thread
+        return pycolmap.incremental_mapping(
+            database, folder, sparse, pipeline, next_image_callback=lambda: placed.append(None),
+            cancellation_token=token,
+        )  # fmt: skip
+
+    return _watched("placing photos", work, lambda: len(placed), count)
+
+
+def _watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total: int) -> T:
+    """Run `work` in a thread and log how far it is; an interruption (Ctrl-C) cancels it."""
+    import pycolmap
+
+    started, token = time.monotonic(), pycolmap.CancellationToken()
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        future = pool.submit(work, token)
+        try:
+            while not wait([future], timeout=LOG_SECONDS).done:
+                logger.info("sfm: %s %d/%d, %.0f s", stage, done(), total, time.monotonic() - started)
+        except BaseException:
+            token.cancel()
+            raise
+    logger.info("sfm: %s done (%d) in %.1f s", stage, done(), time.monotonic() - started)
+    return future.result()
+
+
+def _rows(database: Path, table: str) -> int:
+    """Rows of a table that another thread is writing; 0 while that cannot be told."""
+    try:
+        with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep COLMAP's own log to errors: progress is told here."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

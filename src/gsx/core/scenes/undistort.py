@@ -1,0 +1,132 @@
+"""Lens distortion out of the photos: the pinhole camera that sees (almost) the same, and the resampling to it.
+
+The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, so borders are trimmed). Pixel centres
+are at +0.5 on both rasters. Sampling is bicubic where COLMAP's own undistorter is bilinear: it keeps more detail.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.errors import InputError
+from gsx.core.images import read_image, to_uint8, write_image
+from gsx.core.shapes import Float, UInt8
+
+ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
+METHOD = "bicubic/1"  # part of the cache key: raise the number when the resampling changes
+
+
+def is_pinhole(camera: Any) -> bool:
+    """Whether a pycolmap camera is a pinhole: by its model, or because all its distortion is zero."""
+    return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
+
+
+def pinhole_of(camera: Any) -> Any:
+    """The pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
+
+    Raises:
+        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can.
+    """
+    import pycolmap
+
+    if is_pinhole(camera):
+        return camera
+    if not camera.is_perspective():
+        raise InputError(
+            f"Camera model {camera.model_name} of a {camera.width}x{camera.height} photo has no pinhole equivalent: "
+            "cut the photos into perspective views and reconstruct those."
+        )
+    return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+
+
+def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:
+    """A pycolmap pinhole camera with a pose camera_from_world as gsx has it, at the same resolution."""
+    return Camera(
+        rotation=rotation,
+        translation=translation,
+        fx=pinhole.focal_length_x,
+        fy=pinhole.focal_length_y,
+        cx=pinhole.principal_point_x,
+        cy=pinhole.principal_point_y,
+        width=pinhole.width,
+        height=pinhole.height,
+    )
+
+
+def undistorted_size(lens: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the result for a photo of `size`, which may be reduced against the camera `lens`."""
+    width, height = size
+    return round(pinhole.width * width / lens.width), round(pinhole.height * height / lens.height)
+
+
+def undistort_points(lens: Any, pinhole: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
+    """Where pixels of `lens` lie in `pinhole`; both pycolmap cameras, positions in pixels, float64."""
+    if lens is pinhole or not len(positions):
+        return positions
+    rays = torch.from_numpy(lens.cam_from_img(positions.numpy()))
+    focal = torch.tensor([pinhole.focal_length_x, pinhole.focal_length_y], dtype=torch.float64)
+    centre = torch.tensor([pinhole.principal_point_x, pinhole.principal_point_y], dtype=torch.float64)
+    return rays * focal + centre
+
+
+def undistort(image: UInt8[Tensor, "C H W"], lens: Any, pinhole: Any, size: tuple[int, int]) -> UInt8[Tensor, "C h w"]:
+    """The photo `image` of the camera `lens` as `pinhole` would have taken it, on a raster of `size` (width, height).
+
+    Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
+    """
+    photo = image[None].float() / 255
+    bands = [
+        F.grid_sample(photo, grid[None], mode="bicubic", padding_mode="border", align_corners=False)
+        for grid in _grids(lens, pinhole, size)
+    ]
+    return to_uint8(torch.cat(bands, dim=2)[0])
+
+
+def _grids(lens: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
+    """For each pixel, band by band, where on the raster of `lens` it is to be found, in [-1, 1]^2."""
+    width, height = size
+    columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (pinhole.width / width)
+    rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
+    x = (columns - pinhole.principal_point_x) / pinhole.focal_length_x
+    for band in ((rows - pinhole.principal_point_y) / pinhole.focal_length_y).split(ROWS_PER_BAND):
+        grid_y, grid_x = torch.meshgrid(band, x, indexing="ij")
+        rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
+        pixels = torch.from_numpy(lens.img_from_cam(rays.numpy())).reshape(len(band), width, 2)
+        yield (pixels / torch.tensor([lens.width, lens.height]) * 2 - 1).float()
+
+
+@dataclass(frozen=True, eq=False)
+class StoredUndistortion:
+    """`undistort` for one photo, its result kept as PNG between runs."""
+
+    photo: Path
+    lens: Any
+    pinhole: Any
+    size: tuple[int, int]
+    """(width, height) of the result."""
+
+    def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
+        stored = self.stored()
+        if stored.is_file():
+            return read_image(stored)
+        result = undistort(image, self.lens, self.pinhole, self.size)
+        make_folder(stored.parent)
+        write_image(stored, result)
+        return result
+
+    def stored(self) -> Path:
+        """Where the result is kept; another photo, camera or method has another place."""
+        key = content_key(METHOD, _numbers(self.lens), _numbers(self.pinhole), self.size)
+        name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo))
+        return cache_folder("undistorted", key) / f"{self.photo.stem}_{name}.png"
+
+
+def _numbers(camera: Any) -> tuple[str, int, int, list[float]]:
+    return camera.model_name, camera.width, camera.height, camera.params.tolist()

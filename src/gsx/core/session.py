@@ -1,0 +1,325 @@
+"""One run from settings to report: build, train, evaluate, write. Also opens finished runs again."""
+
+import json
+import logging
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx import __version__
+from gsx.core import checkpoint
+from gsx.core.backbone import Beginning
+from gsx.core.camera import Camera
+from gsx.core.checkpoint import replace_file
+from gsx.core.config import Settings, read_config, write_config
+from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.evaluate import Evaluator, render_tiled
+from gsx.core.export import read_gaussians, splats_of, write_gaussians
+from gsx.core.guard import Guard
+from gsx.core.images import write_image
+from gsx.core.metrics import psnr
+from gsx.core.orbit import orbit_cameras, write_animation
+from gsx.core.pictures import write_pictures
+from gsx.core.plugins import Plugins, hookimpl
+from gsx.core.progress import MetricsLog, Progress
+from gsx.core.report import write_report
+from gsx.core.run import Run, Sampler, Step
+from gsx.core.scene import Scene
+from gsx.core.shapes import Float
+from gsx.core.trainer import train
+
+logger = logging.getLogger(__name__)
+
+PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
+
+
+class Checkpointer:
+    """Listener: saves every `training.checkpoint_every` steps and when training ends, complete or not."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Save when due."""
+        if run.step % run.training.checkpoint_every == 0 and not run.complete:
+            checkpoint.save(run)
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Save the last state."""
+        checkpoint.save(run)
+
+
+def choose_device(name: str) -> torch.device:
+    """auto: a GPU where there is one.
+
+    Raises:
+        ConfigError: the name is unknown or the device absent.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"device is '{name}'; choose auto, cpu or cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device is cuda, but this torch finds no CUDA device: use device=cpu or device=auto")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+
+
+def new_folder(settings: Settings, scene: Scene) -> Path:
+    """A fresh run folder.
+
+    Raises:
+        InputError: it cannot be created, or the one asked for is in use.
+    """
+    if settings.general.folder:
+        folder = Path(settings.general.folder)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    parent = Path(settings.general.output) / scene.name / settings.backbone.component.name
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    for suffix in ("", *(f"_{n}" for n in range(2, 1000))):
+        try:
+            (parent / (stamp + suffix)).mkdir(parents=True)
+            return parent / (stamp + suffix)
+        except FileExistsError:  # another run began in the same second
+            continue
+    raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
+
+
+def build(settings: Settings, scene: Scene, folder: Path) -> Run:
+    """Everything of a run in memory, at step 0."""
+    general = settings.general
+    if general.iterations < 1:
+        raise ConfigError(f"iterations is {general.iterations}; give at least 1")
+    if not scene.test:
+        raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
+    device = choose_device(general.device)
+    torch.manual_seed(general.seed)
+    generator = torch.Generator().manual_seed(general.seed)
+    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, generator=generator)
+    return Run(
+        config=settings.resolved,
+        folder=folder,
+        scene=scene,
+        backbone=settings.backbone.component.factory(settings.backbone.options, beginning),
+        raster=settings.raster,
+        training=settings.training,
+        iterations=general.iterations,
+        device=device,
+        generator=generator,
+        sampler=Sampler(len(scene.train), generator),
+    )
+
+
+def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
+    """Machine, versions and the rescaled schedule, for environment.json."""
+    return {
+        "gsx": __version__,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(run.device)
+        if run.device.type == "cuda"
+        else platform.processor() or "cpu",
+        "packages": {name: installed_version(name) for name in PACKAGES},
+        "plugins": plugins.versions,
+        "plan": run.backbone.plan(),
+        "scene": {
+            "train_views": len(run.scene.train),
+            "test_views": len(run.scene.test),
+            "points": len(run.scene.points),
+            "extent": run.scene.extent,
+            "notes": list(run.scene.notes),
+        },
+    }
+
+
+def installed_version(package: str) -> str:
+    """Version of an installed distribution."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically; numbers that JSON has no words for become null."""
+    replace_file(path, json.dumps(finite(content), indent=2, default=str).encode())
+
+
+def finite(content: Any) -> Any:
+    """The same with infinite and undefined numbers as None."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    if isinstance(content, float) and (content != content or content in (float("inf"), float("-inf"))):
+        return None
+    return content
+
+
+def announce(run: Run, plugins: Plugins) -> None:
+    """Say what is about to be trained, and by which schedule."""
+    scene = run.scene
+    logger.info(
+        "scene %s: %d training and %d test views of %dx%d px, %s points, extent %.3g",
+        scene.name, len(scene.train), len(scene.test), *scene.train[0].camera.size, f"{len(scene.points):,}", scene.extent,
+    )  # fmt: skip
+    for note in scene.notes:
+        logger.info("note: %s", note)
+    for failure in plugins.failures:
+        logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
+    for name, part in run.backbone.plan().items():
+        logger.info("schedule %s: %s", name, ", ".join(f"{key} {value:.6g}" for key, value in part.items()))
+    logger.info(
+        "seed %s, %d threads, %s; run folder %s", run.config["seed"], torch.get_num_threads(), run.device, run.folder
+    )
+
+
+def start(settings: Settings, plugins: Plugins) -> Run:
+    """Load the scene and build a run in a new folder, with config.yaml and environment.json written."""
+    scene = settings.scene.component.factory(settings.scene.options)
+    run = build(settings, scene, new_folder(settings, scene))
+    write_config(run.folder / "config.yaml", settings.resolved)
+    write_json(run.folder / "environment.json", environment(run, plugins))
+    return run
+
+
+def open_run(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> tuple[Run, Settings]:
+    """A run as its newest checkpoint left it.
+
+    Raises:
+        InputError: the folder is no run.
+        CheckpointError: there is no usable checkpoint.
+    """
+    if not (folder / "config.yaml").is_file():
+        raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
+    settings = read_config(folder / "config.yaml", plugins, overrides)
+    run = build(settings, settings.scene.component.factory(settings.scene.options), folder)
+    checkpoint.restore(run)
+    return run, settings
+
+
+def status(run: Run, state: str, reason: str = "") -> None:
+    """Record how the run stands, for reports over many runs."""
+    write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
+
+
+def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
+    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint."""
+    announce(run, plugins)
+    status(run, "running")
+    listeners = (Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress())
+    try:
+        with plugins.listening(listeners):
+            train(run, plugins)
+            if run.complete:
+                finish(run, settings, plugins)
+    except TrainingError as error:
+        checkpoint.save(run)
+        status(run, "failed", str(error))
+        raise
+    except BaseException as error:
+        status(run, "failed", f"{type(error).__name__}: {error}")
+        raise
+    if not run.complete:
+        status(run, "interrupted")
+        write_report(run.folder)
+
+
+def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
+    """Evaluate, export, draw and report a trained run."""
+    evaluation = evaluate(run, settings)
+    plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
+    export(run, run.folder / "point_cloud.ply")
+    write_report(run.folder)
+    status(run, "ok")
+    plugins.emit.gsx_run_finished(run=run)
+    return evaluation
+
+
+def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
+    """Write evaluation.json and the pictures of a run."""
+    logger.info("evaluating %d test views at zoom %s", len(run.scene.test), settings.evaluation.zoom)
+    evaluation = Evaluator(run, settings.evaluation).evaluate()
+    write_json(run.folder / "evaluation.json", evaluation)
+    write_pictures(run, settings.evaluation, evaluation)
+    for line in summary(evaluation):
+        logger.info("%s", line)
+    return evaluation
+
+
+def summary(evaluation: dict[str, Any]) -> list[str]:
+    """The result in a few lines."""
+    e = evaluation
+    lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    lines = [
+        f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}",
+        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s, "
+        f"{e['train_seconds']:.0f} s of training, peak memory {e['peak_memory_mb']:,.0f} MB",
+    ]
+    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()]
+
+
+def zoom_line(factor: str, result: dict[str, Any]) -> str:
+    """One zoom figure with its verdict."""
+    if "unavailable" in result:
+        return f"zoom x{factor}: n/a, {result['unavailable']}"
+    if factor == "1":
+        return f"zoom x1: {result['psnr']:.2f} dB"
+    verdict = "wins against" if result["beats_enlarged"] else "loses to"
+    return (
+        f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the enlarged x1 render ({result['enlarged_psnr']:.2f} dB)"
+    )
+
+
+def export(run: Run, path: Path) -> None:
+    """Write the standard splat file, with the conventions a viewer must know in its comments."""
+    comments = [
+        f"gsx {__version__}, step {run.step}, scene {run.scene.name}",
+        f"screen dilation {run.raster.dilation} px^2, no opacity compensation, no 3D filter",
+        "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
+    ]
+    write_gaussians(path, run.backbone.explicit(), comments)
+
+
+def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
+    """Write every test view at `zoom` times the training resolution as PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for view in run.scene.test:
+        camera = view.camera.zoom(zoom)
+        picture = render_camera(run, camera, settings.evaluation.tile_pixels)
+        write_image(folder / f"{Path(view.name.replace('/', '_')).stem}.png", picture)
+
+
+def render_camera(run: Run, camera: Camera, pixels: int) -> Float[Tensor, "3 H W"]:
+    """The run's model from any camera."""
+    run.backbone.begin(max(1, run.step))
+    with torch.no_grad():
+        return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, pixels).image
+
+
+def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
+    """Animate a closed path around the scene."""
+    pixels = settings.evaluation.tile_pixels
+    cameras = (camera.zoom(zoom) for camera in orbit_cameras(run.scene, frames))
+    write_animation(path, (render_camera(run, camera, pixels) for camera in cameras), fps)
+
+
+def reimport_psnr(run: Run, settings: Settings, path: Path) -> str:
+    """PSNR between the model and its exported file, both rendered from up to five test views."""
+    gaussians, pixels = read_gaussians(path), settings.evaluation.tile_pixels
+    figures = []
+    for view in run.scene.test[:5]:
+        splats = splats_of(gaussians, view.camera.centre)
+        again = render_tiled(splats, view.camera, run.raster, run.background.cpu(), pixels).image
+        figures.append(psnr(again, render_camera(run, view.camera, pixels)))
+    return f"{min(figures):.1f} dB at worst over {len(figures)} test views (inf: identical)"

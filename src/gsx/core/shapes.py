@@ -1,0 +1,20 @@
+"""Shape annotations: `Float[Tensor, "N 3"]`. With jaxtyping installed (development) they are checked in the tests."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int, UInt8
+else:
+    try:
+        from jaxtyping import Bool, Float, Int, UInt8
+    except ImportError:
+
+        class _Shaped:
+            """Stands in for jaxtyping: `Float[Tensor, "N 3"]` is then just `Tensor`."""
+
+            def __class_getitem__(cls, item: tuple[Any, str]) -> Any:
+                return item[0]
+
+        Bool = Float = Int = UInt8 = _Shaped
+
+__all__ = ["Bool", "Float", "Int", "UInt8"]

@@ -1,0 +1,26 @@
+"""What a backbone hands to the rasterizer for one camera."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from gsx.core.shapes import Float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Splats:
+    """Explicit Gaussians, differentiable in every field. N splats with C channels; N may be 0."""
+
+    means: Float[Tensor, "N 3"]
+    """World positions."""
+    scales: Float[Tensor, "N 3"]
+    """Standard deviations along the principal axes, world units, >= 0."""
+    quats: Float[Tensor, "N 4"]
+    """Rotations (w, x, y, z); need not be unit, a zero quaternion is the identity."""
+    log_opacities: Float[Tensor, "N"]
+    """ln of the opacity, <= 0. From logsigmoid of the raw parameter, never the log of a rounded probability."""
+    colours: Float[Tensor, "N C"]
+    """Colour or any other channels to blend."""
+
+    def __len__(self) -> int:
+        return len(self.means)

@@ -1,0 +1,112 @@
+"""Which images are held out for testing, decided by their sorted names (3D-GS spec 8.1)."""
+
+from pathlib import Path, PurePosixPath
+
+from gsx.core.errors import ConfigError, InputError, nearest
+
+RULES = ("every:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
+Split = tuple[list[int], list[int]]
+"""Positions of the training and of the test names in the list that was split, each in sorted order."""
+
+
+def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
+    """Splits `names` after sorting them.
+
+    `every:K`: of the sorted names, those at positions 0, K, 2K, ... are test, as published for K = 8.
+    `none`: all are train.
+    `counts:N,M`: M test names spread evenly over the sorted list, then N train names over the rest.
+    `files:a,b`: train and test names one per line, with or without suffix; relative files lie in `folder`.
+
+    Raises:
+        ConfigError: the rule cannot be read.
+        InputError: a split file is unusable, or the rule leaves no image to train on or none to test on.
+    """
+    kind, _, argument = rule.partition(":")
+    order = sorted(range(len(names)), key=lambda i: sort_key(names[i]))
+    if kind == "none" and not argument:
+        train, test = order, list[int]()
+    elif kind == "every":
+        train, test = _every(order, _count(argument, rule))
+    elif kind == "counts":
+        train, test = _counts(order, *(_count(count, rule) for count in _pair(argument, rule)))
+    elif kind == "files":
+        train, test = _files(names, *(folder / part for part in _pair(argument, rule)))
+    else:
+        raise ConfigError(f"scene.split is '{rule}', use one of {', '.join(RULES)}.{nearest(rule, RULES)}")
+    _refuse_empty(len(names), len(train), len(test), rule)
+    return train, test
+
+
+def sort_key(name: str) -> tuple[str, str]:
+    """Order of published splits: base name up to its first dot; the whole name decides between equal ones."""
+    return PurePosixPath(name).name.split(".")[0], name
+
+
+def _every(order: list[int], k: int) -> Split:
+    return [i for position, i in enumerate(order) if position % k], order[::k]
+
+
+def _counts(order: list[int], train_count: int, test_count: int) -> Split:
+    if train_count + test_count > len(order):
+        raise InputError(
+            f"scene.split asks for {train_count} + {test_count} images and the scene has {len(order)}, ask for fewer."
+        )
+    test = _spread(order, test_count)
+    held_out = set(test)
+    return _spread([i for i in order if i not in held_out], train_count), test
+
+
+def _spread(order: list[int], count: int) -> list[int]:
+    """`count` entries at even distances, from the middle of `count` equal parts."""
+    return [order[(2 * k + 1) * len(order) // (2 * count)] for k in range(count)]
+
+
+def _files(names: list[str], train_file: Path, test_file: Path) -> Split:
+    train, test = _listed(names, train_file), _listed(names, test_file)
+    both = set(train) & set(test)
+    if both:
+        raise InputError(
+            f"'{names[min(both)]}' is listed in both '{train_file}' and '{test_file}', remove it from one."
+        )
+    return train, test
+
+
+def _listed(names: list[str], file: Path) -> list[int]:
+    """Positions of the names that `file` lists, in sorted order."""
+    if not file.is_file():
+        raise InputError(f"The split file '{file}' does not exist, check scene.split.")
+    lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
+    found = {_find(names, line, file) for line in lines if line}
+    return sorted(found, key=lambda i: sort_key(names[i]))
+
+
+def _find(names: list[str], word: str, file: Path) -> int:
+    """Position of the one name that is `word`, else of the one that is `word` plus a suffix."""
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    hits = [i for i, name in enumerate(names) if name == word] or [i for i, s in enumerate(stems) if s == word]
+    if len(hits) != 1:
+        reason = "fits several images" if hits else "is no image of the scene"
+        raise InputError(f"'{word}' in '{file}' {reason}, correct the list.{nearest(word, names)}")
+    return hits[0]
+
+
+def _pair(argument: str, rule: str) -> list[str]:
+    parts = [part.strip() for part in argument.split(",")]
+    if len(parts) != 2 or not all(parts):
+        raise ConfigError(f"scene.split is '{rule}' and needs two values separated by a comma after the colon.")
+    return parts
+
+
+def _count(text: str, rule: str) -> int:
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise ConfigError(f"scene.split is '{rule}' and '{text}' in it is no positive whole number.")
+    return int(text)
+
+
+def _refuse_empty(total: int, train: int, test: int, rule: str) -> None:
+    """Only `none` may leave the test split empty."""
+    if not train or not (test or rule == "none"):
+        raise InputError(
+            f"scene.split '{rule}' makes {train} training and {test} test images of {total}, both need at least"
+            " one: add images or choose another rule."
+        )
