@@ -235,7 +235,10 @@ def test_unwritable_images_leave_nothing_behind(tmp_path: Path) -> None:
         write_image(tmp_path / "a.jpg", photo((4, 5, 6)))
     with pytest.raises(InputError, match="cannot be written"):
         write_image(tmp_path / "no_folder" / "a.png", photo())
-    assert not list(tmp_path.iterdir())
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_image(tmp_path / "folder.png", photo())
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.png"]
 
 
 # --- resizing ---
@@ -307,9 +310,9 @@ def test_unknown_filter_gets_a_suggestion() -> None:
     with pytest.raises(ConfigError, match=r"'bicubik'.*Did you mean 'bicubic'\?"):
         resize(photo(), 5, 5, "bicubik")
     with pytest.raises(ConfigError, match=r"scene\.resize_light is 'gamma'"):
-        ResizeRule(filter="area", light="gamma", background=(0, 0, 0))
+        ResizeRule(filter="area", light="gamma", background=(0.0, 0.0, 0.0))
     with pytest.raises(ConfigError, match=r"scene\.background is"):
-        ResizeRule(filter="area", light="linear", background=(0, 0, 255))
+        ResizeRule(filter="area", light="linear", background=(0.0, 0.0, 255.0))
 
 
 @pytest.mark.parametrize(
@@ -317,7 +320,9 @@ def test_unknown_filter_gets_a_suggestion() -> None:
     [
         ((1061, 1894), 4, 1600, (265, 474)),  # 265.25, 473.5: ties go to the even number
         ((4946, 3286), 4, 1600, (1236, 822)),  # 1236.5, 821.5
-        ((4946, 3286), 1, 1600, (1600, 1063)),  # 1063.01 truncated
+        ((1063, 799), 4, 1600, (266, 200)),  # 265.75, 199.75
+        ((4946, 3286), 1, 1600, (1600, 1063)),  # 1063.01
+        ((4000, 2999), 1, 1600, (1600, 1199)),  # 1199.6 truncated
         ((1600, 3000), 1, 1600, (1600, 3000)),
         ((5000, 3333), 2, 1600, (2500, 1666)),  # an explicit factor is not limited; 1666.5
         ((5000, 3333), 1, 0, (5000, 3333)),
@@ -363,6 +368,7 @@ def test_photo_at_its_own_and_at_half_size(tmp_path: Path) -> None:
     truth = source(tmp_path / "a.png", whole)
     assert torch.equal(truth.image(whole), photo())
     assert torch.equal(truth.image(whole.zoom(0.5)), resize(photo(), 30, 20))
+    assert torch.equal(truth.image(whole.resize(30, 10)), resize(photo(), 30, 10))
 
 
 @pytest.mark.parametrize("principal", [centred, lambda camera: camera])
@@ -380,9 +386,9 @@ def test_crop_is_the_window_of_the_whole(tmp_path: Path, principal: Any) -> None
 
 
 def test_max_zoom_is_that_of_the_original(tmp_path: Path) -> None:
-    whole = camera(1061, 1894)
+    whole = camera(1062, 1894)
     truth = source(tmp_path / "absent.png", whole)
-    training = whole.resize(*training_size(1061, 1894, 4, 1600))
+    training = whole.resize(*training_size(1062, 1894, 4, 1600))  # 266 wide: a little more than a quarter
     assert 4.0 <= truth.max_zoom(training) < 4.1
     assert truth.max_zoom(training.crop(10, 10, 20, 20)) == truth.max_zoom(training)
     assert 1.0 <= truth.max_zoom(whole) < 1.02

@@ -85,6 +85,14 @@ def test_missing_file(tmp_path: Path) -> None:
         read_ply(tmp_path / "nowhere.ply")
 
 
+def test_unwritable_files_leave_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "folder.ply").mkdir()
+    for name in ("folder.ply", "no_folder/a.ply"):
+        with pytest.raises(InputError, match="cannot be written"):
+            write_ply(tmp_path / name, {"x": np.zeros(2)})
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.ply"]
+
+
 def test_unequal_columns_leave_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="one length"):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(3)})

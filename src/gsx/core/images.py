@@ -101,6 +101,8 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
         if not buffer.write(str(partial)):
             raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder and its space.")
         os.replace(partial, path)
+    except OSError as problem:
+        raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), remove what is in its way.") from None
     finally:
         partial.unlink(missing_ok=True)
 

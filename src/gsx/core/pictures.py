@@ -6,7 +6,7 @@ Everything goes to the run's `renders/`, listed in `index.json`, from which the 
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,8 @@ PICTURE_WIDTH = 1600
 """Wider pictures are saved reduced to this, in px: they are for looking, and the report embeds them."""
 LOSSLESS_PIXELS = 400_000
 """Larger pictures are saved as JPEG."""
-WINDOW = 224
-"""Edge of a zoomed crop on the finer raster, px: two stand side by side on a phone at full size."""
+WINDOW = 192
+"""Edge of a zoomed crop on the finer raster, px: the report shows three side by side at twice that."""
 WINDOW_STEP = 8
 """Crops are looked for on a grid of this many px."""
 REACH = 4
@@ -70,14 +70,16 @@ def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -
     folder.mkdir(parents=True, exist_ok=True)
     forget(folder)
     figures = evaluation["views"]
-    shown = spread([figure["psnr"] for figure in figures], SHOWN)
+    best, worst = extremes([figure["psnr"] for figure in figures])
+    roles = {worst: "worst", best: "best"} if best != worst else {}
+    shown = spread(len(figures), SHOWN, {best, worst})
     names = file_names([figures[i]["name"] for i in shown])
     factors = [int(key) for key, entry in evaluation["zoom"].items() if int(key) > 1 and "unavailable" not in entry]
     views, crops = [], []
     for i, name in zip(shown, names, strict=True):
         view, drawn = run.scene.test[i], Draw(run, options, folder, name)
         picture = drawn.render(view)
-        views.append(figures[i] | drawn.whole(view, picture))
+        views.append(figures[i] | drawn.whole(view, picture) | {"role": roles.get(i, "")})
         crops += [crop for factor in factors if (crop := drawn.crop(view, picture, factor)) is not None]
     index = {"error_full": ERROR_FULL, "step": run.step, "views": views, "zoom": crops}
     replace_file(folder / "index.json", json.dumps(without_infinities(index), indent=2).encode())
@@ -155,18 +157,17 @@ def forget(folder: Path) -> None:
             (folder / Path(file).name).unlink(missing_ok=True)
 
 
-def spread(qualities: Sequence[float | None], count: int) -> list[int]:
-    """Up to `count` indices in order, evenly spread, the best and the worst (None is worst of all) among them."""
+def extremes(qualities: Sequence[float | None]) -> tuple[int, int]:
+    """Indices of the best and the worst; None, no number, is worst of all."""
     known = [-math.inf if quality is None else quality for quality in qualities]
-    total = len(known)
-    chosen = {known.index(max(known)), known.index(min(known))}
+    return known.index(max(known)), known.index(min(known))
+
+
+def spread(total: int, count: int, always: Set[int]) -> list[int]:
+    """Up to `count` of `total` indices in order: those in `always`, then an even spacing, then whatever is left."""
     wanted = min(count, total)
-    # Nearest to even spacing first; what remains free is filled in order.
     even = [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
-    for index in [*even, *range(total)]:
-        if len(chosen) < wanted:
-            chosen.add(index)
-    return sorted(chosen)
+    return sorted(list(dict.fromkeys([*sorted(always), *even, *range(total)]))[:wanted])
 
 
 def file_names(names: Iterable[str]) -> list[str]:

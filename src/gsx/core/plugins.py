@@ -109,7 +109,7 @@ class Hooks:
 
     @hookspec
     def gsx_training_finished(self, run: "Run") -> None:
-        """The training loop has ended, complete or interrupted (`run.complete` says which); nothing is evaluated yet."""
+        """The loop has ended, complete or interrupted (`run.complete` says which); nothing is evaluated yet."""
 
     @hookspec
     def gsx_run_finished(self, run: "Run") -> None:

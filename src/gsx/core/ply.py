@@ -40,6 +40,7 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     """Writes arrays [vertices] of equal length as vertex properties; the file appears whole or not at all.
 
     Raises:
+        InputError: the file cannot be written.
         ValueError: the arrays differ in length, have more than one dimension, or a type that PLY lacks.
     """
     path = Path(path)
@@ -59,6 +60,8 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     try:
         partial.write_bytes("\n".join([*header, "end_header", ""]).encode("latin-1") + rows.tobytes())
         os.replace(partial, path)
+    except OSError as problem:
+        raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space.") from None
     finally:
         partial.unlink(missing_ok=True)
 

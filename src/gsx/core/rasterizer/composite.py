@@ -66,6 +66,8 @@ class Tables:
     channels: Float[Tensor, "S K C"]
     basis: Float[Tensor, "3 P"]
     """x, y, 1 at the pixels of a tile."""
+    inside: Float[Tensor, "T P"]
+    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
     settings: RasterSettings
 
 
@@ -83,7 +85,7 @@ def make_tables(
     nothing = means.new_zeros(1, features.shape[1])
     nothing[0, 5] = NOTHING
     table = torch.cat([features, nothing]).index_select(0, blocks.splats.view(-1))
-    table = table.view(*blocks.splats.shape, -1)
+    table = table.view(*blocks.splats.shape, features.shape[1])
     offsets = table[..., :2] - grid.centres(blocks.tiles, means)[:, None]
     u0, u1, u2, log_opacity = table[..., 2:6].unbind(-1)
     x, y = offsets.unbind(-1)
@@ -93,6 +95,7 @@ def make_tables(
         offsets=offsets,
         channels=table[..., 6:].contiguous(),
         basis=grid.basis(means),
+        inside=grid.to_tiles(means.new_ones(1, grid.height, grid.width))[:, 0],
         settings=settings,
     )
 
@@ -248,7 +251,7 @@ def walk(
     tables: Tables, blocks: Blocks, tiles: Int[Tensor, "B"]
 ) -> Iterator[tuple[Front, Float[Tensor, "B P C"], Float[Tensor, "B K P"]]]:
     """(front, light, weights) of a batch of tiles, front to back."""
-    transmittance = tables.basis.new_ones(len(tiles), tables.basis.shape[1])
+    transmittance = tables.inside[tiles]
     number = 0
     while len(tiles):
         front = Front(tiles, blocks.starts[tiles] + number, transmittance)
@@ -306,7 +309,7 @@ def splat_gradient(rows: Float[Tensor, "S K 6"], tables: Tables) -> Float[Tensor
 
 
 def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: int) -> Float[Tensor, "M V"]:
-    """Sums over the list entries of each splat, always in the same order: index_add_ is on a CPU, on a GPU it is not."""
+    """Sums over the list entries of each splat, always in the same order (as index_add_ is, but on a CPU only)."""
     if values.device.type == "cpu":
         return values.new_zeros(count, values.shape[1]).index_add_(0, splats, values)
     order = torch.argsort(splats, stable=True)

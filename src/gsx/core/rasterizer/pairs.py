@@ -131,7 +131,7 @@ def reached_tiles(
     grid: TileGrid,
     settings: RasterSettings,
 ) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """(splat, tile) of every pair, sorted by tile and within a tile by depth; ellipses that miss a tile are left out."""
+    """(splat, tile) of every pair, sorted by tile, then depth; tiles that the ellipse misses are left out."""
     order = torch.argsort(screen.depths, stable=True)
     spans = (last - first)[order]
     counts = spans.long().prod(1)

@@ -82,8 +82,9 @@ def rasterize(
     screen = project(splats, camera, settings)
     pairs = pair(screen, camera, settings)
     blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
-    shift = torch.zeros_like(screen.means, requires_grad=torch.is_grad_enabled())
-    probe = torch.zeros_like(shift, requires_grad=True) if absolute_gradient else None
+    learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
+    shift = torch.zeros_like(screen.means, requires_grad=learning)
+    probe = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
     blended = composite(
         screen.means + shift,

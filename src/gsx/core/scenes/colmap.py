@@ -33,7 +33,7 @@ MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observatio
 class ColmapOptions(SceneOptions):
     """What `conf/scene/colmap.yaml` sets."""
 
-    images: str = "images"
+    images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
     max_reprojection_px: float
     """The scene is refused when the median reprojection error exceeds this, in pixels of the model's cameras."""
@@ -184,7 +184,7 @@ def _provenance(model: Model, shots: Sequence[Shot], options: ColmapOptions) -> 
     return provenance(
         options,
         len(shots),
-        images=Path(options.images).name,
+        image_folder=Path(options.images).name,
         camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
         undistortion=METHOD if bent else None,
     )

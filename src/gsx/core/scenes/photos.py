@@ -49,8 +49,9 @@ def load(options: PhotosOptions) -> Scene:
     notes += report(model, list(sizes))
     for note in notes:
         logger.info(note)
-    scene = colmap.build(model, folder, _colmap_options(options), notes)
-    return replace(scene, provenance=scene.provenance | {"format": "photos", "sfm": settings(options)})
+    scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
+    name = folder.resolve().parent.name if folder.name == "images" else folder.resolve().name
+    return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
 
 
 def refuse_unknown(options: sfm.SfmOptions) -> None:
@@ -158,6 +159,6 @@ def _refuse_nothing(best: Any, folder: Path, sizes: sfm.Sizes) -> None:
         )
 
 
-def _colmap_options(options: PhotosOptions) -> colmap.ColmapOptions:
+def _colmap_options(options: PhotosOptions, folder: Path) -> colmap.ColmapOptions:
     common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
-    return colmap.ColmapOptions(**common, max_reprojection_px=options.max_reprojection_px)
+    return colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)

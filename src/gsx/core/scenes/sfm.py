@@ -135,29 +135,34 @@ def _match(database: Path, count: int, options: SfmOptions) -> None:
     matching.num_threads = options.num_threads or -1
     matching.use_gpu = False
     verification.ransac.random_seed = options.seed
-    exhaustive = chosen_matcher(count, options) == "exhaustive"
-    match, pairing = pycolmap.match_sequential, _sequential(options)
-    if exhaustive:
-        match, pairing = pycolmap.match_exhaustive, pycolmap.ExhaustivePairingOptions()
-        pairing.block_size = PAIR_BLOCK
+    match, pairing = _pairs(chosen_matcher(count, options), options.overlap)
 
     def work(token: Any) -> None:
         match(
-            database, matching_options=matching, pairing_options=pairing, verification_options=verification,
-            device=pycolmap.Device.cpu, cancellation_token=token,
-        )  # fmt: skip
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )
 
     total = pair_count(count, options)
     _watched("matches of pairs", work, lambda: _rows(database, "two_view_geometries"), total)
 
 
-def _sequential(options: SfmOptions) -> Any:
+def _pairs(matcher: str, overlap: int) -> tuple[Callable[..., None], Any]:
+    """pycolmap's matching function and its options."""
     import pycolmap
 
-    pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = options.overlap
-    pairing.loop_detection = False  # it would need a vocabulary tree, which COLMAP downloads
-    return pairing
+    if matcher == "exhaustive":
+        every = pycolmap.ExhaustivePairingOptions()
+        every.block_size = PAIR_BLOCK
+        return pycolmap.match_exhaustive, every
+    neighbours = pycolmap.SequentialPairingOptions()
+    neighbours.overlap = overlap
+    neighbours.loop_detection = False  # it would need a vocabulary tree, which COLMAP downloads
+    return pycolmap.match_sequential, neighbours
 
 
 def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOptions) -> dict[int, Any]:
@@ -171,9 +176,14 @@ def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOpt
     def work(token: Any) -> dict[int, Any]:
         pycolmap.set_random_seed(options.seed)  # of this thread
         return pycolmap.incremental_mapping(
-            database, folder, sparse, pipeline, next_image_callback=lambda: placed.append(None),
+            database,
+            folder,
+            sparse,
+            pipeline,
+            initial_image_pair_callback=lambda: placed.extend([None, None]),
+            next_image_callback=lambda: placed.append(None),
             cancellation_token=token,
-        )  # fmt: skip
+        )
 
     return _watched("placing photos", work, lambda: len(placed), count)
 
@@ -206,11 +216,11 @@ def _rows(database: Path, table: str) -> int:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep COLMAP's own log to errors: progress is told here."""
+    """Keep COLMAP's own log off the terminal: progress is told here, errors are raised, lost photos are named."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
         yield
     finally:

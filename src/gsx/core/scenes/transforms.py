@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from gsx.core.camera import Camera
 from gsx.core.errors import InputError, nearest
 from gsx.core.images import Size, checked_size, image_size
 from gsx.core.scene import PointCloud, Scene, View, extent_of
@@ -29,7 +28,7 @@ from gsx.core.scenes.posed import (
     refuse_too_few,
     views_of,
 )
-from gsx.core.scenes.undistort import METHOD, StoredUndistortion, pinhole_of
+from gsx.core.scenes.undistort import METHOD, StoredUndistortion, camera_of, pinhole_of, undistorted_size
 from gsx.core.splits import Split, split_names
 
 FILE = "transforms.json"
@@ -101,19 +100,9 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
     lens = lens_of(entry, photo, place)
     expected = lens.width, lens.height
-    width, height = checked_size(photo, expected)
     pinhole = pinhole_of(lens)
-    size = round(pinhole.width * width / lens.width), round(pinhole.height * height / lens.height)
-    whole = Camera(
-        rotation=rotation,
-        translation=translation,
-        fx=pinhole.focal_length_x,
-        fy=pinhole.focal_length_y,
-        cx=pinhole.principal_point_x,
-        cy=pinhole.principal_point_y,
-        width=pinhole.width,
-        height=pinhole.height,
-    ).resize(*size)
+    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
+    whole = camera_of(pinhole, rotation, translation).resize(*size)
     remap = None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size)
     return Shot(name=name, photo=photo, whole=whole, expected_size=expected, remap=remap)
 

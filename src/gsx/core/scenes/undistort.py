@@ -1,7 +1,7 @@
 """Lens distortion out of the photos: the pinhole camera that sees (almost) the same, and the resampling to it.
 
 The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, so borders are trimmed). Pixel centres
-are at +0.5 on both rasters. Sampling is bicubic where COLMAP's own undistorter is bilinear: it keeps more detail.
+are at +0.5 on both rasters. Sampling is cubic where COLMAP's own undistorter is bilinear: it keeps more detail.
 """
 
 from collections.abc import Iterator
@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from gsx.core.camera import Camera
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.images import read_image, to_uint8, write_image
 from gsx.core.shapes import Float, UInt8
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
-METHOD = "bicubic/1"  # part of the cache key: raise the number when the resampling changes
+METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
 
 
 def is_pinhole(camera: Any) -> bool:
@@ -81,25 +80,52 @@ def undistort(image: UInt8[Tensor, "C H W"], lens: Any, pinhole: Any, size: tupl
 
     Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
     """
-    photo = image[None].float() / 255
-    bands = [
-        F.grid_sample(photo, grid[None], mode="bicubic", padding_mode="border", align_corners=False)
-        for grid in _grids(lens, pinhole, size)
-    ]
-    return to_uint8(torch.cat(bands, dim=2)[0])
+    photo = image.float() / 255
+    to_photo = torch.tensor([image.shape[2] / lens.width, image.shape[1] / lens.height], dtype=torch.float64)
+    bands = [to_uint8(sample(photo, pixels * to_photo)) for pixels in _lens_pixels(lens, pinhole, size)]
+    return torch.cat(bands, dim=1)
 
 
-def _grids(lens: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
-    """For each pixel, band by band, where on the raster of `lens` it is to be found, in [-1, 1]^2."""
+def _lens_pixels(lens: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
+    """For each pixel of the result, band by band, where `lens` sees the same, in its pixels."""
     width, height = size
     columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (pinhole.width / width)
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
     x = (columns - pinhole.principal_point_x) / pinhole.focal_length_x
-    for band in ((rows - pinhole.principal_point_y) / pinhole.focal_length_y).split(ROWS_PER_BAND):
-        grid_y, grid_x = torch.meshgrid(band, x, indexing="ij")
+    for y in ((rows - pinhole.principal_point_y) / pinhole.focal_length_y).split(ROWS_PER_BAND):
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
-        pixels = torch.from_numpy(lens.img_from_cam(rays.numpy())).reshape(len(band), width, 2)
-        yield (pixels / torch.tensor([lens.width, lens.height]) * 2 - 1).float()
+        yield torch.from_numpy(lens.img_from_cam(rays.numpy())).reshape(len(y), width, 2)
+
+
+def sample(photo: Float[Tensor, "C H W"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "C h w"]:
+    """Interpolate with Keys' cubic, a = -1/2, which leaves ramps exact; borders are repeated outwards.
+
+    torch's own bicubic `grid_sample` has a = -3/4, which shifts detail by up to 0.05 px.
+    """
+    height, width = photo.shape[1:]
+    first = (pixels - 0.5).floor()
+    across, down = _keys((pixels - 0.5 - first).float()).unbind(dim=-1)
+    column, row = first.long().unbind(dim=-1)
+    result = photo.new_zeros(photo.shape[0], *pixels.shape[:2])
+    for j in range(4):
+        line = (row + j - 1).clamp(0, height - 1) * width
+        for i in range(4):
+            index = line + (column + i - 1).clamp(0, width - 1)
+            result.addcmul_(photo.flatten(1)[:, index], across[i] * down[j])
+    return result
+
+
+def _keys(t: Float[Tensor, "*shape"]) -> Float[Tensor, "4 *shape"]:
+    """Weights of the samples at -1, 0, 1, 2 for a position t in [0, 1) (Keys 1981)."""
+    return torch.stack(
+        [
+            ((2 - t) * t - 1) * t / 2,
+            ((3 * t - 5) * t * t + 2) / 2,
+            ((4 - 3 * t) * t + 1) * t / 2,
+            (t - 1) * t * t / 2,
+        ]
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from gsx.core.scenes.demo.solids import FLAT
 from gsx.core.shapes import Float, Int
 
 SIDE = 256  # the lattice repeats after this many cells
-SLICE = (37.0, 113.0)  # lattice offset from one slice of solid noise to the next
+LAYER = (37.0, 113.0)  # lattice cells from one layer of solid noise to the next
 # Abramowitz and Stegun 4.4.47: atan x for |x| <= 1 within 1e-5 radians
 ARCTAN = (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351)
 
@@ -30,19 +30,21 @@ class Noise:
         """The value of lattice cell (i, j)."""
         return self.table.index_select(0, self.cell(i, j)).reshape(i.shape)
 
-    def plane(self, u: Float[Tensor, "*points"], v: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
-        """Smooth noise over the plane with features of size 1."""
+    def plane(
+        self, u: Float[Tensor, "*points"], v: Float[Tensor, "*points"], layer: Tensor | float = 0.0
+    ) -> Float[Tensor, "*points"]:
+        """Smooth noise over the plane with features of size 1; every whole-numbered layer is another noise."""
         i, j = u.floor(), v.floor()
-        cell = self.cell(i, j)
+        cell = self.cell(i + LAYER[0] * layer, j + LAYER[1] * layer)
         a, b, c, d = (self.table[shift:].index_select(0, cell).reshape(u.shape) for shift in (0, 1, SIDE + 1, SIDE + 2))
         x, y = ease(u - i), ease(v - j)
         return blend(blend(a, b, x), blend(c, d, x), y)
 
     def solid(self, points: Float[Tensor, "3 points"]) -> Float[Tensor, "points"]:
         """Smooth noise over space with features of size 1."""
-        k = points[2].floor()
-        u, v = points[0] + SLICE[0] * k, points[1] + SLICE[1] * k
-        return blend(self.plane(u, v), self.plane(u + SLICE[0], v + SLICE[1]), ease(points[2] - k))
+        u, v, height = points
+        layer = height.floor()
+        return blend(self.plane(u, v, layer), self.plane(u, v, layer + 1.0), ease(height - layer))
 
     def grain(
         self, u: Float[Tensor, "points"], v: Float[Tensor, "points"], octaves: int, fall: float = 0.7

@@ -57,7 +57,7 @@ def round_interval(across: list[tuple[Tensor, Tensor]]) -> Interval:
 
     Measured from the point of closest approach, which keeps its accuracy far from the solid.
     """
-    speed = sum_of([d * d for _, d in across])
+    speed = sum_of([d * d for _, d in across]).clamp(min=FLAT)
     closest = -sum_of([o * d for o, d in across]) / speed
     miss = sum_of([(o + closest * d) * (o + closest * d) for o, d in across])
     half_chord = ((1.0 - miss) / speed).sqrt()
@@ -201,7 +201,7 @@ class Solid:
 
 
 def window(solid: Solid, camera: Camera) -> tuple[slice, slice] | None:
-    """Rows and columns of the raster outside which no ray can hit the solid; None when that is all of it."""
+    """Rows and columns of the raster outside which no ray can hit the solid; None: it is out of the picture."""
     pixels, depths = camera.project(solid.corners())
     whole = slice(0, camera.height), slice(0, camera.width)
     if float(depths.min()) <= CLOSE:

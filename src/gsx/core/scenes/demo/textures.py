@@ -23,6 +23,9 @@ BRICK = (0.24, 0.085)  # length and height of a brick with its joint, scene unit
 JOINT = 0.007  # half the thickness of a mortar joint
 RING = 0.21  # width of one ring of paving
 PAVING_RADIUS = 2.35
+LEAF_LAYERS = 4
+LEAF_ROW = 0.17  # height of a row of leaves, radians of latitude
+LEAF = (0.50, 0.21)  # half length and half width of a leaf, rows
 HAZE = (5.0, 18.0)  # the lawn fades into the haze between these distances from the middle
 
 HORIZON, ZENITH, CLOUD = (0.80, 0.87, 0.93), (0.36, 0.58, 0.88), (0.97, 0.97, 0.98)
@@ -94,7 +97,7 @@ def edge_distance(x: Tensor, size: float) -> Tensor:
 
 def mineral(kit: Kit, u: Tensor, v: Tensor, size: float) -> Tensor:
     """A brightness factor around 1: grain of five octaves from `size` down."""
-    return 1.0 + GRAIN * kit.noise.grain(u * (1.0 / size), v * (1.0 / size), 5)
+    return 1.0 + GRAIN * kit.noise.grain(u / size, v / size, 5)
 
 
 def bricks(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
@@ -140,8 +143,8 @@ def crate(
     boards = boards * (0.45 + 0.55 * smoothstep(edge_distance(planks, rim / 2.5) / 0.006)) * 0.93
     label = kit.crate_label.ink(u, v) & (n[2].abs() < 0.5)
     boards = cover(boards, (0.13, 0.14, 0.20), 0.85 * label)
-    level, post = wood(kit, u, v, v.sign() + side + 40.0), wood(kit, v, u, u.sign() + side + 50.0)
-    frame = torch.where(flat, level, post) * nails(u.abs() - 0.86 * half, v.abs() - 0.86 * half)
+    level, stile = wood(kit, u, v, v.sign() + side + 40.0), wood(kit, v, u, u.sign() + side + 50.0)
+    frame = torch.where(flat, level, stile) * nails(u.abs() - 0.86 * half, v.abs() - 0.86 * half)
     inset = torch.minimum((u.abs() - rim).abs(), (v.abs() - rim).abs())
     edge = 0.55 + 0.45 * smoothstep(inset / 0.008)
     return torch.where(flat | upright, frame, boards) * torch.where(flat & upright, 1.0, edge)
@@ -197,7 +200,7 @@ def tin(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, ra
     """A tea tin: green label with lettering on two sides, metal rims and lid."""
     around = angle(p[1], p[0]) * radius
     quarter = radius * math.pi / 2
-    u = edge_signed(around, 2.0 * quarter)
+    u = wrapped(around, 2.0 * quarter)
     green = rgb((0.12, 0.36, 0.27)) * (1.0 + 0.06 * kit.noise.grain(around * 60.0, p[2] * 60.0, 4))
     lettered = cover(green, (0.94, 0.88, 0.66), kit.tin_label.ink(u, p[2]))
     stripe = ((p[2].abs() - 0.092).abs() < 0.003) | ((u.abs() - 0.97 * quarter).abs() < 0.002)
@@ -207,14 +210,9 @@ def tin(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, ra
     return torch.where((p[2].abs() > 0.105) | (n[2].abs() > 0.5), metal, label)
 
 
-def edge_signed(x: Tensor, period: float) -> Tensor:
+def wrapped(x: Tensor, period: float) -> Tensor:
     """`x` brought into [-period/2, period/2)."""
     return x - period * (x / period + 0.5).floor()
-
-
-LEAF_LAYERS = 4
-LEAF_ROW = 0.17  # height of a row of leaves, radians of latitude
-LEAF = (0.50, 0.21)  # half length and half width of a leaf, rows
 
 
 def foliage(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
@@ -319,7 +317,7 @@ def lawn(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
 
 
 def ground(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Paving in the middle with a kerb, lawn around it."""
+    """Paving in the middle, lawn around it."""
     radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
     paved = radius < PAVING_RADIUS
     colour = torch.empty_like(p)

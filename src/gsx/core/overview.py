@@ -1,0 +1,172 @@
+"""One page over all runs below a folder: a table, what cannot be compared, and PSNR against its cost."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gsx import __version__
+from gsx.core.charts import Dot, pareto_front, scatter
+from gsx.core.checkpoint import replace_file
+from gsx.core.errors import InputError
+from gsx.core.page import fixed, template
+from gsx.core.run_files import RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+
+DIFFERENCES = 6
+"""Configuration keys in which runs differ that an overview shows."""
+UNTOLD = ("folder", "output", "device")
+"""Keys that say where a run ran, not what it is."""
+FIELDS = (
+    "run", "state", "reason", "scene", "backbone", "differences", "iterations", "psnr", "ssim", "lpips", "primitives",
+    "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
+)  # fmt: skip
+"""Columns of report.csv."""
+
+
+def write_overview(folder: Path) -> Path:
+    """Write report.html and report.csv over all runs below a folder.
+
+    Raises:
+        InputError: there is no run below it.
+    """
+    runs = [read_run(path) for path in runs_below(folder)]
+    if not runs:
+        raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give the folder of some runs")
+    rows = overview_rows(folder, runs)
+    replace_file(folder / "report.csv", csv_of(rows).encode())
+    context = {
+        "title": f"{len(rows)} runs below {folder.name or folder}",
+        "version": __version__,
+        "rows": rows,
+        "states": {state: sum(row["state"] == state for row in rows) for state in {row["state"]: 0 for row in rows}},
+        "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=int),
+        "mixed": mixed_protocols(rows),
+        "comparisons": comparisons(rows),
+        "any_lpips": any(is_number(row["lpips"]) for row in rows),
+    }
+    path = folder / "report.html"
+    replace_file(path, template("overview.html").render(context).encode())
+    return path
+
+
+def overview_rows(folder: Path, runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
+    """One row for each run."""
+    told = differences(runs)
+    rows = [overview_row(folder, run, told[i]) for i, run in enumerate(runs)]
+    mixed = mixed_protocols(rows)
+    return [
+        row | {"comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"} for row in rows
+    ]
+
+
+def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
+    """The figures of a run."""
+    state, reason = state_of(run)
+    e = run.evaluation
+    zoom = {factor: gain_of(entry) for factor, entry in part(e, "zoom").items() if factor != "1"}
+    gains = {factor: gain for factor, gain in zoom.items() if gain is not None}
+    report = run.folder / "report.html"
+    return {
+        "run": run.folder.relative_to(folder).as_posix(),
+        "report": report.relative_to(folder).as_posix() if report.is_file() else "",
+        "state": state,
+        "reason": reason,
+        "scene": run.scene,
+        "backbone": run.backbone,
+        "differences": told,
+        "iterations": run.iterations,
+        **{
+            key: e.get(key)
+            for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
+        },
+        "seconds": e.get("train_seconds"),
+        "gains": gains,
+        "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
+        "protocol": run.protocol_hash,
+    }
+
+
+def differences(runs: Sequence[RunFiles]) -> list[str]:
+    """For each run the configuration values in which runs of its scene and backbone differ."""
+    flat = [flattened(run.config) for run in runs]
+    out = []
+    for run in runs:
+        alike = [flat[i] for i, other in enumerate(runs) if (other.scene, other.backbone) == (run.scene, run.backbone)]
+        keys = dict.fromkeys(key for values in alike for key in values)
+        own = flattened(run.config)
+        varied = [key for key in keys if len({repr(values.get(key)) for values in alike}) > 1]
+        words = [f"{key}={own.get(key, 'absent')}" for key in varied[:DIFFERENCES]]
+        out.append(", ".join(words) + (f", and {len(varied) - DIFFERENCES} more" if len(varied) > DIFFERENCES else ""))
+    return out
+
+
+def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys and values, without UNTOLD."""
+    out: dict[str, Any] = {}
+    for key, value in node.items():
+        if isinstance(value, dict):
+            out |= flattened(value, f"{prefix}{key}.")
+        elif f"{prefix}{key}" not in UNTOLD:
+            out[f"{prefix}{key}"] = value
+    return out
+
+
+def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """Scenes evaluated by several protocols: how many runs by each hash."""
+    counts: dict[str, dict[str, int]] = {}
+    for row in rows:
+        if row["protocol"]:
+            by_hash = counts.setdefault(row["scene"], {})
+            by_hash[row["protocol"]] = by_hash.get(row["protocol"], 0) + 1
+    return {scene: by_hash for scene, by_hash in counts.items() if len(by_hash) > 1}
+
+
+def csv_of(rows: Sequence[dict[str, Any]]) -> str:
+    """report.csv: missing figures are empty."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, FIELDS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def comparisons(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Scatter plots of each scene and protocol with at least two evaluated runs."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        if all(is_number(row[key]) for key in ("psnr", "primitives", "seconds")):
+            groups.setdefault((row["scene"], row["protocol"]), []).append(row)
+    colours = {name: i for i, name in enumerate(dict.fromkeys(row["backbone"] for row in rows))}
+    return [comparison(*key, members, colours) for key, members in groups.items() if len(members) > 1]
+
+
+def comparison(scene: str, protocol: str, rows: Sequence[dict[str, Any]], colours: dict[str, int]) -> dict[str, Any]:
+    """PSNR against primitives and against training time, with both Pareto fronts."""
+
+    def plot(key: str, x_label: str) -> dict[str, Any]:
+        dots = [
+            Dot(
+                x=row[key],
+                y=row["psnr"],
+                text=f"{row['run']}: {fixed(row['psnr'])} dB, {fixed(row[key], 0)} {x_label}",
+                label=short_name(row),
+                colour=colours[row["backbone"]] % 6,
+            )
+            for row in rows
+        ]
+        front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
+        return {"svg": scatter(dots, x_label=x_label), "front": [rows[i]["run"] for i in front], "label": x_label}
+
+    return {
+        "scene": scene,
+        "protocol": protocol,
+        "plots": [plot("primitives", "primitives"), plot("seconds", "seconds of training")],
+        "legend": {name: colours[name] % 6 for name in dict.fromkeys(row["backbone"] for row in rows)},
+    }
+
+
+def short_name(row: dict[str, Any]) -> str:
+    """What tells a run from its like, briefly."""
+    words = row["differences"].split(", ")[0]
+    return (words.split(".")[-1] if words else Path(row["run"]).name)[:24]

@@ -1,0 +1,180 @@
+"""What a run folder holds, read from files alone: any of them may be missing, cut short or damaged."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+STATES = ("ok", "running", "interrupted", "failed", "corrupted")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunFiles:
+    """Content of a run folder; empty where a file is missing or damaged."""
+
+    folder: Path
+    config: dict[str, Any]
+    config_text: str
+    environment: dict[str, Any]
+    lines: list[dict[str, Any]]
+    """Intact lines of metrics.jsonl."""
+    evaluation: dict[str, Any]
+    pictures: dict[str, Any]
+    status: dict[str, Any]
+    problems: dict[str, str]
+    """What is wrong, by file."""
+
+    @property
+    def step(self) -> int:
+        """Steps known to be done."""
+        logged = self.lines[-1].get("step", 0) if self.lines else 0
+        return max(int(self.status.get("step") or 0), int(self.evaluation.get("step") or 0), int(logged))
+
+    @property
+    def iterations(self) -> int:
+        """Steps asked for; 0 where unknown."""
+        return int(self.config.get("iterations") or 0)
+
+    @property
+    def remedy(self) -> str:
+        """The command that completes the run."""
+        verb = "eval" if 0 < self.iterations <= self.step else "resume"
+        return f"gsx {verb} {self.folder}"
+
+    @property
+    def missing(self) -> list[str]:
+        """Files that a complete run has and this one lacks."""
+        names = ("environment.json", "metrics.jsonl", "evaluation.json", "renders/index.json")
+        return [name for name in names if not (self.folder / name).is_file()]
+
+    @property
+    def scene(self) -> str:
+        """Scene, with the last part of its folder where it has one."""
+        node = part(self.config, "scene")
+        return " ".join(word for word in (str(node.get("name", "?")), Path(str(node.get("path") or "")).name) if word)
+
+    @property
+    def backbone(self) -> str:
+        """Backbone and augmenters."""
+        names = [str(part(self.config, "backbone").get("name", "?")), *part(self.config, "augmenter")]
+        return " + ".join(names)
+
+    @property
+    def protocol_hash(self) -> str:
+        """Hash of the evaluation protocol; empty without an evaluation."""
+        return str(part(self.evaluation, "protocol").get("hash", ""))
+
+
+def part(content: dict[str, Any], key: str) -> dict[str, Any]:
+    """A mapping inside a mapping; empty where there is none."""
+    value = content.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def read_run(folder: Path) -> RunFiles:
+    """Everything that can be read of a run."""
+    problems: dict[str, str] = {}
+    config, text = read_yaml(folder / "config.yaml", problems)
+    evaluation = read_mapping(folder, "evaluation.json", problems)
+    if evaluation and not (is_number(evaluation.get("psnr")) or "views" in evaluation):
+        problems["evaluation.json"] = "evaluation.json holds no figures"
+        evaluation = {}
+    return RunFiles(
+        folder=folder,
+        config=config,
+        config_text=text,
+        environment=read_mapping(folder, "environment.json", problems),
+        lines=read_lines(folder / "metrics.jsonl", problems),
+        evaluation=evaluation,
+        pictures=read_mapping(folder, "renders/index.json", problems),
+        status=read_mapping(folder, "status.json", problems),
+        problems=problems,
+    )
+
+
+def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str]:
+    """Mapping and text of a YAML file."""
+    import yaml  # type: ignore[import-untyped]
+
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        problems[path.name] = f"{path.name} cannot be read ({str(error).splitlines()[0]})"
+        return {}, ""
+    return (content if isinstance(content, dict) else {}), text
+
+
+def read_mapping(folder: Path, name: str, problems: dict[str, str]) -> dict[str, Any]:
+    """A JSON object; empty where the file is missing or damaged."""
+    try:
+        content = json.loads((folder / name).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        problems[name] = f"{name} cannot be read ({error})"
+        return {}
+    if not isinstance(content, dict):
+        problems[name] = f"{name} holds no JSON object"
+        return {}
+    return content
+
+
+def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
+    """The intact lines of metrics.jsonl in order of their steps; a resumed run may have cut one short."""
+    if not path.is_file():
+        return []
+    intact, damaged = [], 0
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            line = json.loads(text)
+        except ValueError:
+            line = None
+        if isinstance(line, dict) and is_number(line.get("step")):
+            intact.append(line)
+        else:
+            damaged += 1
+    if damaged:
+        problems[path.name] = f"{damaged} lines of {path.name} are damaged and left out"
+    return sorted(intact, key=lambda line: line["step"])
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether it is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
+    """Zoomed render minus enlarged x1 render; positive: the zoomed render is closer to the truth."""
+    render, enlarged = entry.get(figure), entry.get(f"enlarged_{figure}")
+    return render - enlarged if is_number(render) and is_number(enlarged) else None
+
+
+def state_of(files: RunFiles) -> tuple[str, str]:
+    """One of STATES, and the reason where it is not `ok`."""
+    recorded = files.status.get("state")
+    for name in ("config.yaml", "evaluation.json"):
+        if name in files.problems:
+            return "corrupted", files.problems[name]
+    if recorded == "failed":
+        return "failed", str(files.status.get("reason") or "no reason recorded")
+    if not files.evaluation:
+        done = f"{files.step:,} of {files.iterations:,} steps, not evaluated"
+        return ("running", f"under way or killed: {done}") if recorded == "running" else ("interrupted", done)
+    evaluated = int(files.evaluation.get("step") or 0)
+    if evaluated < max(files.step, files.iterations) or recorded == "interrupted":
+        return "interrupted", f"evaluated at step {evaluated:,}, trained to {files.step:,} of {files.iterations:,}"
+    return "ok", ""
+
+
+def runs_below(folder: Path) -> Iterator[Path]:
+    """Folders with a config.yaml, sorted; nothing inside a run is searched."""
+    for child in sorted(folder.iterdir()):
+        if not child.is_dir() or child.name.startswith("."):
+            continue
+        if (child / "config.yaml").is_file():
+            yield child
+        else:
+            yield from runs_below(child)
