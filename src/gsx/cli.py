@@ -150,9 +150,11 @@ def interruptible(run: "Run") -> Iterator[None]:
 def verb_train(words: list[str]) -> int:
     """gsx OVERRIDES..."""
     set_up_logging()
-    if words and words[0].startswith("-"):
-        if words[0] not in HYDRA_FLAGS:
-            raise ConfigError(f"'{words[0]}' is no option of gsx.{nearest(words[0], HYDRA_FLAGS)} See gsx --help")
+    flags = [word for word in words if word.startswith("-")]
+    for flag in flags:
+        if flag.split("=")[0] not in HYDRA_FLAGS:
+            raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
+    if flags:
         return hand_to_hydra(words)
     from gsx.core.config import compose
 

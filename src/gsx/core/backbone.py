@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -44,6 +44,7 @@ class Gaussians:
     sh_rest: Float[Tensor, "N B 3"]
 
 
+@runtime_checkable
 class Backbone(Protocol):
     """A scene representation that trains itself and hands out splats.
 

@@ -11,12 +11,14 @@ from gsx.core.charts import Dot, pareto_front, scatter
 from gsx.core.checkpoint import replace_file
 from gsx.core.errors import InputError
 from gsx.core.page import fixed, template
-from gsx.core.run_files import RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+from gsx.core.run_files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
 UNTOLD = ("folder", "output", "device")
 """Keys that say where a run ran, not what it is."""
+LABEL = 32
+"""Longest name beside a point."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "differences", "iterations", "psnr", "ssim", "lpips", "primitives",
     "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
@@ -39,7 +41,7 @@ def write_overview(folder: Path) -> Path:
         "title": f"{len(rows)} runs below {folder.name or folder}",
         "version": __version__,
         "rows": rows,
-        "states": {state: sum(row["state"] == state for row in rows) for state in {row["state"]: 0 for row in rows}},
+        "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
         "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=int),
         "mixed": mixed_protocols(rows),
         "comparisons": comparisons(rows),
@@ -88,17 +90,24 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
 
 
 def differences(runs: Sequence[RunFiles]) -> list[str]:
-    """For each run the configuration values in which runs of its scene and backbone differ."""
+    """For each run its values of the configuration keys in which runs of its scene and backbone differ."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, run in enumerate(runs):
+        groups.setdefault((run.scene, run.backbone), []).append(i)
     flat = [flattened(run.config) for run in runs]
-    out = []
-    for run in runs:
-        alike = [flat[i] for i, other in enumerate(runs) if (other.scene, other.backbone) == (run.scene, run.backbone)]
-        keys = dict.fromkeys(key for values in alike for key in values)
-        own = flattened(run.config)
-        varied = [key for key in keys if len({repr(values.get(key)) for values in alike}) > 1]
-        words = [f"{key}={own.get(key, 'absent')}" for key in varied[:DIFFERENCES]]
-        out.append(", ".join(words) + (f", and {len(varied) - DIFFERENCES} more" if len(varied) > DIFFERENCES else ""))
+    out = [""] * len(runs)
+    for members in groups.values():
+        varied = varied_keys([flat[i] for i in members])
+        more = f", and {len(varied) - DIFFERENCES} more" if len(varied) > DIFFERENCES else ""
+        for i in members:
+            out[i] = ", ".join(f"{key}={flat[i].get(key, 'absent')}" for key in varied[:DIFFERENCES]) + more
     return out
+
+
+def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
+    """Keys whose values are not the same in all configurations, in their order."""
+    keys = dict.fromkeys(key for config in configs for key in config)
+    return [key for key in keys if len({repr(config.get(key)) for config in configs}) > 1]
 
 
 def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -167,6 +176,7 @@ def comparison(scene: str, protocol: str, rows: Sequence[dict[str, Any]], colour
 
 
 def short_name(row: dict[str, Any]) -> str:
-    """What tells a run from its like, briefly."""
-    words = row["differences"].split(", ")[0]
-    return (words.split(".")[-1] if words else Path(row["run"]).name)[:24]
+    """What tells a run from its like, or else its folder, cut to what fits beside a point."""
+    words = [word.split(".")[-1] for word in row["differences"].split(", ") if word]
+    name = " ".join(words) or Path(row["run"]).name
+    return name if len(name) <= LABEL else name[: LABEL - 1] + "…"

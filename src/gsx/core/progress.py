@@ -5,14 +5,15 @@ import sys
 import time
 from typing import IO, TextIO
 
+from gsx.core.checkpoint import replace_file
 from gsx.core.evaluate import EvalOptions, peak_memory_mb, quick_psnr
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
 LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0
 """Time between updates on a terminal, and elsewhere (a Slurm log stays readable)."""
-SMOOTHING = 0.05
-"""Weight of the newest step in the displayed loss, PSNR and speed."""
+SMOOTHING = 0.3
+"""Weight of the newest line in the displayed loss, PSNR and speed."""
 
 
 def clock(seconds: float) -> str:
@@ -25,24 +26,31 @@ def clock(seconds: float) -> str:
 class Progress:
     """Listener: shows step, speed, loss, PSNR, primitives, memory and time left."""
 
-    def __init__(self, stream: TextIO = sys.stderr) -> None:
-        self.stream = stream
-        self.live = stream.isatty()
-        self.shown = 0.0
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = sys.stderr if stream is None else stream
+        self.live = self.stream.isatty()
+        self.shown = time.monotonic() - PLAIN_SECONDS
+        self.done = (0, 0.0)
         self.averages: dict[str, float] = {}
         self.width = 0
 
     @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Speed is measured from here on."""
+        self.done = (run.step, run.seconds)
+
+    @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
-        """Update the averages, and the line when it is time."""
-        self.average("seconds", run.seconds - self.averages.get("until", run.seconds))
-        self.averages["until"] = run.seconds
+        """Show the line when it is time."""
         now = time.monotonic()
         if now - self.shown < (LIVE_SECONDS if self.live else PLAIN_SECONDS) and not run.complete:
             return
-        self.average("loss", float(step.loss), 0.3)
-        self.average("psnr", step.psnr(), 0.3)
         self.shown = now
+        self.average("loss", float(step.loss))
+        self.average("psnr", step.psnr())
+        steps, seconds = run.step - self.done[0], run.seconds - self.done[1]
+        self.average("speed", steps / max(seconds, 1e-9))
+        self.done = (run.step, run.seconds)
         self.show(self.line(run))
 
     @hookimpl
@@ -51,19 +59,18 @@ class Progress:
         if self.live:
             self.stream.write("\n")
 
-    def average(self, name: str, value: float, weight: float = SMOOTHING) -> None:
-        """Exponential average."""
-        old = self.averages.get(name) or value
-        self.averages[name] = old + weight * (value - old)
+    def average(self, name: str, value: float) -> None:
+        """Exponential average of what was shown."""
+        old = self.averages.get(name, value)
+        self.averages[name] = old + SMOOTHING * (value - old)
 
     def line(self, run: Run) -> str:
         """The line as shown."""
-        a, seconds = self.averages, max(self.averages["seconds"], 1e-9)
-        primitives = run.backbone.size()[0]
+        a, primitives = self.averages, run.backbone.size()[0]
         return (
-            f"step {run.step}/{run.iterations}  {1 / seconds:.1f} it/s  loss {a['loss']:.4f}  "
+            f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
             f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {peak_memory_mb(run.device):,.0f} MB  "
-            f"ETA {clock((run.iterations - run.step) * seconds)}"
+            f"ETA {clock((run.iterations - run.step) / a['speed'])}"
         )
 
     def show(self, text: str) -> None:
@@ -85,13 +92,11 @@ class MetricsLog:
     def gsx_run_started(self, run: Run) -> None:
         """Open the file; a resumed run drops lines later than its checkpoint."""
         path = run.folder / "metrics.jsonl"
-        lines = (
-            [json.loads(line) for line in path.read_text().splitlines() if complete_line(line)] if path.exists() else []
-        )
+        written = path.read_text().splitlines() if path.exists() else []
+        lines = [json.loads(line) for line in written if line.endswith("}")]  # a crash may cut off the last
         run.curves[:] = [line for line in lines if line["step"] <= run.step]
-        self.stream = path.open("w")
-        for line in run.curves:
-            self.stream.write(json.dumps(line) + "\n")
+        replace_file(path, "".join(json.dumps(line) + "\n" for line in run.curves).encode())
+        self.stream = path.open("a")
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
@@ -127,8 +132,3 @@ class MetricsLog:
         """Close the file."""
         if self.stream is not None:
             self.stream.close()
-
-
-def complete_line(line: str) -> bool:
-    """False for a line cut off by a crash."""
-    return line.endswith("}")

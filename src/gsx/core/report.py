@@ -26,6 +26,8 @@ WORST = 10
 """Views in the table of the worst."""
 SMOOTHING = 0.02
 """Curves are averaged over this fraction of their lines to either side."""
+NAMES = {"psnr": "training", "step_ms": "ms"}
+"""Figures of metrics.jsonl as they are called under the pointer."""
 IMAGE_KINDS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
@@ -111,7 +113,7 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
         card("Primitives", fixed(e.get("primitives"), 0), "", f"{fixed(visible, 0)} in a view" if visible else ""),
         card("Size", fixed(e.get("megabytes"), 1), "MB", "needed to render"),
         card("Rendering", fixed(e.get("render_fps"), 1), "fps", "at training size"),
-        card("Training", duration(e.get("train_seconds")), "", "without evaluation"),
+        card("Training", duration(e.get("train_seconds")), "", "steps alone"),
         card("Peak memory", fixed(e.get("peak_memory_mb"), 0), "MB", ""),
     ]
 
@@ -225,7 +227,7 @@ def series_of(lines: Sequence[dict[str, Any]], name: str, at: Callable[[dict[str
     """The raw values faintly, their smoothed course, and held-out points for PSNR."""
     x, y = column(lines, name, at)
     smooth = smoothed(y, 0 if name == "primitives" else math.ceil(SMOOTHING * len(y)))
-    out = [Series(name=name.replace("step_ms", "ms"), x=x, y=smooth)]
+    out = [Series(name=NAMES.get(name, name), x=x, y=smooth)]
     if name in ("psnr", "step_ms"):
         out.insert(0, Series(name=f"{name} of one line", x=x, y=y, kind="faint"))
     if name == "psnr":

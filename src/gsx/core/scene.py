@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from gsx.core.camera import Camera
 from gsx.core.shapes import Float, UInt8
 
 
+@runtime_checkable
 class ImageSource(Protocol):
     """Where the truth of one view comes from: a photograph, or an analytic scene."""
 

@@ -296,6 +296,14 @@ def test_text_file_cut_in_half_is_an_error_of_that_model(tmp_path: Path, name: s
         load(colmap_options(tmp_path))
 
 
+def test_points_that_images_observe_but_the_file_has_lost_are_an_error(tmp_path: Path) -> None:
+    model = write_scene(synthesize(), tmp_path, text=True)
+    lines = (model / "points3D.txt").read_text().splitlines()
+    (model / "points3D.txt").write_text("\n".join(lines[:-7]) + "\n")
+    with pytest.raises(InputError, match=r"points3D\.txt is truncated"):
+        load(colmap_options(tmp_path))
+
+
 # do cameras and observations agree
 
 
@@ -368,7 +376,7 @@ def lens(model: str, width: int = 400, height: int = 300) -> Any:
     """A camera with some of every distortion its model has."""
     camera = pycolmap.Camera.create_from_model_name(1, model, 350.0, width, height)
     params = np.array(camera.params)
-    params[list(camera.extra_params_idxs())] += 0.02
+    params[list(camera.extra_params_idxs())] += 0.5 if model == "FOV" else 0.02
     camera.params = params
     return camera
 

@@ -29,7 +29,7 @@ from gsx.core.scenes.demo.still_life import (
     sunlight,
     thing_colour,
 )
-from gsx.core.scenes.demo.textures import cosine
+from gsx.core.scenes.demo.textures import cosine, specular
 from gsx.core.scenes.demo.tracing import GROUND, SKY, camera_rays, lattice, rays_through, render, slopes, trace
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -280,6 +280,13 @@ def test_a_highlight_stands_where_the_sun_is_mirrored(life):
         for shine in (0.0, 0.25)
     )
     torch.testing.assert_close((shiny - dull)[0], torch.tensor([0.25, 0.0]), atol=1e-4, rtol=0)
+
+
+def test_the_highlight_falls_off_with_the_64th_power():
+    slant = torch.tensor([0.0, 0.1, 0.3, 2.0])
+    halfway = torch.stack([slant.sin(), torch.zeros(4), slant.cos()])
+    shine = specular(torch.tensor([[0.0], [0.0], [1.0]]).expand(3, 4), halfway)
+    torch.testing.assert_close(shine, slant.cos().clamp(min=0) ** 64, atol=1e-6, rtol=0)
 
 
 def test_no_solid_that_matters_is_left_out_of_shadows_and_contacts(life, scene):

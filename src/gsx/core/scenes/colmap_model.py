@@ -8,17 +8,18 @@ import copy
 import logging
 import mmap
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
 from gsx.core.scene import PointCloud
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 
 logger = logging.getLogger(__name__)
 
@@ -119,14 +120,23 @@ def read_model(folder: Path) -> Model:
     if _suffix(folder) == ".bin":
         check_binary(folder)
     reconstruction = _reconstruction(folder)
-    points, finite = _points(reconstruction, files["points3D"])
+    numbers = sorted(reconstruction.points3D)
+    points = [reconstruction.point3D(number) for number in numbers]
+    positions = _stack([point.xyz for point in points], 3)
+    usable = _usable(positions)
+    if not usable.any():
+        raise InputError(
+            f"{files['points3D']} holds no points with finite coordinates, but training starts from points: "
+            "triangulate the model (colmap point_triangulator) or reconstruct the photos with scene=photos."
+        )
+    colours = torch.from_numpy(np.array([point.color for point in points]))
     return Model(
         folder=folder,
         cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
-        images=_images(reconstruction, finite),
-        points=points,
+        images=_images(reconstruction, dict(zip(numbers, positions, strict=True)), files["points3D"]),
+        points=PointCloud(positions[usable].float(), colours[usable]),
         mean_error=reconstruction.compute_mean_reprojection_error(),
-        notes=_dropped_note(reconstruction.num_points3D() - len(finite)),
+        notes=_dropped_note(int((~usable).sum())),
     )
 
 
@@ -240,48 +250,40 @@ def _present(folder: Path) -> Iterator[Path]:
     return (file for name in names if (file := folder / f"{name}{_suffix(folder)}").is_file())
 
 
-def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, dict[int, Float[Tensor, "3"]]]:
-    """The finite points in order of their ids, and float64 positions by id."""
-    entries = sorted(reconstruction.points3D.items())
-    finite = {number: point for number, point in entries if _is_finite(point.xyz)}
-    if not finite:
-        raise InputError(
-            f"{file} holds no points with finite coordinates, but training starts from points: triangulate the model "
-            "(colmap point_triangulator) or reconstruct the photos with scene=photos."
-        )
-    positions = {number: torch.from_numpy(point.xyz.copy()) for number, point in finite.items()}
-    colours = torch.stack([torch.from_numpy(point.color.copy()) for point in finite.values()])
-    return PointCloud(torch.stack(list(positions.values())).float(), colours), positions
-
-
-def _is_finite(xyz: Any) -> bool:
-    return bool(abs(xyz).max() < torch.finfo(torch.float32).max)  # false for NaN as well
+def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+    """Which points are finite in float32; false for NaN as well."""
+    return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
 
 
 def _dropped_note(dropped: int) -> list[str]:
     return [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
 
 
-def _images(reconstruction: Any, positions: dict[int, Float[Tensor, "3"]]) -> list[ModelImage]:
+def _images(reconstruction: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> list[ModelImage]:
     images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
-    return [_image(image, positions) for image in sorted(images, key=lambda image: image.name)]
+    return [_image(image, positions, file) for image in sorted(images, key=lambda image: image.name)]
 
 
-def _image(image: Any, positions: dict[int, Float[Tensor, "3"]]) -> ModelImage:
-    pose = image.cam_from_world()
+def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> ModelImage:
+    """An image with its observations; `file` is named if it lacks one of the points in `positions`."""
     indices = image.get_observation_point2D_idxs()
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
     seen = [image.point2D(index) for index in indices[::step]]
-    seen = [point for point in seen if point.point3D_id in positions]
+    lost = next((point.point3D_id for point in seen if point.point3D_id not in positions), None)
+    if lost is not None:
+        raise InputError(f"{file} is truncated: {image.name} observes its point {lost}; copy or make the model again.")
+    observed = _stack([positions[point.point3D_id] for point in seen], 3)
+    usable, pose = _usable(observed), image.cam_from_world()
     return ModelImage(
         name=image.name,
         camera_id=image.camera_id,
         rotation=torch.from_numpy(pose.rotation.matrix().copy()),
         translation=torch.from_numpy(pose.translation.copy()),
-        keypoints=_stack([torch.from_numpy(point.xy.copy()) for point in seen], 2),
-        observed=_stack([positions[point.point3D_id] for point in seen], 3),
+        keypoints=_stack([point.xy for point in seen], 2)[usable],
+        observed=observed[usable],
     )
 
 
-def _stack(rows: list[Tensor], width: int) -> Float[Tensor, "K W"]:
-    return torch.stack(rows) if rows else torch.zeros(0, width, dtype=torch.float64)
+def _stack(rows: Sequence[Any], width: int) -> Float[Tensor, "K W"]:
+    """Rows of numbers as a float64 matrix, also when there are none."""
+    return torch.from_numpy(np.array(rows, dtype=np.float64).reshape(-1, width))

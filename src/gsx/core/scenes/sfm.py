@@ -110,7 +110,7 @@ def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) ->
             cancellation_token=token,
         )  # fmt: skip
 
-    _watched("features of photos", work, lambda: _rows(database, "keypoints"), len(sizes))
+    watched("features of photos", work, lambda: _rows(database, "keypoints"), len(sizes))
 
 
 def chosen_matcher(count: int, options: SfmOptions) -> str:
@@ -135,34 +135,35 @@ def _match(database: Path, count: int, options: SfmOptions) -> None:
     matching.num_threads = options.num_threads or -1
     matching.use_gpu = False
     verification.ransac.random_seed = options.seed
-    match, pairing = _pairs(chosen_matcher(count, options), options.overlap)
+    matcher = chosen_matcher(count, options)
+    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[matcher]
 
     def work(token: Any) -> None:
         match(
             database,
             matching_options=matching,
-            pairing_options=pairing,
+            pairing_options=pairing_options(matcher, options.overlap),
             verification_options=verification,
             device=pycolmap.Device.cpu,
             cancellation_token=token,
         )
 
     total = pair_count(count, options)
-    _watched("matches of pairs", work, lambda: _rows(database, "two_view_geometries"), total)
+    watched("matches of pairs", work, lambda: _rows(database, "two_view_geometries"), total)
 
 
-def _pairs(matcher: str, overlap: int) -> tuple[Callable[..., None], Any]:
-    """pycolmap's matching function and its options."""
+def pairing_options(matcher: str, overlap: int) -> Any:
+    """pycolmap's options for which pairs to match."""
     import pycolmap
 
     if matcher == "exhaustive":
         every = pycolmap.ExhaustivePairingOptions()
         every.block_size = PAIR_BLOCK
-        return pycolmap.match_exhaustive, every
+        return every
     neighbours = pycolmap.SequentialPairingOptions()
     neighbours.overlap = overlap
     neighbours.loop_detection = False  # it would need a vocabulary tree, which COLMAP downloads
-    return pycolmap.match_sequential, neighbours
+    return neighbours
 
 
 def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOptions) -> dict[int, Any]:
@@ -185,10 +186,10 @@ def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOpt
             cancellation_token=token,
         )
 
-    return _watched("placing photos", work, lambda: len(placed), count)
+    return watched("placing photos", work, lambda: len(placed), count)
 
 
-def _watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total: int) -> T:
+def watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total: int) -> T:
     """Run `work` in a thread and log how far it is; an interruption (Ctrl-C) cancels it."""
     import pycolmap
 
