@@ -114,11 +114,17 @@ def set_up_logging() -> None:
     root.handlers = [handler]
 
 
-def log_to(folder: Path) -> None:
+@contextmanager
+def logged_to(folder: Path) -> Iterator[None]:
     """Also write messages to the run's log.txt."""
     handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logging.getLogger("gsx").addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger("gsx").removeHandler(handler)
+        handler.close()
 
 
 def plugins() -> "Plugins":
@@ -175,7 +181,6 @@ def train(settings: "Settings", loaded: "Plugins") -> int:
     from gsx.core.session import start
 
     run = start(settings, loaded)
-    log_to(run.folder)
     return carry_out(run, settings, loaded)
 
 
@@ -183,7 +188,7 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     """Train to the end or to Ctrl-C, and say where things are."""
     from gsx.core.session import execute
 
-    with interruptible(run):
+    with interruptible(run), logged_to(run.folder):
         execute(run, settings, loaded)
     if not run.complete:
         sys.stderr.write(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n")
@@ -210,7 +215,6 @@ def verb_resume(words: list[str]) -> int:
     if run.complete:
         raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
     write_config(folder / "config.yaml", settings.resolved)
-    log_to(folder)
     logger.info("resuming %s at step %d", folder, run.step)
     return carry_out(run, settings, loaded)
 

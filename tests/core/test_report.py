@@ -60,7 +60,7 @@ def evaluation(**changes: Any) -> dict[str, Any]:
         "visible_primitives": 4321.0,
         "megabytes": 29.1,
         "render_fps": 12.5,
-        "train_seconds": 754.2,
+        "train_seconds": 734.2,
         "peak_memory_mb": 812.0,
         "groups": {"near": {"psnr": 24.25, "ssim": 0.9, "lpips": None}},
         "zoom": {
@@ -164,16 +164,7 @@ def test_every_anchor_exists(page: Page) -> None:
 
 def test_headline_figures(page: Page) -> None:
     text = page.text("figures")
-    for words in (
-        "24.25 dB",
-        "0.9000 inria",
-        "n/a no weights",
-        "123,456",
-        "29.1 MB",
-        "12.5 fps",
-        "12 min 34 s",
-        "812 MB",
-    ):
+    for words in ("24.25 dB", "0.9000 inria", "n/a no weights", "123,456", "29.1 MB", "12.5 fps", "12 min", "812 MB"):
         assert words in text
 
 
@@ -184,6 +175,14 @@ def test_zoom_verdicts_say_what_they_mean(page: Page) -> None:
     assert text.count("SSIM says the opposite") == 1
     assert "×8 n/a n/a" in text
     assert "the images hold no truth at x8" in text
+
+
+def test_gains_nobody_can_see_are_no_detail(tmp_path: Path) -> None:
+    result = evaluation(zoom={"2": zoom_entry(23.04, 23.0), "4": zoom_entry(21.0, 21.06, 0.6, 0.7)})
+    text = Page(write_report(make_run(tmp_path / "run", result=result))).text("zoom")
+    assert "win Hardly a difference: 0.04 dB closer to" in text
+    assert "loss Hardly a difference: 0.06 dB further from" in text
+    assert "SSIM says" not in text
 
 
 def test_pictures_are_embedded_byte_for_byte(tmp_path: Path) -> None:
@@ -204,6 +203,7 @@ def test_curves_over_steps_and_seconds_with_marks(page: Page) -> None:
     assert held_out == {"name": "held-out", "x": [500, 1000], "y": [17, 24]}
     minutes = next(chart for chart in charts if chart["label"] == "minutes of training")
     assert next(s for s in minutes["series"] if s["name"] == "held-out")["x"] == [6.25, 12.5]
+    assert page.text("curves").count("opacity reset skipped step") == 4
     assert page.source.count("opacity reset at step 300") == 8
     assert page.source.count("step 600 skipped: loss is not finite") == 8
 
@@ -283,6 +283,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         ({"state": "interrupted", "step": 500}, None, "interrupted", "1,000 of 1,000 steps, not evaluated"),
         ({"state": "running"}, evaluation(), "ok", ""),
         ({"state": "ok"}, evaluation(step=500), "interrupted", "evaluated at step 500, trained to 1,000"),
+        ({"state": "interrupted"}, evaluation(step=999), "interrupted", "evaluated at step 999"),
         ({}, evaluation(), "ok", ""),
     ],
 )
@@ -426,8 +427,8 @@ def test_names_cannot_break_out_of_a_chart() -> None:
 
 
 def test_numbers_in_words() -> None:
-    assert [duration(s) for s in (4.25, 42.4, 59.7, 725, 12000, None)] == [
-        "4.2 s", "42 s", "1 min 00 s", "12 min 05 s", "3 h 20 min", "n/a",
+    assert [duration(s) for s in (4.25, 42.4, 59.7, 305, 2520, 12000, None)] == [
+        "4.2 s", "42 s", "1 min 00 s", "5 min 05 s", "42 min", "3 h 20 min", "n/a",
     ]  # fmt: skip
     assert [fixed(1234.5, 1), fixed(None), fixed(math.nan), fixed(True)] == ["1,234.5", "n/a", "n/a", "n/a"]
     assert [signed(0.5), signed(-1.25, 1)] == ["+0.50", "−1.2"]

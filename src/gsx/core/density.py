@@ -60,16 +60,15 @@ def edit(table: Table, name: str, change: Callable[[Tensor], Tensor], moments: C
     table.parameters[name] = new
 
 
+def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
+    """A function that appends `new` to the rows of a tensor."""
+    return lambda old: torch.cat([old, new])
+
+
 def append_rows(table: Table, rows: dict[str, Tensor]) -> None:
     """Append rows to every parameter; `rows` names all of them. New rows start with zero moments."""
     for name in table.parameters:
-        new = rows[name]
-        edit(
-            table,
-            name,
-            lambda old, new=new: torch.cat([old, new]),
-            lambda m, new=new: torch.cat([m, torch.zeros_like(new)]),
-        )  # type: ignore[misc]
+        edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
 
 
 def keep_rows(table: Table, kept: Bool[Tensor, "N"]) -> None:

@@ -78,7 +78,7 @@ class Lpips(nn.Module):
             )
         self.net, self.signed = net, input_range == "signed"
         self.stages = vgg_stages() if net == "vgg" else alex_stages()
-        widths = [stage[-2].out_channels for stage in self.stages]
+        widths = [stage[-1] for stage in VGG_STAGES] if net == "vgg" else [layer[0] for layer in ALEX_LAYERS]
         self.heads = nn.ParameterList([torch.zeros(width) for width in widths])
         self.note = ""
 

@@ -22,14 +22,16 @@ def signed(value: Any, digits: int = 2) -> str:
 
 
 def duration(seconds: Any) -> str:
-    """42 s, 12 min 05 s, 3 h 20 min, or n/a."""
+    """42 s, 5 min 05 s, 42 min, 3 h 20 min, or n/a."""
     if not is_number(seconds):
         return NONE
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
-    if whole < 3600:
+    if whole < 600:
         return f"{whole // 60} min {whole % 60:02d} s"
+    if whole < 3600:
+        return f"{whole // 60} min"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 

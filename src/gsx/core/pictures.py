@@ -211,10 +211,12 @@ def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
 def most_detailed(image: Float[Tensor, "3 H W"], edge: int) -> Window:
     """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid."""
     height, width = min(edge, image.shape[1]), min(edge, image.shape[2])
-    energy = gradient_energy(image)
-    means = avg_pool2d(energy[None], (height, width), stride=WINDOW_STEP)[0]
+    cells = avg_pool2d(gradient_energy(image)[None], WINDOW_STEP, ceil_mode=True)
+    reach = [min(edge // WINDOW_STEP, size) for size in cells.shape[1:]]
+    means = avg_pool2d(cells, reach, stride=1)[0]
     row, column = divmod(int(means.argmax()), means.shape[1])
-    return Window(column * WINDOW_STEP, row * WINDOW_STEP, width, height)
+    left, top = min(column * WINDOW_STEP, image.shape[2] - width), min(row * WINDOW_STEP, image.shape[1] - height)
+    return Window(left, top, width, height)
 
 
 def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:

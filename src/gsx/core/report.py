@@ -26,6 +26,8 @@ WORST = 10
 """Views in the table of the worst."""
 SMOOTHING = 0.02
 """Curves are averaged over this fraction of their lines to either side."""
+HARDLY = 0.1
+"""Gains below this, in dB, cannot be seen: they are neither called detail nor artefacts."""
 NAMES = {"psnr": "training", "step_ms": "ms"}
 """Figures of metrics.jsonl as they are called under the pointer."""
 IMAGE_KINDS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -148,7 +150,10 @@ def zoom_sentence(factor: str, entry: dict[str, Any]) -> str:
         return "The training resolution: what the other rows fall from."
     if gain is None:
         return "The figures are incomplete."
-    if gain > 0:
+    if abs(gain) < HARDLY:
+        side = "closer to" if gain > 0 else "further from"
+        text = f"Hardly a difference: {abs(gain):.2f} dB {side} the truth than enlarging the ×1 render."
+    elif gain > 0:
         text = f"Real detail: {gain:.2f} dB closer to the truth than enlarging the ×1 render."
     else:
         text = f"Artefacts, not detail: {-gain:.2f} dB further from the truth than simply enlarging the ×1 render."

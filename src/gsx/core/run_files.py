@@ -164,7 +164,7 @@ def state_of(files: RunFiles) -> tuple[str, str]:
         done = f"{files.step:,} of {files.iterations:,} steps, not evaluated"
         return ("running", f"under way or killed: {done}") if recorded == "running" else ("interrupted", done)
     evaluated = int(files.evaluation.get("step") or 0)
-    if evaluated < max(files.step, files.iterations) or recorded == "interrupted":
+    if evaluated < max(files.step, files.iterations):
         return "interrupted", f"evaluated at step {evaluated:,}, trained to {files.step:,} of {files.iterations:,}"
     return "ok", ""
 

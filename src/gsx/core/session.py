@@ -95,10 +95,6 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
 def build(settings: Settings, scene: Scene, folder: Path) -> Run:
     """Everything of a run in memory, at step 0."""
     general = settings.general
-    if general.iterations < 1:
-        raise ConfigError(f"iterations is {general.iterations}; give at least 1")
-    if not scene.test:
-        raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
     device = choose_device(general.device)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
@@ -169,10 +165,9 @@ def finite(content: Any) -> Any:
 def announce(run: Run, plugins: Plugins) -> None:
     """Say what is about to be trained, and by which schedule."""
     scene = run.scene
-    logger.info(
-        "scene %s: %d training and %d test views of %dx%d px, %s points, extent %.3g",
-        scene.name, len(scene.train), len(scene.test), *scene.train[0].camera.size, f"{len(scene.points):,}", scene.extent,
-    )  # fmt: skip
+    size, points = "%dx%d" % scene.train[0].camera.size, f"{len(scene.points):,}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {size} px"
+    logger.info("scene %s: %s, %s points, extent %.3g", scene.name, views, points, scene.extent)
     for note in scene.notes:
         logger.info("note: %s", note)
     for failure in plugins.failures:
@@ -184,10 +179,29 @@ def announce(run: Run, plugins: Plugins) -> None:
     )
 
 
+def load_scene(settings: Settings) -> Scene:
+    """The scene, with views to evaluate on.
+
+    Raises:
+        InputError: it cannot be loaded, or the split leaves no test views.
+    """
+    scene: Scene = settings.scene.component.factory(settings.scene.options)
+    if not scene.test:
+        raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
+    return scene
+
+
 def start(settings: Settings, plugins: Plugins) -> Run:
-    """Load the scene and build a run in a new folder, with config.yaml and environment.json written."""
-    scene = settings.scene.component.factory(settings.scene.options)
-    run = build(settings, scene, new_folder(settings, scene))
+    """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
+
+    Raises:
+        ConfigError, InputError: something is wrong; no folder was made.
+    """
+    if settings.general.iterations < 1:
+        raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
+    choose_device(settings.general.device)
+    run = build(settings, load_scene(settings), Path())
+    run.folder = new_folder(settings, run.scene)
     write_config(run.folder / "config.yaml", settings.resolved)
     write_json(run.folder / "environment.json", environment(run, plugins))
     return run
@@ -203,7 +217,7 @@ def open_run(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> t
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
     settings = read_config(folder / "config.yaml", plugins, overrides)
-    run = build(settings, settings.scene.component.factory(settings.scene.options), folder)
+    run = build(settings, load_scene(settings), folder)
     checkpoint.restore(run)
     return run, settings
 

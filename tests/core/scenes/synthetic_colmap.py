@@ -1,19 +1,20 @@
 """COLMAP scenes on disk for tests: cameras on a sphere around points, made by pycolmap, with photos of noise."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 import torch
-from omegaconf import OmegaConf
 
+from gsx.core.config import compose_raw, hydra_session, typed
 from gsx.core.images import write_image
+from gsx.core.plugins import load_plugins
 from gsx.core.scenes.colmap import ColmapOptions
 
 WIDTH, HEIGHT = 64, 48
 PINHOLE = (80.0, 82.0, 30.0, 25.0)  # fx, fy, cx, cy; the principal point is off the centre
-CONF = Path(__file__).parents[3] / "conf" / "scene"
 
 
 def synthesize(
@@ -54,10 +55,15 @@ def write_scene(reconstruction: Any, folder: Path, *, sparse: str = "sparse/0", 
     return model
 
 
+@cache
+def shipped(kind: str) -> dict[str, Any]:
+    """The values that `gsx scene=<kind>` starts from."""
+    with hydra_session(load_plugins([], [])):
+        return dict(compose_raw([f"scene={kind}"]).scene)
+
+
 def colmap_options(folder: Path, **changes: Any) -> ColmapOptions:
     """The shipped configuration with changes."""
-    chosen = OmegaConf.create({"path": str(folder), **changes})
-    merged = OmegaConf.merge(OmegaConf.structured(ColmapOptions), OmegaConf.load(CONF / "colmap.yaml"), chosen)
-    made = OmegaConf.to_object(merged)
+    made = typed(ColmapOptions, shipped("colmap") | {"path": str(folder)} | changes, "scene")
     assert isinstance(made, ColmapOptions)
     return made

@@ -56,8 +56,11 @@ def camera() -> Camera:
 def options(**changes: object) -> DemoOptions:
     """The defaults with fewer, smaller pictures."""
     small = {"width": 64, "height": 48, "train_views": 8, "test_views": 4, "points": 2000, "samples": 3}
-    config = OmegaConf.merge(OmegaConf.load(DEFAULTS), small, changes)
-    return DemoOptions(**OmegaConf.to_container(config))
+    shipped = OmegaConf.load(DEFAULTS)
+    del shipped["defaults"]  # Hydra's own
+    made = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(DemoOptions), shipped, small, changes))
+    assert isinstance(made, DemoOptions)
+    return made
 
 
 @pytest.fixture(scope="module")

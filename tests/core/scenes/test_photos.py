@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from omegaconf import OmegaConf
-from synthetic_colmap import CONF
+from synthetic_colmap import shipped
 
+from gsx.core.config import typed
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.images import write_image
+from gsx.core.images import image_size, write_image
 from gsx.core.scene import Scene
 from gsx.core.scenes import photos, sfm
 from gsx.core.scenes.photos import PhotosOptions, find_photos, load, reconstruct
@@ -26,9 +26,8 @@ STRANGER = "stranger.png"
 
 def options(folder: Path, **changes: Any) -> PhotosOptions:
     """The shipped configuration with changes."""
-    chosen = OmegaConf.create({"path": str(folder), "num_threads": 1, **changes})
-    merged = OmegaConf.merge(OmegaConf.structured(PhotosOptions), OmegaConf.load(CONF / "photos.yaml"), chosen)
-    made = OmegaConf.to_object(merged)
+    values = shipped("photos") | {"path": str(folder), "num_threads": 1} | changes
+    made = typed(PhotosOptions, values, "scene")
     assert isinstance(made, PhotosOptions)
     return made
 
@@ -41,7 +40,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Photos of textured patches on a sphere with one that shows nothing of it; true camera centres by name."""
+    """Photos of patches on a sphere, and one of another size without them; true camera centres by name."""
     folder = tmp_path_factory.mktemp("capture") / "garden" / "images"
     folder.mkdir(parents=True)
     pycolmap.set_random_seed(0)
@@ -51,7 +50,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     settings.num_points2D_without_point3D = 0
     truth = pycolmap.synthesize_dataset(settings)
     pycolmap.synthesize_images(pycolmap.SyntheticImageOptions(), truth, folder)
-    write_image(folder / STRANGER, torch.rand(3, 480, 640, generator=torch.Generator().manual_seed(0)))
+    write_image(folder / STRANGER, torch.rand(3, 600, 400, generator=torch.Generator().manual_seed(0)))
     return folder.parent, {image.name: image.projection_center() for image in truth.images.values()}
 
 
@@ -104,8 +103,9 @@ def test_reconstruction_is_found_again(
 
 
 def test_same_seed_gives_the_same_bytes(reconstructed: tuple[Scene, Path], capture: tuple[Path, Any]) -> None:
-    sizes = {file.name: (640, 480) for file in (capture[0] / "images").iterdir()}
-    model = reconstruct(capture[0] / "images", sizes, options(capture[0], num_threads=2))
+    folder = capture[0] / "images"
+    sizes = {name: image_size(folder / name) for name in find_photos(folder)[1]}
+    model = reconstruct(folder, sizes, options(folder, num_threads=2))
     (first,) = (reconstructed[1] / "sfm").iterdir()
     assert model != first
     assert {file.name for file in model.iterdir()} == {file.name for file in first.iterdir()}
@@ -220,9 +220,7 @@ def test_interrupted_reconstruction_leaves_nothing_behind(
     assert not list((cache / "sfm").iterdir())
 
 
-def test_another_process_that_finishes_first_wins(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_another_process_that_finishes_first_wins(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, sizes = options(tmp_path), two_photos(tmp_path)
     final: list[Path] = []
 
@@ -307,9 +305,9 @@ def test_interruption_cancels_the_stage(monkeypatch: pytest.MonkeyPatch) -> None
 
     def work(token: Any) -> None:
         until = time.monotonic() + 10
-        while not token.is_cancelled() and time.monotonic() < until:
+        while not token.is_cancelled and time.monotonic() < until:
             time.sleep(0.01)
-        cancelled.append(token.is_cancelled())
+        cancelled.append(token.is_cancelled)
 
     def interrupt() -> int:
         raise KeyboardInterrupt

@@ -4,13 +4,12 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
+from gsx.core.config import compose_raw, hydra_session, typed
 from gsx.core.errors import GsxError, InputError
+from gsx.core.plugins import load_plugins
 from gsx.core.scene import Scene
 from gsx.core.scenes import blender, bungee, colmap, photos, transforms
 from gsx.core.scenes.colmap_model import Model, find_model, model_folders, read_model
@@ -98,11 +97,11 @@ def _command(kind: str, path: Path, *overrides: str) -> str:
     return shlex.join(["gsx", f"scene={kind}", f"scene.path={path}", *overrides])
 
 
-def _options(kind: str, options: type, path: Path, **overrides: Any) -> Any:
-    """The options of conf/scene/<kind>.yaml for a folder."""
-    defaults = OmegaConf.create((files("gsx.conf") / "scene" / f"{kind}.yaml").read_text(encoding="utf-8"))
-    chosen = OmegaConf.create({"path": str(path), **overrides})
-    return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(options), defaults, chosen))
+def _options(kind: str, schema: type, path: Path, **changes: str) -> Any:
+    """The options that `gsx scene=<kind> scene.path=<path>` means."""
+    with hydra_session(load_plugins([], [])):
+        defaults = compose_raw([f"scene={kind}"]).scene
+    return typed(schema, {**defaults, "path": str(path), **changes}, "scene")
 
 
 def _describe_colmap(path: Path, found: Findings) -> Iterator[str]:

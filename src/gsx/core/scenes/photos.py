@@ -123,9 +123,17 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path
         _refuse_nothing(best, folder, sizes)
         model = make_folder(Path(work) / "model")
         best.write_binary(model)
-        with suppress(FileExistsError):  # another process has finished the same reconstruction in the meantime
-            os.rename(model, final)
+        _publish(model, final)
     return final
+
+
+def _publish(model: Path, final: Path) -> None:
+    """Move the finished model to its place, unless another process has finished the same in the meantime."""
+    try:
+        os.rename(model, final)
+    except OSError:
+        if not final.is_dir():
+            raise
 
 
 def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> str:

@@ -35,7 +35,7 @@ class SfmOptions:
     exhaustive_limit: int
     """`auto` matches every pair of up to this many photos, neighbours of more."""
     overlap: int
-    """`sequential` matches photos at distances 1, 2, 3, ... overlap and 1, 2, 4, ... 2^(overlap - 1)."""
+    """`sequential` matches photos at the distances 1, 2, 4, ... 2^(overlap - 1) in the sorted list."""
     max_feature_size: int
     """Features are found on photos reduced to this many pixels on the longer side; training is not affected."""
     max_features: int
@@ -124,8 +124,7 @@ def pair_count(count: int, options: SfmOptions) -> int:
     """How many pairs of photos are matched."""
     if chosen_matcher(count, options) == "exhaustive":
         return count * (count - 1) // 2
-    distances = set(range(1, options.overlap + 1)) | {2**k for k in range(options.overlap)}
-    return sum(max(0, count - distance) for distance in distances)
+    return sum(max(0, count - 2**k) for k in range(options.overlap))
 
 
 def _match(database: Path, count: int, options: SfmOptions) -> None:
@@ -136,7 +135,7 @@ def _match(database: Path, count: int, options: SfmOptions) -> None:
     matching.use_gpu = False
     verification.ransac.random_seed = options.seed
     matcher = chosen_matcher(count, options)
-    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[matcher]
+    match: Callable[..., None] = getattr(pycolmap, f"match_{matcher}")
 
     def work(token: Any) -> None:
         match(

@@ -1,0 +1,65 @@
+"""Composition: every file composes, typed options, nearest matches."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsx.cli import plugins
+from gsx.core.config import compose, typed
+from gsx.core.errors import ConfigError
+from gsx.core.scenes.options import SceneOptions
+
+CONF = Path(__file__).parents[2] / "conf"
+GROUPS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
+
+
+@pytest.mark.parametrize(("group", "option"), GROUPS)
+def test_every_file_composes_and_fits_its_schema(group: str, option: str) -> None:
+    settings = compose([f"{group}={option}"], plugins())
+    if group in ("scene", "backbone"):
+        assert getattr(settings, group).component.name == option
+
+
+def test_published_values_of_gs3d() -> None:
+    options = compose([], plugins()).backbone.options
+    assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)
+    assert options.rates.sh_rest == pytest.approx(options.rates.sh_constant / 20)
+    density = options.density
+    assert (density.start, density.stop, density.every, density.reset_every) == (500, 15000, 100, 3000)
+
+
+def test_common_scene_defaults_agree_with_the_schema() -> None:
+    values = OmegaConf.to_container(OmegaConf.load(CONF / "images.yaml"))
+    built = SceneOptions(name="x", background=[0, 0, 0], **values)
+    assert built == SceneOptions(name="x", background=[0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["backbone=gs3"], "backbone=gs3: there is no such backbone; .*Did you mean 'gs3d'"),
+        (["scene=colmop"], "Did you mean 'colmap'"),
+        (["scene.pth=x"], "'scene.pth' is no configuration key. Did you mean 'scene.path'"),
+        (["itterations=5"], "'itterations' is no configuration key. Did you mean 'iterations'"),
+        (["+steps=5"], "'steps' is no configuration key"),
+        (["+backbone.rates.mean_first=1"], "'backbone.rates.mean_first'.*Did you mean 'backbone.rates.means_first'"),
+        (["iterations=many"], "iterations: Value 'many'"),
+        (["backbone.sh_degree=abc"], "backbone.sh_degree: Value 'abc'"),
+        (["backbone.density.gradient=[1]"], "backbone.density.gradient"),
+        (["backbone.name=mine"], "backbone.name is 'mine'"),
+        (["rasterizer.cull=loose"], "rasterizer.cull is 'loose'"),
+        (["rasterizer.tile_size=5"], "must divide 16"),
+        (["eval.zoom=2"], "eval.zoom"),
+        (["scene=[demo"], "override cannot be read"),
+        (["nonsense"], "override cannot be read"),
+    ],
+)
+def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(overrides, plugins())
+
+
+def test_a_number_for_a_text_is_not_silently_taken() -> None:
+    with pytest.raises(ConfigError, match=r"scene\.downscale"):
+        typed(SceneOptions, {"name": "x", "background": [0, 0, 0], "downscale": 1.5}, "scene")

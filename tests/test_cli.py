@@ -1,0 +1,182 @@
+"""The command line as a user meets it: help, verbs, errors with exit code 2, Ctrl-C."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import OVERRIDES, tiny_run, words
+
+from gsx import __version__
+from gsx.cli import main
+from gsx.core.images import write_image
+
+GSX = [sys.executable, "-m", "gsx"]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """A finished tiny run."""
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    tiny_run(folder, ["iterations=3"])
+    return folder
+
+
+def test_help_is_short_says_what_to_type_and_does_not_import_torch() -> None:
+    code = "import sys; from gsx.cli import main; main(['--help']); sys.exit('torch' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0
+    assert len(result.stdout.splitlines()) <= 30
+    assert "start here" in result.stdout
+    for verb in ("resume", "eval", "render", "export", "report", "scenes", "plugins"):
+        assert f"gsx {verb}" in result.stdout
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gsx {__version__}\n"
+
+
+def test_plugins_lists_builtins(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"scene:.*colmap \(gsx\).*demo \(gsx\)", out)
+    assert "gs3d (gsx)" in out
+
+
+def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words(tmp_path / "run", "iterations=2")) == 0
+    captured = capsys.readouterr()
+    assert captured.out.strip() == str(tmp_path / "run" / "report.html")
+    assert re.search(r"step 2/2 .* it/s .* loss .* PSNR .* splats .* MB .* ETA", captured.err)
+    assert "schedule densify" in (tmp_path / "run" / "log.txt").read_text() + captured.err
+
+
+def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(run_folder), "eval.zoom=[1,2]"]) == 0
+    assert main(["render", str(run_folder), "--to", str(tmp_path / "views"), "--zoom", "2"]) == 0
+    assert len(list((tmp_path / "views").glob("*.png"))) == 2
+    assert main(["render", str(run_folder), "--orbit", str(tmp_path / "o.gif"), "--frames", "3"]) == 0
+    assert (tmp_path / "o.gif").read_bytes()[:4] == b"GIF8"
+    assert main(["export", str(run_folder), str(tmp_path / "x.ply")]) == 0
+    assert "identical" in capsys.readouterr().err
+    assert main(["report", str(run_folder)]) == 0
+    assert main(["report", str(run_folder.parent)]) == 0
+
+
+def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene=colmap", "--cfg", "job"]) == 0
+    assert "max_reprojection_px" in capsys.readouterr().out
+
+
+def test_multirun_makes_a_run_for_every_combination(tmp_path: Path) -> None:
+    command = [*GSX, "-m", *OVERRIDES, "iterations=1", "seed=0,1", f"output={tmp_path / 'out'}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    runs = list((tmp_path / "out").glob("*/*/*/evaluation.json"))
+    assert len(runs) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "Hydra left files of its own"
+
+
+def test_a_mistake_in_a_multirun_is_refused_before_it_starts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-m", "stpes=5", "seed=0,1"]) == 2
+    assert "'stpes' is no configuration key" in capsys.readouterr().err
+
+
+def one_image_scene(folder: Path) -> Path:
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_rigs, options.num_cameras_per_rig = 1, 1, 1
+    reconstruction = pycolmap.synthesize_dataset(options)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    reconstruction.write_binary(folder / "sparse" / "0")
+    (folder / "images").mkdir()
+    for image in reconstruction.images.values():
+        camera = image.camera
+        write_image(folder / "images" / image.name, torch.rand(3, camera.height, camera.width))
+    return folder
+
+
+def empty_folder(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def folder_of_text(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "a.txt").write_text("no picture")
+    return folder
+
+
+BAD = {
+    "missing folder": lambda t: ["scene=colmap", f"scene.path={t / 'nowhere'}"],
+    "no path": lambda t: ["scene=colmap"],
+    "empty folder": lambda t: ["scene=colmap", f"scene.path={empty_folder(t / 'e')}"],
+    "no photos": lambda t: ["scene=photos", f"scene.path={folder_of_text(t / 'p')}"],
+    "one image": lambda t: ["scene=colmap", f"scene.path={one_image_scene(t / 's')}"],
+    "no transforms": lambda t: ["scene=blender", f"scene.path={empty_folder(t / 'b')}"],
+    "unknown split": lambda t: ["scene=colmap", "scene.split=sometimes", f"scene.path={one_image_scene(t / 's')}"],
+    "unknown verb": lambda t: ["trian"],
+    "unknown flag": lambda t: ["--zoom"],
+    "typo in key": lambda t: ["iteratoins=5"],
+    "not a run": lambda t: ["resume", str(empty_folder(t / "r"))],
+    "resume a splat file": lambda t: ["resume", "point_cloud.ply"],
+    "eval nothing": lambda t: ["eval"],
+    "report of nothing": lambda t: ["report", str(t / "nowhere")],
+    "scenes of nothing": lambda t: ["scenes"],
+    "bad device": lambda t: words(t / "run", "device=tpu"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_ends_in_one_sentence_and_exit_code_2(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = BAD[case](tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert main([*arguments]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("gsx: ")
+    assert "Traceback" not in "".join(lines)
+    assert sorted(tmp_path.rglob("*")) == before, "something half-written is left"
+
+
+def test_an_unwritable_output_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main([*OVERRIDES, "iterations=1", f"output={tmp_path / 'file'}"]) == 2
+    assert "choose a writable place" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_no_partial_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(words(tmp_path / "run", "iterations=1")) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(tmp_path: Path) -> None:
+    command = [*GSX, *words(tmp_path / "run", "iterations=100000")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (metrics.exists() and metrics.read_text().count("\n") >= 2):
+        assert time.monotonic() < deadline, "training did not begin"
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    found = re.search(r"stopped at step (\d+); go on with: gsx resume (\S+)", err)
+    assert found
+    assert found.group(2) == str(tmp_path / "run")
+    assert list((tmp_path / "run" / "checkpoints").glob(f"step_{int(found.group(1)):07d}.safetensors"))

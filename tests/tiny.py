@@ -1,0 +1,52 @@
+"""The smallest experiment that exercises everything: the built-in scene as thumbnails, a dozen steps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsx.cli import plugins
+from gsx.core.config import Settings, compose
+from gsx.core.plugins import hookimpl
+from gsx.core.run import Run
+from gsx.core.session import execute, start
+
+OVERRIDES = (
+    "scene.width=48",
+    "scene.height=36",
+    "scene.train_views=6",
+    "scene.test_views=2",
+    "scene.points=300",
+    "scene.samples=1",
+    "training.test_points=2",
+    "device=cpu",
+)
+
+
+def words(folder: Path, *more: str) -> list[str]:
+    """Command-line overrides of a tiny run in `folder`."""
+    return [*OVERRIDES, f"folder={folder}", *more]
+
+
+def tiny_settings(folder: Path, *more: str) -> Settings:
+    """The composed tiny experiment."""
+    return compose(words(folder, *more), plugins())
+
+
+def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = None) -> Run:
+    """Run the tiny experiment, interrupted after `stop_after` steps if given."""
+    settings, loaded = tiny_settings(folder, *more), plugins()
+    run = start(settings, loaded)
+    with loaded.listening([StopAfter(stop_after)] if stop_after is not None else []):
+        execute(run, settings, loaded)
+    return run
+
+
+class StopAfter:
+    """Listener that does what Ctrl-C does."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        """Ask the run to stop."""
+        run.stopping = run.step >= self.step
