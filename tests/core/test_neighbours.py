@@ -24,9 +24,8 @@ def cloud(count: int, seed: int = 0) -> Tensor:
 
 def test_points_on_a_line_worked_by_hand() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0], [20, 0, 0]])
-    expected = torch.tensor([(1 + 9 + 49) / 3, (1 + 4 + 36) / 3, (4 + 9 + 16) / 3, 101 / 3, (169 + 289 + 361) / 3])
-    expected[3] = (16 + 36 + 49) / 3
-    torch.testing.assert_close(mean_square_distance(points), expected)
+    sums = torch.tensor([1.0 + 9 + 49, 1 + 4 + 36, 4 + 9 + 16, 16 + 36 + 49, 169 + 289 + 361])
+    torch.testing.assert_close(mean_square_distance(points), sums / 3)
 
 
 @pytest.mark.parametrize("count", [4, 9, 10, 300])

@@ -282,8 +282,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         ({"state": "running", "step": 20}, None, "running", "killed: 1,000 of 1,000 steps"),
         ({"state": "interrupted", "step": 500}, None, "interrupted", "1,000 of 1,000 steps, not evaluated"),
         ({"state": "running"}, evaluation(), "ok", ""),
-        ({"state": "ok"}, evaluation(step=500), "interrupted", "evaluated at step 500, trained to 1,000"),
+        ({"state": "ok"}, evaluation(step=500), "interrupted", "1,000 of 1,000 steps, evaluated at step 500"),
         ({"state": "interrupted"}, evaluation(step=999), "interrupted", "evaluated at step 999"),
+        ({"state": "running"}, evaluation(step=999), "running", "killed: 1,000 of 1,000 steps, evaluated at step 999"),
         ({}, evaluation(), "ok", ""),
     ],
 )

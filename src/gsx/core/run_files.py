@@ -160,13 +160,12 @@ def state_of(files: RunFiles) -> tuple[str, str]:
             return "corrupted", files.problems[name]
     if recorded == "failed":
         return "failed", str(files.status.get("reason") or "no reason recorded")
-    if not files.evaluation:
-        done = f"{files.step:,} of {files.iterations:,} steps, not evaluated"
-        return ("running", f"under way or killed: {done}") if recorded == "running" else ("interrupted", done)
     evaluated = int(files.evaluation.get("step") or 0)
-    if evaluated < max(files.step, files.iterations):
-        return "interrupted", f"evaluated at step {evaluated:,}, trained to {files.step:,} of {files.iterations:,}"
-    return "ok", ""
+    if files.evaluation and evaluated >= max(files.step, files.iterations):
+        return "ok", ""
+    progress = f"{files.step:,} of {files.iterations:,} steps, "
+    progress += f"evaluated at step {evaluated:,}" if files.evaluation else "not evaluated"
+    return ("running", f"under way or killed: {progress}") if recorded == "running" else ("interrupted", progress)
 
 
 def runs_below(folder: Path) -> Iterator[Path]:

@@ -1,6 +1,7 @@
 """Photos without poses: a real reconstruction of synthetic photos against its truth, and everything around it."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -220,25 +221,37 @@ def test_interrupted_reconstruction_leaves_nothing_behind(
     assert not list((cache / "sfm").iterdir())
 
 
+class StubModel:
+    """What `sfm.reconstruct` returns, reduced to what is asked of it."""
+
+    def num_reg_images(self) -> int:
+        return 2
+
+    def write_binary(self, folder: Path) -> None:
+        (folder / "cameras.bin").write_bytes(b"mine")
+
+
 def test_another_process_that_finishes_first_wins(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen, sizes = options(tmp_path), two_photos(tmp_path)
-    final: list[Path] = []
+    def overtaken(folder: Path, sizes: Any, chosen: Any, work: Path) -> StubModel:
+        final = work.parent / work.name.partition(".partial")[0]
+        final.mkdir()
+        (final / "cameras.bin").write_bytes(b"theirs")
+        return StubModel()
 
-    class Model:
-        def num_reg_images(self) -> int:
-            return 2
+    monkeypatch.setattr(sfm, "reconstruct", overtaken)
+    final = reconstruct(tmp_path, two_photos(tmp_path), options(tmp_path))
+    assert (final / "cameras.bin").read_bytes() == b"theirs"
+    assert list((cache / "sfm").iterdir()) == [final]
 
-        def write_binary(self, folder: Path) -> None:
-            (folder / "cameras.bin").write_bytes(b"late")
-            if not final:  # the other process
-                final.append(folder.parent.parent / folder.parent.name.partition(".partial")[0])
-                final[0].mkdir()
-                (final[0] / "cameras.bin").write_bytes(b"early")
 
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: Model())
-    assert reconstruct(tmp_path, sizes, chosen) == final[0]
-    assert (final[0] / "cameras.bin").read_bytes() == b"early"
-    assert list((cache / "sfm").iterdir()) == final
+def test_a_replaced_photo_is_reconstructed_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: StubModel())
+    sizes = two_photos(tmp_path)
+    before = reconstruct(tmp_path, sizes, options(tmp_path))
+    assert (before / "cameras.bin").read_bytes() == b"mine"
+    assert reconstruct(tmp_path, sizes, options(tmp_path)) == before
+    os.utime(tmp_path / "b.png", ns=(0, 0))
+    assert reconstruct(tmp_path, sizes, options(tmp_path)) != before
 
 
 # the stages
