@@ -238,8 +238,9 @@ class GS3D:
 
     def reset_opacities(self) -> None:
         """o <- min(o, reset_opacity), moments zeroed (spec 7)."""
-        opacities = self.table["opacity_logits"].detach().sigmoid().clamp(max=self.options.density.reset_opacity)
-        reset_column(self.table, "opacity_logits", torch.logit(opacities))
+        highest = self.options.density.reset_opacity
+        logits = self.table["opacity_logits"].detach().clamp(max=math.log(highest / (1 - highest)))
+        reset_column(self.table, "opacity_logits", logits)
 
     def largest_scales(self) -> Float[Tensor, "N"]:
         """Largest standard deviation of each primitive, world units."""

@@ -5,9 +5,7 @@ without one does not exist. A damaged checkpoint is named, and the one before it
 """
 
 import hashlib
-import json
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +13,13 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import CheckpointError
-from gsx.core.run import Run, read_json
+from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.run import Run
 
 logger = logging.getLogger(__name__)
 
 SCHEMA = 1
 GENERATOR = "run.generator"
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file so that it is either wholly there or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with temporary.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def save(run: Run) -> Path:
@@ -54,7 +40,7 @@ def save(run: Run) -> Path:
         "sampler": run.sampler.order,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
-    replace_file(path.with_suffix(".json"), json.dumps(sidecar).encode())
+    write_json(path.with_suffix(".json"), sidecar)
     for old in sidecars(folder)[: -run.training.checkpoints_kept]:
         old.unlink()
         old.with_suffix(".safetensors").unlink(missing_ok=True)

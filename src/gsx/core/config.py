@@ -180,7 +180,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     Raises:
         ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
     """
-    raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)  # type: ignore[call-overload]
+    raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
     assert isinstance(raw, dict)
     values = dict(raw)
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
@@ -243,7 +243,7 @@ def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
 
 def write_config(path: Path, resolved: dict[str, Any]) -> None:
     """Save a resolved configuration as YAML."""
-    from gsx.core.checkpoint import replace_file
+    from gsx.core.files import replace_file
 
     replace_file(path, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
 
@@ -263,7 +263,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         key, equals, value = override.partition("=")
         if not equals or key not in known:
             raise ConfigError(f"'{key}' is no key of {path}.{nearest(key, known)}")
-        OmegaConf.update(config, key, OmegaConf.create(f"value: {value}")["value"])
+        OmegaConf.update(config, key, OmegaConf.select(OmegaConf.create(f"value: {value}"), "value"))
     return settings_from(config, plugins)  # type: ignore[arg-type]
 
 

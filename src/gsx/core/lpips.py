@@ -110,6 +110,8 @@ def load_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
     try:
         data = Path(path).expanduser().read_bytes()
         weights = torch.load(Path(path).expanduser(), map_location="cpu", weights_only=True)
+        if not isinstance(weights, dict):
+            raise TypeError(f"it holds a {type(weights).__name__}, not a state dict")
     except Exception as error:
         raise InputError(f"{option}={path} cannot be read as weights ({error}): give a local .pth file") from error
     return weights, hashlib.sha256(data).hexdigest()[:8]

@@ -37,7 +37,7 @@ def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant:
 
 
 def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-    """SSIM where the window fits; pictures smaller than a window are reflected at their borders first."""
+    """SSIM where the window fits; pictures smaller than a window are extended by their border first."""
     missing = [max(0, WINDOW - size) for size in (image.shape[2], image.shape[1])]
     margin = [half for size in missing for half in (size // 2, size - size // 2)]
     if any(missing):

@@ -6,7 +6,6 @@ a small ellipse of bearing and height; cameras that look outward give a turn on 
 """
 
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, look_at
 from gsx.core.errors import InputError, nearest
+from gsx.core.files import replacing
 from gsx.core.images import to_uint8
 from gsx.core.scene import Scene
 from gsx.core.shapes import Float, UInt8
@@ -207,12 +207,8 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
     if not 0 < fps <= (GIF_FASTEST if writer is write_gif else 1000):
         raise InputError(f"{path} cannot play at {fps} frames per second: use 1 to {GIF_FASTEST}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
+    with replacing(path) as partial:
         writer(partial, checked(path, frames), fps)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def writer_for(path: Path) -> Callable[[Path, Iterator[Tensor], float], None]:

@@ -8,8 +8,8 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.charts import Dot, pareto_front, scatter
-from gsx.core.checkpoint import replace_file
 from gsx.core.errors import InputError
+from gsx.core.files import replace_file
 from gsx.core.page import fixed, template
 from gsx.core.run_files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
 

@@ -3,7 +3,6 @@
 Everything goes to the run's `renders/`, listed in `index.json`, from which the report is built again at any time.
 """
 
-import json
 import math
 import re
 from collections.abc import Iterable, Sequence, Set
@@ -15,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from gsx.core.checkpoint import replace_file
 from gsx.core.evaluate import EvalOptions, render_view
+from gsx.core.files import read_json, write_json
 from gsx.core.images import write_image
 from gsx.core.metrics import bicubic, psnr, quantise
-from gsx.core.run import Run, read_json
+from gsx.core.run import Run
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 
@@ -82,7 +81,7 @@ def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -
         views.append(figures[i] | drawn.whole(view, picture) | {"role": roles.get(i, "")})
         crops += [crop for factor in factors if (crop := drawn.crop(view, picture, factor)) is not None]
     index = {"error_full": ERROR_FULL, "step": run.step, "views": views, "zoom": crops}
-    replace_file(folder / "index.json", json.dumps(without_infinities(index), indent=2).encode())
+    write_json(folder / "index.json", index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +241,3 @@ def enlarged_window(picture: Float[Tensor, "3 H W"], factor: int, window: Window
     part = picture[:, top:bottom, left:right]
     larger = bicubic(part, part.shape[2] * factor, part.shape[1] * factor)
     return replace(window, left=window.left - left * factor, top=window.top - top * factor).cut(larger)
-
-
-def without_infinities(content: Any) -> Any:
-    """The same with infinite PSNRs (equal images) as None, which JSON can hold."""
-    if isinstance(content, dict):
-        return {key: without_infinities(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [without_infinities(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -3,13 +3,13 @@
 Reads binary little-endian and ascii, writes binary little-endian. Elements after the vertices are ignored.
 """
 
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from gsx.core.errors import InputError
+from gsx.core.files import replace_file
 
 TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
@@ -56,14 +56,10 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
         rows[name] = column
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element vertex {len(rows)}", *(f"property {names[code]} {name}" for name, code in codes.items())]
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        partial.write_bytes("\n".join([*header, "end_header", ""]).encode("latin-1") + rows.tobytes())
-        os.replace(partial, path)
+        replace_file(path, "\n".join([*header, "end_header", ""]).encode("latin-1") + rows.tobytes())
     except OSError as problem:
         raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space.") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:

@@ -5,8 +5,8 @@ import sys
 import time
 from typing import IO, TextIO
 
-from gsx.core.checkpoint import replace_file
 from gsx.core.evaluate import EvalOptions, peak_memory_mb, quick_psnr
+from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 

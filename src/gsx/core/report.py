@@ -13,8 +13,8 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.charts import Mark, Series, line_chart, smoothed
-from gsx.core.checkpoint import replace_file
 from gsx.core.errors import InputError
+from gsx.core.files import replace_file
 from gsx.core.overview import write_overview
 from gsx.core.page import NONE, duration, fixed, template
 from gsx.core.pictures import ERROR_COLOURS

@@ -1,7 +1,5 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,13 +93,3 @@ class Step:
     def psnr(self) -> float:
         """PSNR of the training view before the update, dB."""
         return psnr(self.rendering.image.detach().clamp(0, 1), self.target)
-
-
-def read_json(path: Path) -> Any:
-    """Parsed JSON file."""
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def views_of(scene: Scene) -> Sequence[View]:
-    """Training then test views."""
-    return [*scene.train, *scene.test]

@@ -1,6 +1,5 @@
 """One run from settings to report: build, train, evaluate, write. Also opens finished runs again."""
 
-import json
 import logging
 import os
 import platform
@@ -18,11 +17,11 @@ from gsx import __version__
 from gsx.core import checkpoint
 from gsx.core.backbone import Beginning
 from gsx.core.camera import Camera
-from gsx.core.checkpoint import replace_file
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_gaussians
+from gsx.core.files import write_json
 from gsx.core.guard import Guard
 from gsx.core.images import write_image
 from gsx.core.metrics import psnr
@@ -146,27 +145,11 @@ def installed_version(package: str) -> str:
         return "not installed"
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically; numbers that JSON has no words for become null."""
-    replace_file(path, json.dumps(finite(content), indent=2, default=str).encode())
-
-
-def finite(content: Any) -> Any:
-    """The same with infinite and undefined numbers as None."""
-    if isinstance(content, dict):
-        return {key: finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite(value) for value in content]
-    if isinstance(content, float) and (content != content or content in (float("inf"), float("-inf"))):
-        return None
-    return content
-
-
 def announce(run: Run, plugins: Plugins) -> None:
     """Say what is about to be trained, and by which schedule."""
     scene = run.scene
-    size, points = "%dx%d" % scene.train[0].camera.size, f"{len(scene.points):,}"
-    views = f"{len(scene.train)} training and {len(scene.test)} test views of {size} px"
+    (width, height), points = scene.train[0].camera.size, f"{len(scene.points):,}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height} px"
     logger.info("scene %s: %s, %s points, extent %.3g", scene.name, views, points, scene.extent)
     for note in scene.notes:
         logger.info("note: %s", note)

@@ -200,3 +200,22 @@ def test_same_input_gives_the_same_bits() -> None:
         return [rendering.image, *(getattr(live, name).grad for name in vars(live))]
 
     assert all(torch.equal(a, b) for a, b in zip(once(), once(), strict=True))
+
+
+@pytest.mark.parametrize("name", ["means", "scales", "quats", "log_opacities", "colours"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_non_finite_splats_are_dropped_and_counted(name: str, value: float) -> None:
+    clean = scene(50)
+    fields = {key: field.clone() for key, field in vars(clean).items()}
+    fields[name][7] = value
+    rendering = rasterize(Splats(**fields), camera(), RasterSettings())
+    without = {key: field[torch.arange(50) != 7] for key, field in vars(clean).items()}
+    assert rendering.dropped == 1
+    assert torch.equal(rendering.image, rasterize(Splats(**without), camera(), RasterSettings()).image)
+
+
+def test_opacity_zero_is_no_error() -> None:
+    splats = Splats(**(vars(scene(5)) | {"log_opacities": torch.full((5,), -math.inf)}))
+    rendering = rasterize(splats, camera(), RasterSettings())
+    assert rendering.dropped == 0
+    assert float(rendering.alpha.max()) == 0

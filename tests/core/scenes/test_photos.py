@@ -61,6 +61,7 @@ def reconstructed(capture: tuple[Path, Any], tmp_path_factory: pytest.TempPathFa
     kept = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GSX_CACHE", str(kept))
+        patch.setattr(sfm, "LOG_SECONDS", 0.01)  # looks at the database while COLMAP writes it, as often as it can
         yield load(options(capture[0])), kept
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import threshold_
 
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import Pairs
@@ -133,7 +132,7 @@ def just_below(value: float, dtype: torch.dtype) -> float:
 def alphas_(gaussian: Float[Tensor, "B K P"], settings: RasterSettings) -> Float[Tensor, "B K P"]:
     """In place: clamped at alpha_max, zero below alpha_min (spec 3.4)."""
     below = just_below(settings.alpha_min, gaussian.dtype)
-    return threshold_(gaussian.clamp_(max=settings.alpha_max), below, 0.0)
+    return torch.threshold_(gaussian.clamp_(max=settings.alpha_max), below, 0.0)
 
 
 def transmittances(alpha: Float[Tensor, "B K P"], start: Float[Tensor, "B P"]) -> Float[Tensor, "B K_plus_1 P"]:
@@ -291,11 +290,13 @@ def all_gradients(
     rows, channels = gradient.new_zeros(*shape, 6), torch.zeros_like(tables.channels)
     means = gradient.new_zeros(*shape, 2) if absolute else None
     for front in reversed(fronts):
-        part = front_gradient(tables, front, gradient[front.tiles], rest[front.tiles], absolute)
-        rest[front.tiles] = part.rest
-        rows[front.blocks], channels[front.blocks] = part.rows, part.channels
-        if means is not None:
-            means[front.blocks] = part.absolute
+        seen, behind = gradient.index_select(0, front.tiles), rest.index_select(0, front.tiles)
+        part = front_gradient(tables, front, seen, behind, absolute)
+        rest.index_copy_(0, front.tiles, part.rest)
+        rows.index_copy_(0, front.blocks, part.rows)
+        channels.index_copy_(0, front.blocks, part.channels)
+        if means is not None and part.absolute is not None:
+            means.index_copy_(0, front.blocks, part.absolute)
     return rows, channels, means
 
 
@@ -333,7 +334,7 @@ class Composite(torch.autograd.Function):
     def backward(ctx, gradient):
         tables, blocks, grid, fronts, count, absolute = ctx.kept
         rows, channels, means = all_gradients(tables, fronts, grid.to_tiles(gradient), absolute)
-        parts = [splat_gradient(rows, tables), channels[..., :-1]] + ([means] if absolute else [])
+        parts = [splat_gradient(rows, tables), channels[..., :-1], *([] if means is None else [means])]
         total = sum_by_splat(torch.cat(parts, -1).flatten(0, 1), blocks.splats.view(-1), count + 1)[:-1]
         width = 6 + channels.shape[2] - 1
         probe = total[:, width:] if absolute else None

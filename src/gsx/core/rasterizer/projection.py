@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer.settings import RasterSettings
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 from gsx.core.splats import Splats
 
 
@@ -26,6 +26,8 @@ class ScreenSplats:
     """(u0, u1, u2): half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]]."""
     log_opacities: Float[Tensor, "M"]
     channels: Float[Tensor, "M C"]
+    dropped: int
+    """Splats left out because a value of theirs is not finite."""
 
 
 def rotate_back(quats: Float[Tensor, "M 4"], vectors: Float[Tensor, "M V 3"]) -> Float[Tensor, "M V 3"]:
@@ -80,16 +82,24 @@ def covariance_and_factor(
     return torch.stack([xx, pq, yy], 1), torch.stack([u0, u1, u2], 1)
 
 
-def in_front(splats: Splats, camera: Camera) -> Int[Tensor, "M"]:
-    """Rows deeper than the near plane. Selecting comes before any division (spec 12)."""
-    with torch.no_grad():
-        depth = splats.means @ camera.rotation[2].to(splats.means) + camera.translation[2].to(splats.means)
-        return (depth > camera.near).nonzero()[:, 0]
+@torch.no_grad()
+def usable(splats: Splats) -> Bool[Tensor, "N"]:
+    """False for splats with a value that is not finite (an opacity of 0, ln -inf, is fine): they are not drawn."""
+    total = splats.means.sum(1) + splats.scales.sum(1) + splats.quats.sum(1) + splats.colours.sum(1)
+    return torch.isfinite(total) & (splats.log_opacities < torch.inf)
+
+
+@torch.no_grad()
+def in_front(splats: Splats, camera: Camera) -> Bool[Tensor, "N"]:
+    """Splats deeper than the near plane. Selecting comes before any division (spec 12)."""
+    rotation, translation = camera.rotation.to(splats.means), camera.translation.to(splats.means)
+    return splats.means @ rotation[2] + translation[2] > camera.near
 
 
 def project(splats: Splats, camera: Camera, settings: RasterSettings) -> ScreenSplats:
-    """The splats in front of the near plane as the camera sees them; differentiable in every input."""
-    ids = in_front(splats, camera)
+    """The usable splats in front of the near plane as the camera sees them; differentiable in every input."""
+    finite = usable(splats)
+    ids = (finite & in_front(splats, camera)).nonzero()[:, 0]
     points = splats.means[ids] @ camera.rotation.T.to(splats.means) + camera.translation.to(splats.means)
     focal = points.new_tensor([camera.fx, camera.fy])
     centre = points.new_tensor([camera.cx + camera.frame.left, camera.cy + camera.frame.top])
@@ -103,4 +113,5 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> ScreenS
         factors=factors,
         log_opacities=splats.log_opacities[ids],
         channels=splats.colours[ids],
+        dropped=len(finite) - int(finite.sum()),
     )

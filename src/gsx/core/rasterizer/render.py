@@ -54,8 +54,10 @@ class Rendering:
     depth: Float[Tensor, "H W"] | None
     """Blending-weighted sum of camera z, scene units (divide by alpha for a mean); None unless asked for."""
     screen: ScreenStatistics
-    pairs: int = 0
+    pairs: int
     """Splat-tile pairs blended."""
+    dropped: int
+    """Splats left out because a value of theirs is not finite."""
 
 
 def heaviest_by_splat(by_entry: Float[Tensor, "S K"], blocks: Blocks, count: int) -> Float[Tensor, "M"]:
@@ -106,6 +108,7 @@ def rasterize(
         alpha=alpha,
         depth=blended[count] if depth else None,
         pairs=len(pairs.splats),
+        dropped=screen.dropped,
         screen=ScreenStatistics(
             ids=screen.ids,
             radii=pairs.radii,

@@ -2,14 +2,16 @@
 
 Features, matches and the incremental reconstruction are COLMAP's. What is set here is what makes two runs agree:
 numbers of photos are given out before threads start, every estimator has a seed, and one thread does the mapping.
+
+How far a stage is, is read from COLMAP's database through pycolmap only: Python's sqlite3 would be a second SQLite
+library in the process, and each of the two drops the other's file locks.
 """
 
 import logging
-import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,7 +24,7 @@ T = TypeVar("T")
 Sizes = Mapping[str, tuple[int, int]]
 """(width, height) by name of photo, relative to their folder."""
 
-LOG_SECONDS = 5.0  # between progress lines
+LOG_SECONDS = 10.0  # between progress lines
 PAIR_BLOCK = 10  # photos whose pairs COLMAP matches before writing them down, which is when progress shows
 
 
@@ -110,7 +112,9 @@ def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) ->
             cancellation_token=token,
         )  # fmt: skip
 
-    watched("features of photos", work, lambda: _rows(database, "keypoints"), len(sizes))
+    with pycolmap.Database.open(database) as reader:
+        numbers = [image.image_id for image in reader.read_all_images()]
+        watched("features of photos", work, lambda: sum(map(reader.exists_keypoints, numbers)), len(sizes))
 
 
 def chosen_matcher(count: int, options: SfmOptions) -> str:
@@ -147,8 +151,8 @@ def _match(database: Path, count: int, options: SfmOptions) -> None:
             cancellation_token=token,
         )
 
-    total = pair_count(count, options)
-    watched("matches of pairs", work, lambda: _rows(database, "two_view_geometries"), total)
+    with pycolmap.Database.open(database) as reader:
+        watched("matches of pairs", work, reader.num_matched_image_pairs, pair_count(count, options))
 
 
 def pairing_options(matcher: str, overlap: int) -> Any:
@@ -203,15 +207,6 @@ def watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total
             raise
     logger.info("sfm: %s done (%d) in %.1f s", stage, done(), time.monotonic() - started)
     return future.result()
-
-
-def _rows(database: Path, table: str) -> int:
-    """Rows of a table that another thread is writing; 0 while that cannot be told."""
-    try:
-        with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    except sqlite3.Error:
-        return 0
 
 
 @contextmanager

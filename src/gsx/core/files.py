@@ -1,0 +1,51 @@
+"""Files that are either wholly there or not at all, and JSON."""
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`, same suffix; it becomes `path` when the block ends, or vanishes on an error."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file at once, and onto the disk before it takes the place of an older one."""
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def finite(content: Any) -> Any:
+    """The same with infinite and undefined numbers as None, for which JSON has a word."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; numbers that are not finite become null, unknown objects text."""
+    replace_file(path, json.dumps(finite(content), indent=2, default=str).encode())
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON file.
+
+    Raises:
+        OSError, ValueError: it cannot be read or parsed.
+    """
+    return json.loads(path.read_text(encoding="utf-8"))
