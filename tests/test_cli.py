@@ -74,6 +74,11 @@ def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert "max_reprojection_px" in capsys.readouterr().out
 
 
+def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-sc", "install=bash"]) == 0
+    assert "complete " in capsys.readouterr().out
+
+
 def test_multirun_makes_a_run_for_every_combination(tmp_path: Path) -> None:
     command = [*GSX, "-m", *OVERRIDES, "iterations=1", "seed=0,1", f"output={tmp_path / 'out'}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)

@@ -172,7 +172,8 @@ def hand_to_hydra(words: list[str]) -> int:
     from gsx.core.config import check_overrides, hydra_main
 
     loaded = plugins()
-    check_overrides([word for word in words if "=" in word and not word.startswith("-")], loaded)
+    if {"-m", "--multirun"} & set(words):
+        check_overrides([word for word in words if not word.startswith("-")], loaded)
     return hydra_main(words, loaded, lambda settings: train(settings, loaded))
 
 

@@ -65,6 +65,13 @@ def test_few_points_average_over_those_there_are(rows: list[list[float]], expect
     torch.testing.assert_close(mean_square_distance(torch.tensor(rows)), torch.tensor(expected))
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_distances_scale_with_the_square_of_the_unit(unit: float) -> None:
+    points = cloud(40)
+    expected = mean_square_distance(points) * unit**2
+    torch.testing.assert_close(mean_square_distance(points * unit), expected, rtol=1e-5, atol=0)
+
+
 @pytest.mark.parametrize("distance", [1e3, 1e5])
 def test_far_from_the_origin(distance: float) -> None:
     points = cloud(200) + distance  # what float32 keeps of the positions is the truth here

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from synthetic_colmap import shipped
 
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import resize, write_image
 from gsx.core.ply import write_ply
 from gsx.core.scenes.blender import BlenderOptions, load
 
-CONF = Path(__file__).parents[3] / "conf" / "scene" / "blender.yaml"
 FOV = 2 * math.atan(0.5)  # the focal length is the width
 # looks along +y from (0, -4, 0) with z up: right is +x, up is +z, back is -y
 FRONT = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
@@ -47,7 +47,7 @@ def folder(tmp_path: Path) -> Path:
 def options(folder: Path, **changes: Any) -> BlenderOptions:
     """The shipped configuration with changes."""
     merged = OmegaConf.merge(
-        OmegaConf.structured(BlenderOptions), OmegaConf.load(CONF), {"path": str(folder), "random_points": 50}, changes
+        OmegaConf.structured(BlenderOptions), shipped("blender"), {"path": str(folder), "random_points": 50}, changes
     )
     made = OmegaConf.to_object(merged)
     assert isinstance(made, BlenderOptions)
@@ -55,8 +55,8 @@ def options(folder: Path, **changes: Any) -> BlenderOptions:
 
 
 def test_shipped_values_are_the_published_ones() -> None:
-    shipped = OmegaConf.load(CONF)
-    assert (shipped.random_points, shipped.points_bound, shipped.background) == (100000, 1.3, [1, 1, 1])
+    values = OmegaConf.create(shipped("blender"))
+    assert (values.random_points, values.points_bound, values.background) == (100000, 1.3, [1, 1, 1])
 
 
 def test_points_project_where_the_hand_says(folder: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from synthetic_colmap import shipped
 
 from gsx.core.camera import look_at
 from gsx.core.errors import ConfigError, InputError
@@ -24,7 +25,6 @@ from gsx.core.scenes.bungee import (
     split_views,
 )
 
-CONF = Path(__file__).parents[3] / "conf" / "scene" / "bungee.yaml"
 WIDTH, HEIGHT, FOCAL = 48, 36, 50.0
 SCENE_SCALE = 0.002  # 250 m are half a unit
 SHARES = [1, 1, 1, 2, 2, 3, 3, 4]  # scale of each of eight images, near to far, for scale_split [7, 5, 3, 0]
@@ -60,7 +60,7 @@ def write_colmap(folder: Path, count: int = 8) -> None:
 def options(folder: Path, **changes: Any) -> BungeeOptions:
     """The shipped configuration with changes."""
     small = {"path": str(folder), "random_points": 50}
-    merged = OmegaConf.merge(OmegaConf.structured(BungeeOptions), OmegaConf.load(CONF), small, changes)
+    merged = OmegaConf.merge(OmegaConf.structured(BungeeOptions), shipped("bungee"), small, changes)
     made = OmegaConf.to_object(merged)
     assert isinstance(made, BungeeOptions)
     return made

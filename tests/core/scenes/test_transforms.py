@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from synthetic_colmap import shipped
 
 from gsx.core.errors import InputError
 from gsx.core.images import write_image
@@ -16,7 +17,6 @@ from gsx.core.ply import write_ply
 from gsx.core.scene import Scene, View
 from gsx.core.scenes.transforms import TransformsOptions, load
 
-CONF = Path(__file__).parents[3] / "conf" / "scene" / "transforms.yaml"
 WIDTH, HEIGHT = 120, 90
 COMMON = {"fl_x": 110.0, "fl_y": 100.0, "cx": 63.0, "cy": 41.0, "w": 120.0, "h": 90.0}
 BENT = {"k1": 0.12, "k2": -0.05, "p1": 0.004, "p2": -0.006}
@@ -48,7 +48,7 @@ def frame_changes(**changes: Any) -> list[dict[str, Any]]:
 def options(folder: Path, **changes: Any) -> TransformsOptions:
     """The shipped configuration with changes."""
     small = {"path": str(folder), "random_points": 50}
-    merged = OmegaConf.merge(OmegaConf.structured(TransformsOptions), OmegaConf.load(CONF), small, changes)
+    merged = OmegaConf.merge(OmegaConf.structured(TransformsOptions), shipped("transforms"), small, changes)
     made = OmegaConf.to_object(merged)
     assert isinstance(made, TransformsOptions)
     return made

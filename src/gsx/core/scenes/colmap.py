@@ -10,18 +10,14 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.errors import InputError
-from gsx.core.images import checked_size
 from gsx.core.scene import Scene, View, extent_of
 from gsx.core.scenes.colmap_model import Model, ModelImage, find_model, read_model
 from gsx.core.scenes.options import SceneOptions
-from gsx.core.scenes.posed import MIN_IMAGES, Shot, named, provenance, views_of
+from gsx.core.scenes.posed import MIN_IMAGES, Shot, lens_notes, named, provenance, shot_through, views_of
 from gsx.core.scenes.undistort import (
     METHOD,
-    StoredUndistortion,
-    camera_of,
     pinhole_of,
     undistort_points,
-    undistorted_size,
 )
 from gsx.core.shapes import Bool, Float
 from gsx.core.splits import split_names
@@ -69,7 +65,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
         points=model.points,
         background=torch.tensor(list(options.background), dtype=torch.float32),
         extent=extent_of([views[index].camera for index in train]),
-        notes=[*notes, *model.notes, *_missing_note(model, present), *_lens_notes(shots), fit],
+        notes=[*notes, *model.notes, *_missing_note(model, present), *lens_notes(shots), fit],
         provenance=_provenance(model, shots, options),
     )
 
@@ -100,16 +96,8 @@ def shot_of(model: Model, image: ModelImage, photos: Path) -> Shot:
     Raises:
         InputError: the photo's size is no uniform reduction of its camera's, or that has no pinhole equivalent.
     """
-    lens, photo = model.cameras[image.camera_id], photos / image.name
-    pinhole, expected = pinhole_of(lens), (lens.width, lens.height)
-    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
-    return Shot(
-        name=image.name,
-        photo=photo,
-        whole=camera_of(pinhole, image.rotation, image.translation).resize(*size),
-        expected_size=expected,
-        remap=None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size),
-    )
+    lens = model.cameras[image.camera_id]
+    return shot_through(lens, image.name, photos / image.name, image.rotation, image.translation)
 
 
 def check_cameras(
@@ -168,15 +156,6 @@ def _in_view(camera: Camera, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
 def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
     missing = sorted({image.name for image in model.images} - {image.name for image in present})
     return [f"Skipped {len(missing)} images whose photos are missing: {named(missing)}."] if missing else []
-
-
-def _lens_notes(shots: Sequence[Shot]) -> list[str]:
-    """One note for each kind of camera that is undistorted."""
-    kinds = {(shot.remap.lens.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
-    return [
-        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
-        for name, (width, height), (new_width, new_height) in sorted(kinds)
-    ]
 
 
 def _provenance(model: Model, shots: Sequence[Shot], options: ColmapOptions) -> dict[str, Any]:

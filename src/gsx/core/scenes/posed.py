@@ -1,4 +1,4 @@
-"""What the loaders of photographs with poses in JSON share: reading, axes, views, provenance."""
+"""What the loaders of photographs with poses share: reading, axes, lenses, views, provenance."""
 
 import json
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, centred
 from gsx.core.errors import ConfigError, InputError, nearest
-from gsx.core.images import ImageCache, PhotoSource, ResizeRule, Size, training_size
+from gsx.core.images import ImageCache, PhotoSource, ResizeRule, Size, checked_size, training_size
 from gsx.core.scene import View
 from gsx.core.scenes.options import SceneOptions
-from gsx.core.scenes.undistort import StoredUndistortion
+from gsx.core.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
 from gsx.core.shapes import Float
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined
@@ -34,6 +34,34 @@ class Shot:
     expected_size: Size
     """(width, height) that the poses file states for the photo."""
     remap: StoredUndistortion | None = None
+
+
+def shot_through(
+    lens: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+) -> Shot:
+    """A photo taken through `lens`, a pycolmap camera, as the pinhole photo that gsx uses.
+
+    Raises:
+        InputError: the photo's size is no uniform reduction of the lens's, or that has no pinhole equivalent.
+    """
+    pinhole, expected = pinhole_of(lens), (lens.width, lens.height)
+    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
+    return Shot(
+        name=name,
+        photo=photo,
+        whole=camera_of(pinhole, rotation, translation).resize(*size),
+        expected_size=expected,
+        remap=None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size),
+    )
+
+
+def lens_notes(shots: Sequence[Shot]) -> list[str]:
+    """One note for each kind of camera that is undistorted."""
+    kinds = {(shot.remap.lens.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
+    return [
+        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
+        for name, (width, height), (new_width, new_height) in sorted(kinds)
+    ]
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -14,21 +14,23 @@ from typing import Any
 import torch
 
 from gsx.core.errors import InputError, nearest
-from gsx.core.images import Size, checked_size, image_size
+from gsx.core.images import Size, image_size
 from gsx.core.scene import PointCloud, Scene, View, extent_of
 from gsx.core.scenes.options import SceneOptions
 from gsx.core.scenes.points import random_points, read_points
 from gsx.core.scenes.posed import (
     Shot,
+    lens_notes,
     plain_name,
     pose_from_opengl,
     present_frames,
     provenance,
     read_frames,
     refuse_too_few,
+    shot_through,
     views_of,
 )
-from gsx.core.scenes.undistort import METHOD, StoredUndistortion, camera_of, pinhole_of, undistorted_size
+from gsx.core.scenes.undistort import METHOD
 from gsx.core.splits import Split, split_names
 
 FILE = "transforms.json"
@@ -75,7 +77,7 @@ def load(options: TransformsOptions) -> Scene:
         points=points,
         background=torch.tensor(list(options.background), dtype=torch.float32),
         extent=extent_of([view.camera for view in train]),
-        notes=[*notes, *_lens_notes(shots), *_mask_note(frames), *split_notes, points_note],
+        notes=[*notes, *lens_notes(shots), *_mask_note(frames), *split_notes, points_note],
         provenance=provenance(options, len(views), points=options.points, undistortion=METHOD if bent else None),
     )
 
@@ -98,13 +100,7 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
-    lens = lens_of(entry, photo, place)
-    expected = lens.width, lens.height
-    pinhole = pinhole_of(lens)
-    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
-    whole = camera_of(pinhole, rotation, translation).resize(*size)
-    remap = None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size)
-    return Shot(name=name, photo=photo, whole=whole, expected_size=expected, remap=remap)
+    return shot_through(lens_of(entry, photo, place), name, photo, rotation, translation)
 
 
 def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
@@ -233,15 +229,6 @@ def _points(
     generator = torch.Generator().manual_seed(options.seed)
     cloud = random_points(options.random_points, middle - half, middle + half, generator)
     return cloud, f"Starts from {len(cloud)} random points in the cube around the cameras."
-
-
-def _lens_notes(shots: Sequence[Shot]) -> list[str]:
-    """One note for each kind of camera that is undistorted."""
-    kinds = {(shot.remap.lens.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
-    return [
-        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
-        for name, (width, height), (new_width, new_height) in sorted(kinds)
-    ]
 
 
 def _mask_note(frames: Sequence[Mapping[str, Any]]) -> list[str]:
