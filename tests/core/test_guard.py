@@ -140,3 +140,14 @@ def test_finite_gradients_of_any_shape_pass_and_others_are_counted_by_row(tmp_pa
     odd[1, 2, 0] = odd[3, 0, 1] = odd[3, 1, 0] = torch.nan
     reason = Guard().gsx_gradients_ready(run, step)
     assert reason == "the gradient of weights is not finite in 2 of 4 rows"
+
+
+def test_splats_that_are_not_finite_are_announced_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run, plugins = run_with({}, tmp_path), load_plugins([], points=[])
+    with plugins.listening([Guard()]), caplog.at_level(logging.WARNING, "gsx.core.guard"):
+        for spoilt in ([], [1], [1], [1, 3]):
+            with torch.no_grad():
+                run.backbone.table["means"][spoilt] = torch.nan
+            plugins.emit.gsx_step_finished(run=run, step=take_step(run, plugins))
+    announced = [record.getMessage().split(": ")[1] for record in caplog.records]
+    assert announced == ["1 splats are not finite and not drawn", "2 splats are not finite and not drawn"]

@@ -1,0 +1,72 @@
+"""Training learns: short runs on the built-in scene, and (slow) the runs that the README quotes."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from gsx.cli import main
+
+SCENES = Path(os.environ.get("GSX_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
+"""Real captures, used where they are present; the tests never need them."""
+
+
+def real(name: str) -> Path:
+    """Folder of a real capture; skips the test without it."""
+    if not (SCENES / name).is_dir():
+        pytest.skip(f"needs the capture {SCENES / name}; set GSX_SCENES to the folder that holds it")
+    return SCENES / name
+
+
+def result(folder: Path, *overrides: str) -> dict:
+    """Train in `folder` and return evaluation.json."""
+    assert main([*overrides, f"folder={folder}"]) == 0
+    return json.loads((folder / "evaluation.json").read_text())
+
+
+def test_a_short_run_learns_the_scene_and_zoom_truth_is_finer(tmp_path: Path) -> None:
+    small = ("scene.width=96", "scene.height=72", "scene.points=4000", "scene.samples=4", "scene.test_views=4")
+    evaluation = result(tmp_path / "run", *small, "iterations=200", "eval.zoom=[1,2]")
+    # the mean colour of the training views scores about 14 dB, nearest-point blobs about 18
+    assert evaluation["psnr"] > 22.5
+    assert evaluation["zoom"]["2"]["psnr"] < evaluation["psnr"]
+
+
+@pytest.mark.parametrize(("name", "train", "test"), [("fox", 43, 7), ("desk_bottle", 88, 13)])
+def test_real_captures_load(name: str, train: int, test: int) -> None:
+    from gsx.cli import plugins
+    from gsx.core.config import compose
+    from gsx.core.session import load_scene
+
+    scene = load_scene(compose(["scene=colmap", f"scene.path={real(name)}", "scene.downscale=4"], plugins()))
+    assert (len(scene.train), len(scene.test)) == (train, test)
+    assert any("Reprojection error 0." in note for note in scene.notes)
+
+
+@pytest.mark.slow
+def test_demo_reaches_27_db(tmp_path: Path) -> None:
+    assert result(tmp_path / "run")["psnr"] >= 27
+
+
+@pytest.mark.slow
+def test_fox_reaches_29_db_within_3_gb(tmp_path: Path) -> None:
+    scene = ("scene=colmap", f"scene.path={real('fox')}", "scene.downscale=4")
+    evaluation = result(tmp_path / "run", *scene, "iterations=2000", "eval.zoom=[1,2,4]")
+    assert evaluation["psnr"] >= 29
+    assert evaluation["peak_memory_mb"] < 3000
+
+
+@pytest.mark.slow
+def test_lego_reaches_26_db_on_white(tmp_path: Path) -> None:
+    scene = ("scene=blender", f"scene.path={real('lego')}", "scene.downscale=4")
+    assert result(tmp_path / "run", *scene, "iterations=2000")["psnr"] >= 26
+
+
+@pytest.mark.slow
+def test_fox_from_photos_alone(tmp_path: Path) -> None:
+    evaluation = result(
+        tmp_path / "run",
+        "scene=photos", f"scene.path={real('fox') / 'images'}", "scene.downscale=8", "iterations=200",
+    )  # fmt: skip
+    assert evaluation["protocol"]["train_views"] + len(evaluation["protocol"]["test_views"]) >= 45
