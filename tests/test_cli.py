@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, verbs, errors with exit code 2, Ctrl-C."""
 
+import logging
 import os
 import re
 import signal
@@ -108,6 +109,52 @@ def one_image_scene(folder: Path) -> Path:
     return folder
 
 
+def synthetic(folder: Path, points: int = 50) -> Path:
+    """A COLMAP scene of four photographs."""
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_rigs, options.num_cameras_per_rig = 4, 1, 1
+    options.num_points3D = points
+    reconstruction = pycolmap.synthesize_dataset(options)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    reconstruction.write_binary(folder / "sparse" / "0")
+    for image in reconstruction.images.values():
+        path = folder / "images" / image.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, torch.rand(3, image.camera.height // 8, image.camera.width // 8))
+    return folder
+
+
+def resized_photo(folder: Path) -> Path:
+    """One photograph has another shape than its camera."""
+    write_image(next((folder / "images").rglob("*.png")), torch.rand(3, 50, 50))
+    return folder
+
+
+def strange_camera(folder: Path) -> Path:
+    """The first camera has a model number that no COLMAP knows."""
+    path = folder / "sparse" / "0" / "cameras.bin"
+    data = bytearray(path.read_bytes())
+    data[12:16] = (77).to_bytes(4, "little")  # count u64, id i32, then the model i32 (spec 2.1)
+    path.write_bytes(bytes(data))
+    return folder
+
+
+def stopped_run(folder: Path) -> Path:
+    """An interrupted tiny run."""
+    logging.getLogger("gsx").handlers.clear()  # of an earlier test, on a stream that is closed by now
+    tiny_run(folder, ["iterations=4"], stop_after=2)
+    return folder
+
+
+def truncated(folder: Path) -> Path:
+    """The only checkpoint is cut off."""
+    path = next((folder / "checkpoints").glob("*.safetensors"))
+    path.write_bytes(path.read_bytes()[:1000])
+    return folder
+
+
 def empty_folder(folder: Path) -> Path:
     folder.mkdir()
     return folder
@@ -135,6 +182,18 @@ BAD = {
     "eval nothing": lambda t: ["eval"],
     "report of nothing": lambda t: ["report", str(t / "nowhere")],
     "scenes of nothing": lambda t: ["scenes"],
+    "demo with a folder": lambda t: [f"scene.path={empty_folder(t / 'd')}"],
+    "one weights file": lambda t: words(t / "run", "metrics.lpips.trunk=x.pth"),
+    "unreadable weights": lambda t: words(t / "run", "metrics.lpips.trunk=x.pth", "metrics.lpips.head=y.pth"),
+    "override cut off": lambda t: ["-m", "seed=0,1", "eval.zoom=[1"],
+    "another group on resume": lambda t: ["resume", str(stopped_run(t / "run")), "scene=colmap"],
+    "list cut off on eval": lambda t: ["eval", str(stopped_run(t / "run")), "eval.zoom=[1,2"],
+    "truncated checkpoint": lambda t: ["resume", str(truncated(stopped_run(t / "run")))],
+    "zero points": lambda t: ["scene=colmap", f"scene.path={synthetic(t / 's', points=0)}"],
+    "empty split": lambda t: ["scene=colmap", "scene.split=every:1", f"scene.path={synthetic(t / 's')}"],
+    "sizes disagree": lambda t: ["scene=colmap", f"scene.path={resized_photo(synthetic(t / 's'))}"],
+    "unknown camera model": lambda t: ["scene=colmap", f"scene.path={strange_camera(synthetic(t / 's'))}"],
+    "render at zoom 0": lambda t: ["render", str(t / "run"), "--zoom", "0"],
     "bad device": lambda t: words(t / "run", "device=tpu"),
 }
 
@@ -156,6 +215,20 @@ def test_an_unwritable_output_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "file").write_text("")
     assert main([*OVERRIDES, "iterations=1", f"output={tmp_path / 'file'}"]) == 2
     assert "choose a writable place" in capsys.readouterr().err
+
+
+def test_points_that_are_not_numbers_are_dropped_and_counted(tmp_path: Path) -> None:
+    from gsx.cli import plugins
+    from gsx.core.config import compose
+    from gsx.core.session import load_scene
+
+    path = synthetic(tmp_path / "s") / "sparse" / "0" / "points3D.bin"
+    data = bytearray(path.read_bytes())
+    data[16:24] = b"\xff" * 8  # count u64, id u64, then x as f64: all ones is a NaN (spec 2.1)
+    path.write_bytes(bytes(data))
+    scene = load_scene(compose(["scene=colmap", f"scene.path={tmp_path / 's'}"], plugins()))
+    assert len(scene.points) == 49
+    assert any("1 " in note and "finite" in note for note in scene.notes)
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_no_partial_file(

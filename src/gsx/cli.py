@@ -1,6 +1,7 @@
 """The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
 
 import argparse
+import errno
 import logging
 import signal
 import sys
@@ -29,7 +30,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
   gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
   gsx eval RUN [K=V ...]    evaluate a run again, for example with 'eval.zoom=[1,2,4]'
-  gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif|.webp|.mp4
+  gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif (.webp, .mp4: gsx[video])
   gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
   gsx report DIR            report.html of a run, or of all runs below a folder
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
@@ -41,6 +42,8 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
 """
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells report it."""
 HYDRA_FLAGS = (
     "-m",
     "--multirun",
@@ -67,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(os_sentence(error))
     except KeyboardInterrupt:
         sys.stderr.write("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n")
-        return 130
+        return INTERRUPTED
 
 
 def complain(sentence: str) -> int:
@@ -79,12 +82,13 @@ def complain(sentence: str) -> int:
 def os_sentence(error: OSError) -> str:
     """A failure of the file system with its remedy."""
     where = f" ({error.filename})" if error.filename else ""
-    return f"{error.strerror or error}{where}: free some space or choose a writable place, for example output=FOLDER"
+    remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
+    return f"{error.strerror or error}{where}: {remedy}, or choose a writable place, for example output=FOLDER"
 
 
 def dispatch(words: list[str]) -> int:
     """Find the verb and run it."""
-    if words and words[0] in ("--help", "-h", "help"):
+    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] != "render"):
         sys.stdout.write(HELP)
         return 0
     if words == ["--version"]:
@@ -119,6 +123,7 @@ def logged_to(folder: Path) -> Iterator[None]:
     """Also write messages to the run's log.txt."""
     handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
     logging.getLogger("gsx").addHandler(handler)
     try:
         yield
@@ -136,16 +141,25 @@ def plugins() -> "Plugins":
 
 
 @contextmanager
-def interruptible(run: "Run") -> Iterator[None]:
-    """The first Ctrl-C ends training after the current step; a second one ends the program."""
+def interruptible(run: "Run") -> Iterator[object]:
+    """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
+
+    Yields a listener that takes the handler away when training is over.
+    """
+    from gsx.core.plugins import hookimpl
 
     def stop(number: int, frame: Any) -> None:
         run.stopping = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
+
+    class UntilTrained:
+        @hookimpl
+        def gsx_training_finished(self) -> None:
+            signal.signal(signal.SIGINT, before)
 
     before = signal.signal(signal.SIGINT, stop)
     try:
-        yield
+        yield UntilTrained()
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -174,7 +188,20 @@ def hand_to_hydra(words: list[str]) -> int:
     loaded = plugins()
     if {"-m", "--multirun"} & set(words):
         check_overrides([word for word in words if not word.startswith("-")], loaded)
-    return hydra_main(words, loaded, lambda settings: train(settings, loaded))
+    return hydra_main(words, loaded, lambda settings: guarded(lambda: train(settings, loaded)))
+
+
+def guarded(action: Callable[[], int]) -> int:
+    """The exit code of an action; an error of one experiment is shown and does not end the others, Ctrl-C does."""
+    try:
+        code = action()
+    except GsxError as error:
+        return complain(str(error))
+    except OSError as error:
+        return complain(os_sentence(error))
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code
 
 
 def train(settings: "Settings", loaded: "Plugins") -> int:
@@ -189,11 +216,15 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     """Train to the end or to Ctrl-C, and say where things are."""
     from gsx.core.session import execute
 
-    with interruptible(run), logged_to(run.folder):
-        execute(run, settings, loaded)
+    try:
+        with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
+            execute(run, settings, loaded)
+    except KeyboardInterrupt:
+        sys.stderr.write(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n")
+        return INTERRUPTED
     if not run.complete:
         sys.stderr.write(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n")
-        return 130
+        return INTERRUPTED
     sys.stdout.write(f"{run.folder / 'report.html'}\n")
     return 0
 
@@ -213,7 +244,7 @@ def verb_resume(words: list[str]) -> int:
     folder, overrides = run_words("resume", words)
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
-    if run.complete:
+    if run.complete and (folder / "evaluation.json").is_file():
         raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
     write_config(folder / "config.yaml", settings.resolved)
     logger.info("resuming %s at step %d", folder, run.step)
@@ -223,13 +254,17 @@ def verb_resume(words: list[str]) -> int:
 def verb_eval(words: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
     from gsx.core.report import write_report
-    from gsx.core.session import evaluate, open_run
+    from gsx.core.session import evaluate, finish, open_run
 
     folder, overrides = run_words("eval", words)
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
-    loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
-    sys.stdout.write(f"{write_report(folder)}\n")
+    if run.complete:
+        finish(run, settings, loaded)
+    else:
+        loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
+        write_report(folder)
+    sys.stdout.write(f"{folder / 'report.html'}\n")
     return 0
 
 
@@ -243,6 +278,8 @@ def verb_render(words: list[str]) -> int:
     parser.add_argument("--zoom", type=float, default=1, help="times the training resolution (1)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for test views (RUN/renders/test)")
     given = parser.parse_args(words)
+    if given.zoom <= 0 or given.frames < 1:
+        raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
     from gsx.core.session import open_run, render_orbit, render_test_views
 
     run, settings = open_run(given.run, plugins())
@@ -287,8 +324,9 @@ def verb_scenes(words: list[str]) -> int:
         raise InputError("gsx scenes needs one folder: gsx scenes PATH")
     from gsx.core.scenes.inspect import describe
 
-    sys.stdout.write("\n".join(describe(Path(words[0]))) + "\n")
-    return 0
+    lines = describe(Path(words[0]))
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
 def verb_plugins(words: list[str]) -> int:

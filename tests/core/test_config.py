@@ -53,6 +53,16 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["eval.zoom=2"], "eval.zoom"),
         (["scene=[demo"], "override cannot be read"),
         (["nonsense"], "override cannot be read"),
+        (["eval.ssim=inira"], "eval.ssim is 'inira'; choose from inria"),
+        (["eval.zoom=[0]"], "give factors of 1 or more"),
+        (["eval.tile_pixels=-4"], "eval.tile_pixels is -4"),
+        (["training.log_every=0"], "training.log_every is 0"),
+        (["training.checkpoints_kept=0"], "training.checkpoints_kept is 0"),
+        (["backbone.sh_degree=4"], "choose 0 to 3"),
+        (["backbone.initial_opacity=1"], "between 0 and 1"),
+        (["backbone.rates.means_first=0"], "must be positive"),
+        (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
+        (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),
     ],
 )
 def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) -> None:
@@ -63,3 +73,7 @@ def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) ->
 def test_a_number_for_a_text_is_not_silently_taken() -> None:
     with pytest.raises(ConfigError, match=r"scene\.downscale"):
         typed(SceneOptions, {"name": "x", "background": [0, 0, 0], "downscale": 1.5}, "scene")
+
+
+def test_a_folder_named_by_a_number_is_a_folder() -> None:
+    assert compose(["scene=colmap", "scene.path=2024"], plugins()).scene.options.path.endswith("/2024")

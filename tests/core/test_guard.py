@@ -142,12 +142,17 @@ def test_finite_gradients_of_any_shape_pass_and_others_are_counted_by_row(tmp_pa
     assert reason == "the gradient of weights is not finite in 2 of 4 rows"
 
 
-def test_splats_that_are_not_finite_are_announced_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_primitives_that_are_not_finite_are_removed_and_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     run, plugins = run_with({}, tmp_path), load_plugins([], points=[])
-    with plugins.listening([Guard()]), caplog.at_level(logging.WARNING, "gsx.core.guard"):
-        for spoilt in ([], [1], [1], [1, 3]):
-            with torch.no_grad():
-                run.backbone.table["means"][spoilt] = torch.nan
-            plugins.emit.gsx_step_finished(run=run, step=take_step(run, plugins))
-    announced = [record.getMessage().split(": ")[1] for record in caplog.records]
-    assert announced == ["1 splats are not finite and not drawn", "2 splats are not finite and not drawn"]
+    before = len(run.backbone.table)
+    with plugins.listening([Guard()]), caplog.at_level(logging.WARNING, "gsx.core.trainer"):
+        with torch.no_grad():
+            run.backbone.table["log_scales"][1] = torch.nan
+        skipped, after = take_step(run, plugins), take_step(run, plugins)
+    assert skipped.skipped == "removed 1 primitives"
+    assert not after.skipped
+    assert after.rendering.dropped == 0
+    assert len(run.backbone.table) == len(run.backbone.statistics.count) == before - 1
+    assert "removed 1 primitives with values that are not finite" in caplog.text

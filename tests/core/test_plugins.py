@@ -47,7 +47,7 @@ def test_a_plugin_adds_components_and_search_paths(importable: Path) -> None:
     assert (component.kind, component.name, component.provider) == ("backbone", "mine", "good1")
     assert component.factory(None, None) == "built"
     assert component.options.__name__ == "Options"
-    assert plugins.config_paths() == ["pkg://mine.conf"]
+    assert plugins.config_paths == ["pkg://mine.conf"]
     assert plugins.failures == []
     assert plugins.versions == {"good1": "?"}
 
@@ -73,7 +73,7 @@ def test_name_clash_keeps_the_first_and_reports_the_second(importable: Path) -> 
     assert "backbone 'mine' is already registered by first2" in failure.reason
     # nothing of the second is left: neither what it had added before nor its other hooks
     assert plugins.registry.names("backbone") == ["mine"]
-    assert plugins.config_paths() == ["pkg://mine.conf"]
+    assert plugins.config_paths == ["pkg://mine.conf"]
     assert list(plugins.versions) == ["first2"]
 
 
@@ -106,7 +106,7 @@ def test_a_broken_plugin_is_reported_and_the_others_load(case: str, importable: 
     assert error in failure.reason
     assert words in failure.reason
     assert plugins.registry.names("backbone") == ["good"]
-    assert plugins.config_paths() == ["pkg://good.conf"]
+    assert plugins.config_paths == ["pkg://good.conf"]
     assert plugins.manager.get_plugin(f"bad_{stem}") is None
     assert list(plugins.versions) == [f"good_{stem}"]
 

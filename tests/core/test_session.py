@@ -1,6 +1,7 @@
 """Whole runs: what they leave, exact resume, repeatability, zoom evaluation, interruption."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from safetensors.torch import load_file
 from tiny import tiny_run, tiny_settings
 
-from gsx.cli import plugins
+from gsx.cli import main, plugins
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.export import read_gaussians
 from gsx.core.session import execute, open_run, start
@@ -157,3 +158,39 @@ def test_zero_iterations_and_unknown_devices_are_refused_before_anything_is_writ
         with pytest.raises(ConfigError, match=pattern):
             start(settings, plugins())
         assert not (tmp_path / "run").exists()
+
+
+def test_other_views_than_trained_on_are_refused(finished: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"trained with other train views \(now 5, then 6"):
+        open_run(finished, plugins(), ["scene.train_views=5"])
+
+
+def test_evaluating_a_finished_run_keeps_its_training_peak_and_mends_its_status(finished: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    (copy / "evaluation.json").unlink()
+    (copy / "status.json").write_text('{"state": "failed", "reason": "power cut", "step": 24}')
+    assert main(["eval", str(copy)]) == 0
+    assert json.loads((copy / "status.json").read_text())["state"] == "ok"
+    peak = max(json.loads(line)["memory_mb"] for line in (copy / "metrics.jsonl").read_text().splitlines())
+    assert json.loads((copy / "evaluation.json").read_text())["peak_memory_mb"] >= peak
+
+
+def test_the_zooms_looked_at_do_not_change_the_protocol_hash(finished: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    before = json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"]
+    assert main(["eval", str(copy), "eval.zoom=[1]"]) == 0
+    assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] == before
+    assert main(["eval", str(copy), "eval.ssim=valid"]) == 0
+    assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] != before
+
+
+def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
+    newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
+    shutil.copy(newest, newest.with_name("step_0000099.safetensors"))
+    newest.with_name("step_0000099.json").write_text("{")
+    resume(folder)
+    assert [path.name for path in (folder / "checkpoints").glob("*.json")] == ["step_0000006.json"]

@@ -23,6 +23,8 @@ from gsx.core.sh import colours_of, constant_from_colour
 from gsx.core.shapes import Bool, Float
 from gsx.core.splats import Splats
 
+LARGEST_LOG_SCALE = 30.0
+"""Scales are held below e^30 world units, so that their squares stay finite in float32 (DESIGN: clamp log-scales)."""
 LEAST_SQUARE_DISTANCE = 1e-7
 """Lower bound of the squared neighbour distance that sets the initial scale (spec 1.4)."""
 
@@ -78,6 +80,16 @@ class GS3DOptions:
     rates: Rates
     density: Density
 
+    def __post_init__(self) -> None:
+        if self.sh_degree not in range(4):
+            raise ValueError(f"backbone.sh_degree is {self.sh_degree}; choose 0 to 3")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"backbone.initial_opacity is {self.initial_opacity}; give a value between 0 and 1")
+        if self.published_iterations < 1 or self.max_primitives < 1:
+            raise ValueError("backbone.published_iterations and backbone.max_primitives must be at least 1")
+        if not (self.rates.means_first > 0 and self.rates.means_last > 0):
+            raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
+
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
     """Raw parameters of one Gaussian per point (spec 1.1 and 1.4)."""
@@ -91,6 +103,11 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
         "log_scales": distance.sqrt().log()[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
     }
+
+
+def as_rows(values: Tensor) -> Tensor:
+    """[N, ...] with at least two dimensions."""
+    return values.view(len(values), -1)
 
 
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
@@ -137,7 +154,7 @@ class GS3D:
         offsets = table["means"] - camera.centre.to(table["means"])
         return Splats(
             means=table["means"],
-            scales=table["log_scales"].exp(),
+            scales=table["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp(),
             quats=table["quats"],
             log_opacities=logsigmoid(table["opacity_logits"]),
             colours=colours_of(table["sh_constant"], table["sh_rest"], offsets, self.active_degree),
@@ -163,13 +180,24 @@ class GS3D:
         return done
 
     def update(self) -> None:
-        """One Adam step."""
+        """One Adam step. Unused SH bands take part with zero gradients, as in the published code (spec 1.3)."""
+        rest = self.table["sh_rest"]
+        if rest.grad is None and self.table["sh_constant"].grad is not None:
+            rest.grad = torch.zeros_like(rest)
         self.table.optimiser.step()
         self.discard()
 
     def gradients(self) -> Iterable[tuple[str, Tensor]]:
         """Gradients by parameter name."""
         return ((name, p.grad) for name, p in self.table.parameters.items() if p.grad is not None)
+
+    def heal(self) -> int:
+        """Remove rows with a value that is not finite, with their statistics; returns how many."""
+        finite = [torch.isfinite(as_rows(p.detach())).all(1) for p in self.table.parameters.values()]
+        kept = torch.stack(finite).all(0)
+        keep_rows(self.table, kept)
+        self.statistics = Statistics(self.statistics.gradient[kept], self.statistics.count[kept])
+        return int((~kept).sum())
 
     def discard(self) -> None:
         """Forget the gradients."""
@@ -268,7 +296,9 @@ class GS3D:
                 "until": steps.step(density.stop),
                 "every": steps.interval(density.every),
             },
-            "opacity_reset": {"every": self.reset_interval(), "until": steps.step(density.stop)},
+            "opacity_reset": {"every": self.reset_interval(), "until": steps.step(density.stop)}
+            | ({"white_background": max(1, steps.step(density.white_reset))} if self.white else {}),
+            "prune_huge": {"from": self.reset_interval()},
             "sh_degree": {
                 "every": max(1, steps.step(self.options.sh_every)),
                 "up_to": self.options.sh_degree,

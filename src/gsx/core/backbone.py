@@ -79,6 +79,10 @@ class Backbone(Protocol):
         """Name and gradient of every parameter that has one."""
         ...
 
+    def heal(self) -> int:
+        """Remove primitives with values that are not finite; returns how many. Called when a render left some out."""
+        ...
+
     def discard(self) -> None:
         """Clear the gradients without moving anything."""
         ...

@@ -38,6 +38,7 @@ def save(run: Run) -> Path:
         "step": run.step,
         "seconds": run.seconds,
         "sampler": run.sampler.order,
+        "views": names_of(run),
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     write_json(path.with_suffix(".json"), sidecar)
@@ -45,6 +46,22 @@ def save(run: Run) -> Path:
         old.unlink()
         old.with_suffix(".safetensors").unlink(missing_ok=True)
     return path
+
+
+def names_of(run: Run) -> dict[str, list[str]]:
+    """Names of the training and test views: a run goes on with these or not at all."""
+    return {"train": [v.name for v in run.scene.train], "test": [v.name for v in run.scene.test]}
+
+
+def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
+    """Raise CheckpointError if the scene now has other views, or splits them otherwise, than when it was trained."""
+    for part, names in names_of(run).items():
+        if names != trained[part]:
+            changed = sorted(set(names) ^ set(trained[part]))
+            raise CheckpointError(
+                f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
+                f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
+            )
 
 
 def sidecars(folder: Path) -> list[Path]:
@@ -96,7 +113,11 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 def restore(run: Run) -> None:
     """Bring a freshly built run to the state of its newest checkpoint."""
     meta, tensors = newest(run.folder)
+    refuse_other_views(run, meta["views"])
     run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     run.backbone.restore(tensors)
     run.sampler.order = list(meta["sampler"])
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
+    for sidecar in sidecars(run.folder / "checkpoints"):  # newer ones are damaged; they must not outlive good ones
+        if sidecar.stem > f"step_{run.step:07d}":
+            sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -76,7 +76,7 @@ def register_search_paths(plugins: Plugins) -> None:
     from hydra.core.plugins import Plugins as HydraPlugins
     from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-    paths = plugins.config_paths()
+    paths = plugins.config_paths
 
     class PluginPaths(SearchPathPlugin):
         def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
@@ -94,10 +94,7 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
         ConfigError: a group, option, key or value is wrong; the nearest right one is named.
     """
     with hydra_session(plugins):
-        config = compose_raw(overrides)
-        if config.scene.get("path"):  # a run folder must open from anywhere
-            config.scene.path = str(Path(config.scene.path).expanduser().resolve())
-        return settings_from(config, plugins)
+        return settings_from(compose_raw(overrides), plugins)
 
 
 def compose_raw(overrides: Sequence[str]) -> DictConfig:
@@ -112,19 +109,24 @@ def compose_raw(overrides: Sequence[str]) -> DictConfig:
         raise ConfigError(explain(error, overrides)) from error
 
 
-def check_groups(overrides: Sequence[str]) -> None:
-    """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
-    from hydra.core.global_hydra import GlobalHydra
+def parse_overrides(overrides: Sequence[str]) -> list[Any]:
+    """Hydra's Override objects, or ConfigError."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    loader = GlobalHydra.instance().config_loader()
-    groups = [group for group in loader.list_groups("") if not group.startswith("hydra")]
     try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
         raise ConfigError(f"override cannot be read: {first_line(error)} (quote it for the shell)") from error
-    for override in parsed:
+
+
+def check_groups(overrides: Sequence[str]) -> None:
+    """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    groups = [group for group in loader.list_groups("") if not group.startswith("hydra")]
+    for override in parse_overrides(overrides):
         if override.key_or_group not in groups or override.is_sweep_override():
             continue
         options = loader.get_group_options(override.key_or_group)
@@ -180,8 +182,13 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     Raises:
         ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
     """
-    raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
+    try:
+        raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"a value cannot be resolved: {first_line(error)}") from error
     assert isinstance(raw, dict)
+    if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
+        raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = dict(raw)
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
@@ -198,7 +205,11 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
 
 def chosen(kind: str, node: Any, plugins: Plugins) -> Chosen:
     """The component a node names, and its options."""
-    component = plugins.registry.find(kind, str((node or {}).get("name", "")))
+    if not isinstance(node, dict):
+        raise ConfigError(
+            f"{kind} is {node!r}, which is no group of options: choose one with {kind}=NAME when training"
+        )
+    component = plugins.registry.find(kind, str(node.get("name", "")))
     return Chosen(component=component, options=typed(component.options, node, kind))
 
 
@@ -263,21 +274,22 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         key, equals, value = override.partition("=")
         if not equals or key not in known:
             raise ConfigError(f"'{key}' is no key of {path}.{nearest(key, known)}")
-        OmegaConf.update(config, key, OmegaConf.select(OmegaConf.create(f"value: {value}"), "value"))
+        try:
+            OmegaConf.update(config, key, OmegaConf.select(OmegaConf.create(f"value: {value}"), "value"))
+        except Exception as error:  # the YAML parser has its own family of errors
+            raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)  # type: ignore[arg-type]
 
 
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:
     """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
     with hydra_session(plugins):
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        parsed = parse_overrides(overrides)
         compose_raw([o.input_line for o in parsed if o.input_line and not o.is_sweep_override()])
 
 
 def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> int:
-    """Hydra's own command line on our configuration; `task` is called for every composed experiment."""
+    """Hydra's own command line on our configuration; returns the worst code of `task` over the experiments."""
     import sys
 
     import hydra
@@ -285,9 +297,10 @@ def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Setti
     register_search_paths(plugins)
 
     @hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")
-    def entry(config: DictConfig) -> int:
-        return task(settings_from(config, plugins))
+    def entry(config: DictConfig) -> None:
+        codes.append(task(settings_from(config, plugins)))
 
+    codes: list[int] = []
     sys.argv = ["gsx", *arguments]
     entry()
-    return 0
+    return max(codes, default=0)

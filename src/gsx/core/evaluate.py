@@ -20,23 +20,34 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.lpips import LpipsOptions, load_lpips
-from gsx.core.metrics import bicubic, psnr, quantise, ssim
+from gsx.core.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.run import Run
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 from gsx.core.splats import Splats
 
+LEAST_TILE_PIXELS = 16 * 16
+"""One tile of the published rasterizer."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvalOptions:
-    """Options; values in conf/config.yaml. They are the protocol: saved and hashed with every result."""
+    """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
 
     zoom: list[int]
     quantise: bool
     ssim: str
     tile_pixels: int
     lpips: LpipsOptions
+
+    def __post_init__(self) -> None:
+        if self.ssim not in SSIM_VARIANTS:
+            raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
+        if not self.zoom or min(self.zoom) < 1:
+            raise ValueError(f"eval.zoom is {list(self.zoom)}; give factors of 1 or more")
+        if self.tile_pixels < LEAST_TILE_PIXELS:
+            raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +120,11 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
         "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
         "ssim": options.ssim,
         "lpips": lpips_name,
-        "zoom": list(options.zoom),
         "enlarged": "x1 render, antialiased Keys bicubic",
     }
     text = json.dumps(protocol, sort_keys=True, default=str)
-    return protocol | {"hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
+    # which zooms were looked at changes no figure, so it does not enter the hash
+    return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
 
 
 def mean(values: Sequence[float | None]) -> float | None:
@@ -187,7 +198,7 @@ class Evaluator:
             "megabytes": size / 1e6,
             "render_fps": 1 / render_seconds(run, run.scene.test, self.options.tile_pixels),
             "train_seconds": run.seconds,
-            "peak_memory_mb": peak_memory_mb(run.device),
+            "peak_memory_mb": max([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
             "groups": {name: {key: mean([v[key] for v in vs]) for key in figures} for name, vs in by_group.items()},
             "zoom": {str(factor): self.zoom(factor) for factor in self.options.zoom},
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],

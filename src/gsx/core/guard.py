@@ -19,14 +19,6 @@ class Guard:
 
     def __init__(self) -> None:
         self.in_a_row = 0
-        self.dropped = 0
-
-    @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
-        """Say aloud when the number of splats with non-finite values has grown."""
-        if step.rendering.dropped > self.dropped:
-            logger.warning("step %d: %d splats are not finite and not drawn", step.number, step.rendering.dropped)
-        self.dropped = step.rendering.dropped
 
     @hookimpl
     def gsx_gradients_ready(self, run: Run, step: Step) -> str | None:
@@ -56,5 +48,7 @@ def culprit(run: Run, step: Step) -> str | None:
     for name, gradient in run.backbone.gradients():
         if not bool(torch.isfinite(gradient.sum())):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
+            if rows == 0:  # every value is finite, only their sum overflowed
+                continue
             return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
     return None

@@ -133,7 +133,10 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
     Raises:
         InputError: a given file is missing, unreadable or of another network.
     """
-    if not options.trunk or not options.head:
+    if bool(options.trunk) != bool(options.head):
+        missing = "head" if options.trunk else "trunk"
+        raise InputError(f"metrics.lpips.{missing} is missing: give both weights files, or neither")
+    if not options.trunk:
         logger.info("LPIPS: n/a (no weights); give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE")
         return None
     network = Lpips(options.net, options.input_range)

@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 from gsx.core.losses import WINDOW, ssim_map
 from gsx.core.shapes import Float
 
-SSIM_VARIANTS = ("inria", "torchmetrics")
+SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
 
 
 def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
@@ -26,14 +26,23 @@ def psnr(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float
 def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant: str) -> float:
     """Structural similarity in [-1, 1].
 
-    `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release. `torchmetrics`: reflected windows,
-    mean over the pixels whose window lies inside, as torchmetrics and the original SSIM. They differ near borders.
+    They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
+    `torchmetrics`: the same with reflected borders, as torchmetrics since 1.5. `valid`: mean over the pixels whose
+    window lies inside, as the original SSIM and pytorch-msssim.
     """
     if variant == "inria":
         return float(ssim_map(image, target).double().mean())
     if variant == "torchmetrics":
+        return float(whole_windows(reflected(image), reflected(target)).double().mean())
+    if variant == "valid":
         return float(whole_windows(image, target).double().mean())
     raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
+
+
+def reflected(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+    """Extended by half a window on each side; borders narrower than that are repeated, not reflected."""
+    half = WINDOW // 2
+    return pad(image, (half,) * 4, mode="reflect" if min(image.shape[1:]) > half else "replicate")
 
 
 def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:

@@ -133,22 +133,22 @@ class Plugins:
     failures: list[Failure]
     versions: dict[str, str]
     """Version of each loaded plugin's distribution."""
+    config_paths: list[str] = field(default_factory=list)
+    """Hydra search paths of all plugins."""
 
     @property
     def emit(self) -> pluggy.HookRelay:
         """Hook calls by name: `plugins.emit.gsx_step_finished(run=run, step=step)`."""
         return self.manager.hook
 
-    def config_paths(self) -> list[str]:
-        """Search paths of all plugins."""
-        return [path for paths in self.emit.gsx_config_paths() for path in paths]
-
     @contextmanager
     def listening(self, listeners: Iterable[object]) -> Iterator[None]:
         """Objects with event hooks listen for the duration of a run; the first listed is called first."""
         registered = list(listeners)
         for listener in reversed(registered):  # pluggy calls the latest registration first
+            refuse_unmarked(listener)
             self.manager.register(listener)
+        self.manager.check_pending()
         try:
             yield
         finally:
@@ -176,15 +176,35 @@ def load_plugins(builtins: Iterable[tuple[str, object]], points: Iterable[EntryP
 
 def admit(plugins: Plugins, name: str, plugin: object) -> None:
     """Register one plugin and let it fill the registry; on an error it is taken out again, and the error raised."""
-    before = dict(plugins.registry.components)
+    before, paths = dict(plugins.registry.components), list(plugins.config_paths)
+    refuse_unmarked(plugin)
     plugins.manager.register(plugin, name=name)
     try:
         plugins.manager.check_pending()
-        register = getattr(plugin, "gsx_register", None)
         plugins.registry.provider = name
-        if register is not None:
-            register(registry=plugins.registry)
+        if hasattr(plugin, "gsx_register"):
+            plugin.gsx_register(registry=plugins.registry)
+        if hasattr(plugin, "gsx_config_paths"):
+            plugins.config_paths += checked_paths(plugin.gsx_config_paths())
     except Exception:
         plugins.manager.unregister(plugin)
-        plugins.registry.components = before
+        plugins.registry.components, plugins.config_paths = before, paths
         raise
+
+
+def refuse_unmarked(plugin: object) -> None:
+    """Raise TypeError for a function named like a hook without `@hookimpl`: it would silently never run."""
+    for name in dir(plugin):
+        if (
+            name.startswith(f"{GROUP}_")
+            and callable(hook := getattr(plugin, name))
+            and not hasattr(hook, f"{GROUP}_impl")
+        ):
+            raise TypeError(f"{name} is not marked with @hookimpl")
+
+
+def checked_paths(paths: Any) -> list[str]:
+    """What gsx_config_paths returned, or TypeError."""
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise TypeError(f"gsx_config_paths must return a list of texts, got {paths!r}")
+    return paths

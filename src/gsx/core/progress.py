@@ -3,13 +3,15 @@
 import json
 import sys
 import time
-from typing import IO, TextIO
+from pathlib import Path
+from typing import IO, Any, TextIO
 
 from gsx.core.evaluate import EvalOptions, peak_memory_mb, quick_psnr
 from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
+METRICS = "metrics.jsonl"
 LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0
 """Time between updates on a terminal, and elsewhere (a Slurm log stays readable)."""
 SMOOTHING = 0.3
@@ -81,6 +83,13 @@ class Progress:
         self.width = len(text)
 
 
+def read_curves(folder: Path) -> list[dict[str, Any]]:
+    """Lines of a run's metrics.jsonl; one that a crash cut off is left out."""
+    path = folder / METRICS
+    written = path.read_text().splitlines() if path.exists() else []
+    return [json.loads(line) for line in written if line.endswith("}")]
+
+
 class MetricsLog:
     """Listener: appends to metrics.jsonl every `training.log_every` steps, test PSNR at evenly spaced points."""
 
@@ -91,10 +100,8 @@ class MetricsLog:
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
         """Open the file; a resumed run drops lines later than its checkpoint."""
-        path = run.folder / "metrics.jsonl"
-        written = path.read_text().splitlines() if path.exists() else []
-        lines = [json.loads(line) for line in written if line.endswith("}")]  # a crash may cut off the last
-        run.curves[:] = [line for line in lines if line["step"] <= run.step]
+        path = run.folder / METRICS
+        run.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
         replace_file(path, "".join(json.dumps(line) + "\n" for line in run.curves).encode())
         self.stream = path.open("a")
 

@@ -25,6 +25,13 @@ class TrainingOptions:
     checkpoints_kept: int
     test_points: int
 
+    def __post_init__(self) -> None:
+        for name in ("log_every", "checkpoint_every", "checkpoints_kept"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"training.ssim_weight is {self.ssim_weight}; give a value from 0 to 1")
+
 
 @dataclass(eq=False)
 class Sampler:

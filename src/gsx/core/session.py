@@ -3,6 +3,7 @@
 import logging
 import os
 import platform
+import shutil
 import sys
 from collections.abc import Sequence
 from datetime import datetime
@@ -24,11 +25,12 @@ from gsx.core.export import read_gaussians, splats_of, write_gaussians
 from gsx.core.files import write_json
 from gsx.core.guard import Guard
 from gsx.core.images import write_image
+from gsx.core.lpips import load_lpips
 from gsx.core.metrics import psnr
 from gsx.core.orbit import orbit_cameras, write_animation
-from gsx.core.pictures import write_pictures
+from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
-from gsx.core.progress import MetricsLog, Progress
+from gsx.core.progress import MetricsLog, Progress, read_curves
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.scene import Scene
@@ -68,16 +70,20 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
 
 
+def refuse_used(folder: str) -> None:
+    """Raise InputError if the run folder asked for exists and holds something."""
+    if folder and Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
+        raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
+
+
 def new_folder(settings: Settings, scene: Scene) -> Path:
     """A fresh run folder.
 
     Raises:
-        InputError: it cannot be created, or the one asked for is in use.
+        InputError: no free name was found.
     """
     if settings.general.folder:
         folder = Path(settings.general.folder)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
         folder.mkdir(parents=True, exist_ok=True)
         return folder
     parent = Path(settings.general.output) / scene.name / settings.backbone.component.name
@@ -171,6 +177,11 @@ def load_scene(settings: Settings) -> Scene:
     scene: Scene = settings.scene.component.factory(settings.scene.options)
     if not scene.test:
         raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
+    if not scene.extent > 0:
+        raise InputError(
+            f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, which gives no depth "
+            "and no scale: use photos from different places"
+        )
     return scene
 
 
@@ -183,10 +194,16 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     if settings.general.iterations < 1:
         raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
     choose_device(settings.general.device)
+    refuse_used(settings.general.folder)
+    load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     run = build(settings, load_scene(settings), Path())
     run.folder = new_folder(settings, run.scene)
-    write_config(run.folder / "config.yaml", settings.resolved)
-    write_json(run.folder / "environment.json", environment(run, plugins))
+    try:
+        write_config(run.folder / "config.yaml", settings.resolved)
+        write_json(run.folder / "environment.json", environment(run, plugins))
+    except OSError:
+        shutil.rmtree(run.folder, ignore_errors=True)
+        raise
     return run
 
 
@@ -202,6 +219,7 @@ def open_run(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> t
     settings = read_config(folder / "config.yaml", plugins, overrides)
     run = build(settings, load_scene(settings), folder)
     checkpoint.restore(run)
+    run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     return run, settings
 
 
@@ -236,8 +254,8 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
     """Evaluate, export, draw and report a trained run."""
     evaluation = evaluate(run, settings)
     plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
-    export(run, run.folder / "point_cloud.ply")
     write_report(run.folder)
+    export(run, run.folder / "point_cloud.ply")
     status(run, "ok")
     plugins.emit.gsx_run_finished(run=run)
     return evaluation
@@ -291,10 +309,9 @@ def export(run: Run, path: Path) -> None:
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
     """Write every test view at `zoom` times the training resolution as PNG."""
     folder.mkdir(parents=True, exist_ok=True)
-    for view in run.scene.test:
-        camera = view.camera.zoom(zoom)
-        picture = render_camera(run, camera, settings.evaluation.tile_pixels)
-        write_image(folder / f"{Path(view.name.replace('/', '_')).stem}.png", picture)
+    for view, name in zip(run.scene.test, file_names([view.name for view in run.scene.test]), strict=True):
+        picture = render_camera(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels)
+        write_image(folder / f"{name}.png", picture)
 
 
 def render_camera(run: Run, camera: Camera, pixels: int) -> Float[Tensor, "3 H W"]:

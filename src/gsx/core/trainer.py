@@ -1,5 +1,6 @@
 """The training loop. Density control, learning rates and the like live in backbones; everything else listens."""
 
+import logging
 import time
 
 import torch
@@ -10,6 +11,8 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import rasterize
 from gsx.core.run import Run, Step
 from gsx.core.shapes import Float
+
+logger = logging.getLogger(__name__)
 
 
 def train(run: Run, plugins: Plugins) -> None:
@@ -26,7 +29,7 @@ def train(run: Run, plugins: Plugins) -> None:
 def take_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (spec 7): render, backward, statistics, density, Adam."""
     step = backward(run)
-    reason = plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    reason = healed(run, step) or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
     if reason:
         run.backbone.discard()
     else:
@@ -36,6 +39,14 @@ def take_step(run: Run, plugins: Plugins) -> Step:
     run.step = step.number
     synchronise(run.device)
     return step if not reason else Step(**(vars(step) | {"skipped": reason}))
+
+
+def healed(run: Run, step: Step) -> str:
+    """Removes primitives that the render had to leave out; a reason to skip the step if there were any."""
+    removed = run.backbone.heal() if step.rendering.dropped else 0
+    if removed:
+        logger.warning("step %d: removed %d primitives with values that are not finite", step.number, removed)
+    return f"removed {removed} primitives" if removed else ""
 
 
 def backward(run: Run) -> Step:

@@ -39,6 +39,8 @@ class RasterSettings:
             raise ValueError(
                 f"rasterizer.tile_size is {self.tile_size}; with cull=published it must divide {WINDOW_TILE}"
             )
+        if not self.dilation > 0:
+            raise ValueError(f"rasterizer.dilation is {self.dilation}; give a positive number of px^2")
         if self.chunk < 1 or self.batch_values < 1:
             raise ValueError("rasterizer.chunk and rasterizer.batch_values must be at least 1")
         if not 0 < self.alpha_min < self.alpha_max < 1:

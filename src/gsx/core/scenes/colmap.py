@@ -13,7 +13,16 @@ from gsx.core.errors import InputError
 from gsx.core.scene import Scene, View, extent_of
 from gsx.core.scenes.colmap_model import Model, ModelImage, find_model, read_model
 from gsx.core.scenes.options import SceneOptions
-from gsx.core.scenes.posed import MIN_IMAGES, Shot, lens_notes, named, provenance, shot_through, views_of
+from gsx.core.scenes.posed import (
+    MIN_IMAGES,
+    Shot,
+    lens_notes,
+    named,
+    provenance,
+    refuse_too_few,
+    shot_through,
+    views_of,
+)
 from gsx.core.scenes.undistort import (
     METHOD,
     pinhole_of,
@@ -58,6 +67,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
     train, test = split_names([view.name for view in views], options.split, path)
+    refuse_too_few([views[index] for index in train], path)
     return Scene(
         name=path.resolve().name,
         train=[views[index] for index in train],

@@ -28,4 +28,4 @@ class SceneOptions:
     cache_gb: float = 2.0
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     split: str = "every:8"
-    """every:K | none | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.core.splits)."""
+    """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.core.splits)."""

@@ -47,8 +47,6 @@ def load(options: PhotosOptions) -> Scene:
     sizes, notes = readable_sizes(folder, photos)
     model = read_model(reconstruct(folder, sizes, options))
     notes += report(model, list(sizes))
-    for note in notes:
-        logger.info(note)
     scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
     name = folder.resolve().parent.name if folder.name == "images" else folder.resolve().name
     return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
@@ -156,7 +154,11 @@ def report(model: Model, photos: Sequence[str]) -> list[str]:
         f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, mean reprojection "
         f"error {model.mean_error:.2f} px."
     )
-    return [placed, f"Photos that could not be placed are not used ({len(lost)}): {named(lost)}."] if lost else [placed]
+    return (
+        [placed, f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."]
+        if lost
+        else [placed]
+    )
 
 
 def _refuse_nothing(best: Any, folder: Path, sizes: sfm.Sizes) -> None:

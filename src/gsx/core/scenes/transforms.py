@@ -165,6 +165,8 @@ def _focal(entry: Mapping[str, Any], width: int, height: int, place: str) -> tup
 
 def _focal_of_angle(entry: Mapping[str, Any], key: str, side: int, place: str) -> float:
     angle = _number(entry, key, math.nan, place)
+    if angle <= 0 or angle >= math.pi:
+        raise InputError(f"{place} has {key} {angle:g}, no angle between 0 and pi: give fl_x and fl_y instead.")
     return side / (2 * math.tan(angle / 2))
 
 

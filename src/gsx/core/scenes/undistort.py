@@ -4,6 +4,7 @@ The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, 
 are at +0.5 on both rasters. Sampling is cubic where COLMAP's own undistorter is bilinear: it keeps more detail.
 """
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from gsx.core.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.images import read_image, to_uint8, write_image
 from gsx.core.shapes import Float, UInt8
+
+logger = logging.getLogger(__name__)
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
@@ -141,7 +144,10 @@ class StoredUndistortion:
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
         stored = self.stored()
         if stored.is_file():
-            return read_image(stored)
+            try:
+                return read_image(stored)
+            except InputError as problem:
+                logger.warning("%s It is made anew.", problem)
         result = undistort(image, self.lens, self.pinhole, self.size)
         make_folder(stored.parent)
         write_image(stored, result)

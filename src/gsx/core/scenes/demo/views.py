@@ -163,8 +163,13 @@ def check(options: DemoOptions) -> None:
     Raises:
         ConfigError: a count is too small, there are more test than training views, or the background is no colour.
     """
+    if options.path:
+        raise ConfigError(
+            f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "
+            f"scene=colmap, photos, blender, transforms or bungee (gsx scenes {options.path} tells)."
+        )
     least = {
-        "width": 1, "height": 1, "train_views": 2, "test_views": 0, "points": 1, "samples": 1, "downscale": 1
+        "width": 1, "height": 1, "train_views": 2, "test_views": 1, "points": 1, "samples": 1, "downscale": 1
     }  # fmt: skip
     for name, bound in least.items():
         if getattr(options, name) < bound:
