@@ -143,12 +143,17 @@ def test_name_tells_weights_apart(weights: dict, tmp_path: Path) -> None:
     assert one != other
 
 
-@pytest.mark.parametrize(("trunk", "head"), [("", ""), ("trunk.pth", ""), ("", "head.pth")])
-def test_without_weights_there_is_no_figure(trunk: str, head: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_weights_there_is_no_figure(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "gsx.core.lpips"):
-        assert load_lpips(options(trunk, head)) is None
+        assert load_lpips(options("", "")) is None
     assert "n/a" in caplog.text
     assert "metrics.lpips.trunk" in caplog.text
+
+
+@pytest.mark.parametrize(("trunk", "head", "missing"), [("trunk.pth", "", "head"), ("", "head.pth", "trunk")])
+def test_one_file_without_the_other_is_refused(trunk: str, head: str, missing: str) -> None:
+    with pytest.raises(InputError, match=rf"metrics\.lpips\.{missing} is missing"):
+        load_lpips(options(trunk, head))
 
 
 def test_missing_file_is_named_with_its_option(weights: dict, tmp_path: Path) -> None:

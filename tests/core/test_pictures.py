@@ -67,6 +67,9 @@ class FourSplats:
     def gradients(self) -> Iterator[tuple[str, Tensor]]:
         return iter(())
 
+    def heal(self) -> int:
+        return 0
+
     def discard(self) -> None: ...
 
     def explicit(self) -> Gaussians:
