@@ -3,6 +3,7 @@
 import os
 
 import pytest
+from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
 
@@ -12,6 +13,10 @@ except ImportError:  # tests of an installed wheel may run without the developme
     pass
 else:
     install_import_hook(["gsx.core", "gsx.backbones"], "shape_checks.check")
+
+
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")  # the same cases on every run
 
 
 @pytest.fixture(autouse=True)

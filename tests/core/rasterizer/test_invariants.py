@@ -118,8 +118,10 @@ def test_order_of_rows_and_sign_and_length_of_quaternions_do_not_matter(seed: in
     rows = torch.randperm(60, generator=g)
     other = {name: value[rows] for name, value in vars(splats).items()}
     other["quats"] = other["quats"] * (torch.rand(60, 1, generator=g) - 0.5)
-    a = rasterize(splats, camera(), RasterSettings()).image
-    assert torch.allclose(a, rasterize(Splats(**other), camera(), RasterSettings()).image, atol=2e-5)
+    # rounding may move an alpha over the cut-off or a radius to the next pixel: rules without those steps
+    rules = RasterSettings(cull="tight", alpha_min=1e-6)
+    a, b = rasterize(splats, camera(), rules).image, rasterize(Splats(**other), camera(), rules).image
+    assert torch.allclose(a, b, atol=2e-5)
 
 
 def test_any_number_of_channels_and_coverage_in_unit_range() -> None:
