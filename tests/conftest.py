@@ -1,18 +1,33 @@
 """Shape annotations are checked on every call in the tests (jaxtyping and beartype); single-threaded torch."""
 
 import os
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
 
+COMPILED = "gsx.core.rasterizer.kernels"
+"""torch.compile must see these functions themselves, not the checks around them."""
+
+
+def checked_modules() -> list[str]:
+    """Every module of the core and the backbones but the compiled one; the hook takes a package with all below it."""
+    spec = find_spec("gsx")
+    root = Path(next(iter(spec.submodule_search_locations)))
+    files = [file for part in ("core", "backbones") for file in (root / part).rglob("*.py") if file.stem != "__init__"]
+    names = {".".join(file.relative_to(root.parent).with_suffix("").parts) for file in files}
+    return sorted(names - {COMPILED})
+
+
 try:
     from jaxtyping import install_import_hook
 except ImportError:  # tests of an installed wheel may run without the development extras
     pass
 else:
-    install_import_hook(["gsx.core", "gsx.backbones"], "shape_checks.check")
+    install_import_hook(checked_modules(), "shape_checks.check")
 
 
 settings.register_profile("repeatable", derandomize=True)

@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, verbs, errors with exit code 2, Ctrl-C."""
 
+import json
 import logging
 import os
 import re
@@ -34,7 +35,7 @@ def test_help_is_short_says_what_to_type_and_does_not_import_torch() -> None:
     assert result.returncode == 0
     assert len(result.stdout.splitlines()) <= 30
     assert "start here" in result.stdout
-    for verb in ("resume", "eval", "render", "export", "report", "scenes", "plugins"):
+    for verb in ("resume", "eval", "render", "export", "report", "trade", "scenes", "plugins"):
         assert f"gsx {verb}" in result.stdout
 
 
@@ -68,6 +69,40 @@ def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pyt
     assert "identical" in capsys.readouterr().err
     assert main(["report", str(run_folder)]) == 0
     assert main(["report", str(run_folder.parent)]) == 0
+
+
+def test_trade_of_a_run_a_file_and_the_built_in_scene(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = ["--knobs", "cull,tile_size", "--repeats", "1"]
+    assert main(["trade", "rasterizer", str(run_folder), *quick, "--views", "3", "rasterizer.chunk=8"]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1] == str(run_folder / "trade" / "trade.html")
+    assert "cull=tight" in out
+    assert "every pixel within 0.001: " in out
+    content = json.loads((run_folder / "trade" / "trade.json").read_text())
+    assert content["base"]["chunk"] == 8
+    assert len(content["views"]) == 3
+
+    file = tmp_path / "x.ply"
+    assert main(["export", str(run_folder), str(file)]) == 0
+    other = ["rasterizer.tile_size=16", "--knobs=cull", "--repeats=1", "--views=1", "--max-error=1"]
+    assert main(["trade", "rasterizer", str(file), *other, "--to", str(tmp_path / "a" / "b")]) == 0
+    assert (tmp_path / "a" / "b" / "trade.html").is_file()
+    assert "every pixel within 1: " in capsys.readouterr().out
+
+    small = ["scene.width=48", "scene.height=36", "scene.points=200", "device=cpu", "--to", str(tmp_path / "c")]
+    assert main(["trade", "rasterizer", *small, *quick]) == 0
+    assert "points of scene demo" in capsys.readouterr().err
+    assert len(json.loads((tmp_path / "c" / "trade.json").read_text())["views"]) == 1
+
+
+def test_trade_help_lists_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    for asked in (["trade", "--help"], ["trade", "rasterizer", "-h"]):
+        with pytest.raises(SystemExit) as end:
+            main(asked)
+        assert end.value.code == 0
+        assert "--max-error" in capsys.readouterr().out
 
 
 def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,6 +201,11 @@ def folder_of_text(folder: Path) -> Path:
     return folder
 
 
+def broken_ply(path: Path) -> Path:
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    return path
+
+
 BAD = {
     "missing folder": lambda t: ["scene=colmap", f"scene.path={t / 'nowhere'}"],
     "no path": lambda t: ["scene=colmap"],
@@ -194,6 +234,22 @@ BAD = {
     "sizes disagree": lambda t: ["scene=colmap", f"scene.path={resized_photo(synthetic(t / 's'))}"],
     "unknown camera model": lambda t: ["scene=colmap", f"scene.path={strange_camera(synthetic(t / 's'))}"],
     "render at zoom 0": lambda t: ["render", str(t / "run"), "--zoom", "0"],
+    "trade nothing": lambda t: ["trade"],
+    "trade something else": lambda t: ["trade", "resterizer"],
+    "trade nowhere": lambda t: ["trade", "rasterizer", str(t / "nowhere")],
+    "trade two": lambda t: ["trade", "rasterizer", str(t / "a"), str(t / "b")],
+    "trade no run": lambda t: ["trade", "rasterizer", str(empty_folder(t / "r"))],
+    "trade a text": lambda t: ["trade", "rasterizer", str(next(folder_of_text(t / "p").iterdir()))],
+    "trade a broken file": lambda t: ["trade", "rasterizer", str(broken_ply(t / "x.ply"))],
+    "trade without budget": lambda t: ["trade", "rasterizer", "--max-error", "-1"],
+    "trade no number": lambda t: ["trade", "rasterizer", "--max-error", "small"],
+    "trade no rounds": lambda t: ["trade", "rasterizer", "--repeats", "0"],
+    "trade fewer than none": lambda t: ["trade", "rasterizer", "--combinations", "-1"],
+    "trade half a view": lambda t: ["trade", "rasterizer", "--views", "0.5"],
+    "trade no such knob": lambda t: ["trade", "rasterizer", "--knobs", "tilesize"],
+    "trade no such option": lambda t: ["trade", "rasterizer", "--max-eror", "1"],
+    "trade option cut off": lambda t: ["trade", "rasterizer", "--to"],
+    "trade typo in key": lambda t: ["trade", "rasterizer", "rasterizer.tilesize=16"],
     "bad device": lambda t: words(t / "run", "device=tpu"),
 }
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from gsx import __version__
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
@@ -33,6 +33,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif (.webp, .mp4: gsx[video])
   gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
   gsx report DIR            report.html of a run, or of all runs below a folder
+  gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
   gsx plugins               what is installed, from where, and what failed to load
 
@@ -88,7 +89,7 @@ def os_sentence(error: OSError) -> str:
 
 def dispatch(words: list[str]) -> int:
     """Find the verb and run it."""
-    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] != "render"):
+    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in ("render", "trade")):
         sys.stdout.write(HELP)
         return 0
     if words == ["--version"]:
@@ -329,6 +330,123 @@ def verb_scenes(words: list[str]) -> int:
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
+class Parser(argparse.ArgumentParser):
+    """Mistakes become errors of ours: one sentence, without the usage text."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ConfigError."""
+        raise ConfigError(f"{self.prog}: {message}. See {self.prog} --help")
+
+
+def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
+    """What reads a finite number above 0 from a word."""
+
+    def read(word: str) -> int | float:
+        try:
+            number = kind(word)
+        except ValueError:
+            number = kind(0)
+        if not 0 < number < float("inf"):
+            what, example = ("whole number of 1 or more", "3") if kind is int else ("number above 0", "1e-3")
+            raise argparse.ArgumentTypeError(f"'{word}' is no {what}: give one, for example {example}")
+        return number
+
+    return read
+
+
+def whole(word: str) -> int:
+    """A whole number of 0 or more."""
+    if not word.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{word}' is no whole number of 0 or more: give one, for example 4")
+    return int(word)
+
+
+def trade_arguments(words: list[str]) -> argparse.Namespace:
+    """The options of gsx trade; `target` is a path or None, `overrides` what has an equals sign.
+
+    Raises:
+        ConfigError: a word means nothing here.
+    """
+    parser = Parser(
+        prog="gsx trade rasterizer",
+        usage="%(prog)s [RUN or FILE.ply] [KEY=VALUE ...] [options]",
+        description="Try the rasterizer's settings on a model: time each, compare with a float64 truth, recommend "
+        "some. Without a model the built-in scene stands in; KEY=VALUE changes the settings to start from.",
+    )
+    parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
+    add = parser.add_argument
+    add("--max-error", type=positive(float), default=1e-3, metavar="E", help="error budget in display units (1e-3)")
+    add("--to", type=Path, metavar="FOLDER", help="folder for trade.html and trade.json (RUN/trade, else ./trade)")
+    add("--repeats", type=positive(int), default=3, metavar="N", help="rounds of timing (3)")
+    add("--views", type=positive(int), metavar="N", help="pictures to measure on (2, built-in scene: 1)")
+    add("--combinations", type=whole, metavar="N", help="most combinations of knobs to try (4, built-in scene: 1)")
+    add("--knobs", metavar="A,B,...", help="turn only these settings, for example tile_size,cull (all)")
+    given, unknown = parser.parse_known_intermixed_args(words)
+    if unknown:
+        options = ("--max-error", "--to", "--repeats", "--views", "--combinations", "--knobs")
+        hint = nearest(unknown[0], options)
+        raise ConfigError(f"'{unknown[0]}' is no option of {parser.prog}.{hint} See {parser.prog} --help")
+    targets = [word for word in given.words if "=" not in word or Path(word).exists()]
+    given.overrides = [word for word in given.words if word not in targets]
+    if len(targets) > 1:
+        raise InputError(f"gsx trade rasterizer takes one run or one splat file, got {' and '.join(targets)}")
+    given.target = Path(targets[0]) if targets else None
+    return given
+
+
+def new_folder(folder: Path) -> Path:
+    """The folder, made where it is missing.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made ({error.strerror}): choose another with --to FOLDER") from error
+    return folder
+
+
+def verb_trade(words: list[str]) -> int:
+    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
+    if words[:1] in (["--help"], ["-h"]):
+        words = ["rasterizer", "--help"]
+    if not words:
+        raise InputError("gsx trade needs to know what to trade: gsx trade rasterizer [RUN or FILE.ply]")
+    if words[0] != "rasterizer":
+        remedy = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...]"
+        raise ConfigError(f"'{words[0]}' is nothing gsx can trade.{nearest(words[0], ['rasterizer'])} Type {remedy}")
+    given = trade_arguments(words[1:])
+    from gsx.core.trade import advice_lines, check_knobs, table
+    from gsx.core.trade_measure import sweep, usable_paths
+    from gsx.core.trade_page import write_trade
+    from gsx.core.trade_subject import open_subject
+
+    knobs, loaded = check_knobs(given.knobs), plugins()
+    views, combinations = (2, 4) if given.target else (1, 1)
+    subject = open_subject(given.target, given.overrides, given.views or views, loaded)
+    folder = new_folder(given.to or (given.target if given.target and given.target.is_dir() else Path()) / "trade")
+    for note in (subject.name, *subject.notes):
+        logger.info("%s", note)
+    presets, notes = usable_paths(loaded, subject.device)
+    for note in notes:
+        logger.warning("%s", note)
+    trade = sweep(
+        subject,
+        presets,
+        knobs=knobs,
+        repeats=given.repeats,
+        max_error=given.max_error,
+        most_combinations=combinations if given.combinations is None else given.combinations,
+        notes=notes,
+    )
+    for note in trade.notes[len(notes) :]:
+        logger.warning("%s", note)
+    lines = ["", *table(trade.rows), "", *advice_lines(trade.rows, given.max_error)]
+    sys.stdout.write("\n".join(lines) + f"\n{write_trade(trade, folder, given.max_error)}\n")
+    return 0
+
+
 def verb_plugins(words: list[str]) -> int:
     """gsx plugins"""
     from gsx.core.plugins import KINDS
@@ -350,6 +468,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "render": verb_render,
     "export": verb_export,
     "report": verb_report,
+    "trade": verb_trade,
     "scenes": verb_scenes,
     "plugins": verb_plugins,
 }

@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsx.cli import plugins
-from gsx.core.config import compose, typed
+from gsx.core.config import compose, read_config, typed, write_config
 from gsx.core.errors import ConfigError
 from gsx.core.scenes.options import SceneOptions
 
@@ -77,3 +77,13 @@ def test_a_number_for_a_text_is_not_silently_taken() -> None:
 
 def test_a_folder_named_by_a_number_is_a_folder() -> None:
     assert compose(["scene=colmap", "scene.path=2024"], plugins()).scene.options.path.endswith("/2024")
+
+
+def test_runs_of_an_older_gsx_open_and_know_newer_rasterizer_settings(tmp_path: Path) -> None:
+    config = compose(["rasterizer.tile_size=16"], plugins()).resolved
+    del config["rasterizer"]["tile_cap"], config["rasterizer"]["path"]
+    write_config(tmp_path / "config.yaml", config)
+    settings = read_config(tmp_path / "config.yaml", plugins(), ["rasterizer.tile_cap=64"])
+    assert (settings.raster.tile_size, settings.raster.tile_cap, settings.raster.path) == (16, 64, "eager")
+    with pytest.raises(ConfigError, match=r"Did you mean 'rasterizer.tile_cap'"):
+        read_config(tmp_path / "config.yaml", plugins(), ["rasterizer.tile_cp=64"])

@@ -17,6 +17,8 @@ MOST_POINTS = 400
 """Longer curves are averaged in groups down to this many points."""
 PADDING = 0.04
 """Room around the data, as a fraction of their range."""
+DIGITS_DECADES, MOST_DECADES = 4, 8
+"""A logarithmic axis over more decades is marked with powers of ten only; over yet more, with every other one."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,9 @@ class Axis:
         if not self.log:
             return linear_ticks(self.low, self.high)
         decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
-        ticks = [digit * 10.0**decade for decade in decades for digit in (1, 2, 5)]
+        step = -(-len(decades) // MOST_DECADES)
+        digits = (1, 2, 5) if len(decades) <= DIGITS_DECADES else (1,)
+        ticks = [digit * 10.0**decade for decade in decades if decade % step == 0 for digit in digits]
         inside = [tick for tick in ticks if self.low <= tick <= self.high]
         return inside if len(inside) >= 2 else linear_ticks(self.low, self.high)
 
@@ -244,13 +248,16 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
     return sorted((i for i in range(len(costs)) if not beaten(i)), key=lambda i: (costs[i], gains[i]))
 
 
-def scatter(dots: Sequence[Dot], *, x_label: str) -> Markup:
-    """Points with the Pareto front (lower x, higher y) joined and named; empty without points."""
+def scatter(dots: Sequence[Dot], *, x_label: str, falling: bool = False) -> Markup:
+    """Points with the Pareto front (lower x, higher y) joined and named; empty without points.
+
+    `falling`: lower y is better, on a logarithmic axis (errors; all must be positive).
+    """
     if not dots:
         return Markup()
     log = min(dot.x for dot in dots) > 0 and max(dot.x for dot in dots) > 8 * min(dot.x for dot in dots)
-    plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of(dot.y for dot in dots))
-    front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
+    plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of((dot.y for dot in dots), log=falling))
+    front = pareto_front([dot.x for dot in dots], [-dot.y if falling else dot.y for dot in dots])
     line = plot.points([dots[i].x for i in front], [dots[i].y for i in front])
     body = plot.frame(x_label) + f'<polyline class="front" points="{line}"/>'
     return svg(body + "".join(scatter_dot(plot, dot, i in front) for i, dot in enumerate(dots)))

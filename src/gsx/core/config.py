@@ -269,6 +269,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         config = OmegaConf.load(path)
     except Exception as error:
         raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
+    add_newer_settings(config)
     known = list(dotted(OmegaConf.to_container(config)))
     for override in overrides:
         key, equals, value = override.partition("=")
@@ -279,6 +280,12 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)  # type: ignore[arg-type]
+
+
+def add_newer_settings(config: Any) -> None:
+    """Give the configuration of an older gsx the rasterizer settings it does not know, at their defaults."""
+    if isinstance(config, DictConfig) and isinstance(config.get("rasterizer"), DictConfig):
+        config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
 
 
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:

@@ -16,6 +16,10 @@ class InputError(GsxError):
     """A file or folder given to gsx cannot be used."""
 
 
+class TooManyPairs(InputError):
+    """A picture needs more splat-tile pairs than `rasterizer.max_pairs`; smaller pieces of it may not."""
+
+
 class CheckpointError(GsxError):
     """A checkpoint is missing, truncated, altered or of another schema."""
 

@@ -6,7 +6,6 @@ that loses to it adds artefacts, not detail.
 
 import hashlib
 import json
-import math
 import resource
 import statistics
 import sys
@@ -21,7 +20,7 @@ from torch import Tensor
 from gsx.core.camera import Camera
 from gsx.core.lpips import LpipsOptions, load_lpips
 from gsx.core.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
-from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
+from gsx.core.rasterizer import RasterSettings, rasterize_pieces
 from gsx.core.run import Run
 from gsx.core.scene import View
 from gsx.core.shapes import Float
@@ -59,28 +58,12 @@ class Tiled:
     """Splats with a radius on the whole raster."""
 
 
-def pieces(width: int, height: int, pixels: int) -> list[tuple[int, int, int, int]]:
-    """(left, top, width, height) of pieces of at most about `pixels` px, whole tiles of 16 px."""
-    edge = max(16, int(math.sqrt(pixels)) // 16 * 16)
-    return [
-        (x, y, min(edge, width - x), min(edge, height - y))
-        for y in range(0, height, edge)
-        for x in range(0, width, edge)
-    ]
-
-
-@torch.no_grad()
 def render_tiled(
     splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"], pixels: int
 ) -> Tiled:
     """Render in pieces of at most `pixels`, so that memory does not grow with the picture; clamped to [0, 1]."""
-    picture = torch.empty(3, camera.height, camera.width)
-    seen = torch.zeros(len(splats), dtype=torch.bool)
-    for left, top, width, height in pieces(camera.width, camera.height, pixels):
-        part: Rendering = rasterize(splats, camera.crop(left, top, width, height), raster, background=background)
-        picture[:, top : top + height, left : left + width] = part.image.clamp(0, 1).cpu()
-        seen[part.screen.ids[part.screen.visible].cpu()] = True
-    return Tiled(picture, int(seen.sum()))
+    mosaic = rasterize_pieces(splats, camera, raster, background=background, pixels=pixels)
+    return Tiled(mosaic.image.clamp_(0, 1), int(mosaic.visible.sum()))
 
 
 @torch.no_grad()

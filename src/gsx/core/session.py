@@ -31,6 +31,7 @@ from gsx.core.orbit import orbit_cameras, write_animation
 from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.progress import MetricsLog, Progress, read_curves
+from gsx.core.rasterizer.prepare import prepare
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.scene import Scene
@@ -231,6 +232,7 @@ def status(run: Run, state: str, reason: str = "") -> None:
 def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint."""
     announce(run, plugins)
+    run.raster = prepare(run.raster, run.iterations, run.device)
     status(run, "running")
     listeners = (Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress())
     try:

@@ -1,6 +1,16 @@
 """The one rasterizer every backbone renders through: project, pair with tiles, sort, composite. Needs only torch."""
 
+from gsx.core.rasterizer.batch import rasterize_batch
+from gsx.core.rasterizer.pieces import Mosaic, rasterize_pieces
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 
-__all__ = ["RasterSettings", "Rendering", "ScreenStatistics", "rasterize"]
+__all__ = [
+    "Mosaic",
+    "RasterSettings",
+    "Rendering",
+    "ScreenStatistics",
+    "rasterize",
+    "rasterize_batch",
+    "rasterize_pieces",
+]

@@ -1,7 +1,6 @@
 """Front-to-back blending over tiles and its gradient, in O(pairs + pixels) memory.
 
-In tile-centred pixel coordinates log alpha = log o - s^2 - r^2 with s = u0 x + u1 y + k0 and r = u2 y + k1: never
-above log o, and as exact as evaluating offsets from the mean directly (docs/numerics.md).
+How ln alpha is written is chosen in exponent.py, in which number formats the work is done in precision.py.
 
 The list of a tile is cut into blocks of K splats, the last one padded. Tiles are taken in batches of similar list
 length; a batch blends one block of each of its tiles at a time, front to back; tiles whose list has ended or whose
@@ -17,8 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsx.core.rasterizer.exponent import EXPONENTS, Exponent
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import Pairs
+from gsx.core.rasterizer.precision import Precision, power_of_two_above
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
 
@@ -58,16 +59,18 @@ def make_blocks(pairs: Pairs, chunk: int, splats: int) -> Blocks:
 class Tables:
     """What blending reads, block by block."""
 
-    rows: Float[Tensor, "S K 7"]
-    """(u0, u1, k0, 0, u2, k1, log o) of every list entry."""
+    rows: Float[Tensor, "S K V"]
+    """What the exponent reads of every list entry, in the exact dtype."""
     offsets: Float[Tensor, "S K 2"]
     """Mean relative to the tile's centre, px."""
     channels: Float[Tensor, "S K C"]
-    basis: Float[Tensor, "3 P"]
-    """x, y, 1 at the pixels of a tile."""
+    basis: Float[Tensor, "Q P"]
+    """What the exponent reads of the pixels of a tile, in the dtype of evaluation."""
     inside: Float[Tensor, "T P"]
     """1 at pixels of the raster, 0 at those of border tiles beyond it."""
     settings: RasterSettings
+    precision: Precision
+    exponent: Exponent
 
 
 def make_tables(
@@ -83,19 +86,20 @@ def make_tables(
     features = torch.cat([means, factors, log_opacities[:, None], channels, torch.ones_like(means[:, :1])], 1)
     nothing = means.new_zeros(1, features.shape[1])
     nothing[0, 5] = NOTHING
-    table = torch.cat([features, nothing]).index_select(0, blocks.splats.view(-1))
+    precision, exponent = Precision.of(settings, means.dtype), EXPONENTS[settings.exponent]
+    table = torch.cat([features, nothing]).to(precision.exact).index_select(0, blocks.splats.view(-1))
     table = table.view(*blocks.splats.shape, features.shape[1])
-    offsets = table[..., :2] - grid.centres(blocks.tiles, means)[:, None]
-    u0, u1, u2, log_opacity = table[..., 2:6].unbind(-1)
-    x, y = offsets.unbind(-1)
-    rows = torch.stack([u0, u1, -(u0 * x + u1 * y), torch.zeros_like(u0), u2, -u2 * y, log_opacity], -1)
+    offsets = table[..., :2] - grid.centres(blocks.tiles, table)[:, None]
+    one = means.new_ones(1, grid.height, grid.width, dtype=precision.accumulation)
     return Tables(
-        rows=rows,
+        rows=exponent.rows(offsets, table[..., 2:5], table[..., 5]),
         offsets=offsets,
-        channels=table[..., 6:].contiguous(),
-        basis=grid.basis(means),
-        inside=grid.to_tiles(means.new_ones(1, grid.height, grid.width))[:, 0],
+        channels=table[..., 6:].to(precision.accumulation).contiguous(),
+        basis=exponent.basis(grid.basis(means.new_empty(0, dtype=precision.evaluation))),
+        inside=grid.to_tiles(one)[:, 0],
         settings=settings,
+        precision=precision,
+        exponent=exponent,
     )
 
 
@@ -110,18 +114,6 @@ class Front:
 
 
 # -- mathematics of a [B, K, P] batch ------------------------------------------------------------------------------
-
-
-def exponents(rows: Float[Tensor, "B K 7"], basis: Float[Tensor, "3 P"]) -> tuple[Tensor, Tensor]:
-    """s and r of every splat at every pixel, each [B, K, P]."""
-    flat = rows.view(-1, 7)
-    shape = (*rows.shape[:2], basis.shape[1])
-    return (flat[:, :3] @ basis).view(shape), (flat[:, 4:6] @ basis[1:]).view(shape)
-
-
-def gaussians(rows: Float[Tensor, "B K 7"], s: Float[Tensor, "B K P"], r: Float[Tensor, "B K P"]) -> Tensor:
-    """o exp(-s^2 - r^2), before clamp and cut-off, [B, K, P]."""
-    return torch.addcmul(rows[:, :, 6:], s, s, value=-1).addcmul_(r, r, value=-1).exp_()
 
 
 def just_below(value: float, dtype: torch.dtype) -> float:
@@ -154,8 +146,8 @@ def stop_(alpha: Float[Tensor, "B K P"], transmittance: Float[Tensor, "B K_plus_
 
 def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[Tensor, "B P"], Tensor]:
     """Light that the blocks add, the transmittance behind them, and the blending weights [B, K, P]."""
-    rows = tables.rows.index_select(0, front.blocks)
-    alpha = alphas_(gaussians(rows, *exponents(rows, tables.basis)), tables.settings)
+    log_alpha, _ = tables.exponent.log_alphas(tables.rows.index_select(0, front.blocks), tables.basis)
+    alpha = alphas_(log_alpha.exp_(), tables.settings).to(tables.precision.accumulation)
     transmittance = transmittances(alpha, front.transmittance)
     stop_(alpha, transmittance, tables.settings.transmittance_stop)
     weight = alpha.mul_(transmittance[:, :-1])
@@ -185,7 +177,7 @@ class FrontGradient:
     """Gradients of B blocks, and the light of the blocks and all behind them."""
 
     rows: Float[Tensor, "B K 6"]
-    """Of (u0, u1, k0, u2, k1, log o)."""
+    """As `Exponent.gradient` has it."""
     channels: Float[Tensor, "B K C"]
     absolute: Float[Tensor, "B K 2"] | None
     """Sum over pixels of the absolute gradient of the mean, per axis."""
@@ -197,9 +189,9 @@ def front_gradient(
 ) -> FrontGradient:
     """Gradient of a front; `rest` is the light behind it, weighted by the gradient of the picture."""
     rows = tables.rows.index_select(0, front.blocks)
-    s, r = exponents(rows, tables.basis)
-    gaussian = gaussians(rows, s, r)
-    alpha = alphas_(gaussian.clone(), tables.settings)
+    log_alpha, kept = tables.exponent.log_alphas(rows, tables.basis)
+    gaussian, exact = log_alpha.exp_(), tables.precision.exact
+    alpha = alphas_(gaussian.clone(), tables.settings).to(tables.precision.accumulation)
     transmittance = transmittances(alpha, front.transmittance)
     stop_(alpha, transmittance, tables.settings.transmittance_stop)
     weight = alpha * transmittance[:, :-1]
@@ -208,33 +200,13 @@ def front_gradient(
     # d loss / d log alpha = w c.g - (light behind) alpha / (1 - alpha)
     slope = light.addcdiv_(behind[:, 1:].mul_(alpha), 1 - alpha, value=-1)
     unclamp_(slope, gaussian, tables.settings)
+    slope = slope.to(exact)  # sums over pixels are exact
     return FrontGradient(
-        rows=row_gradient(slope, s, r, tables.basis),
-        channels=torch.bmm(weight, gradient.mT),
-        absolute=absolute_gradient(slope, s, r, rows) if absolute else None,
+        rows=tables.exponent.gradient(slope, kept, rows, tables.basis),
+        channels=torch.bmm(weight.to(exact), gradient.mT.to(exact)),
+        absolute=tables.exponent.absolute(slope, kept, rows, tables.basis) if absolute else None,
         rest=behind[:, 0],
     )
-
-
-def row_gradient(
-    slope: Float[Tensor, "B K P"], s: Float[Tensor, "B K P"], r: Float[Tensor, "B K P"], basis: Float[Tensor, "3 P"]
-) -> Float[Tensor, "B K 6"]:
-    """Gradient of (u0, u1, k0, u2, k1, log o) from that of log alpha: d/ds = -2 s slope, d/dr = -2 r slope."""
-    flat, columns = (-1, slope.shape[2]), -2 * basis.T
-    by_s = (slope * s).view(flat) @ columns
-    by_r = (slope * r).view(flat) @ columns[:, 1:]
-    parts = torch.cat([by_s, by_r, slope.view(flat).sum(1, keepdim=True)], 1)
-    return parts.view(*slope.shape[:2], 6)
-
-
-def absolute_gradient(
-    slope: Float[Tensor, "B K P"], s: Float[Tensor, "B K P"], r: Float[Tensor, "B K P"], rows: Float[Tensor, "B K 7"]
-) -> Float[Tensor, "B K 2"]:
-    """Sum over pixels of |d loss / d mean| in px, per axis: s and r fall by (u0, u1) and (0, u2) per pixel of mean."""
-    u0, u1, u2 = rows[:, :, 0, None], rows[:, :, 1, None], rows[:, :, 4, None]
-    by_x = 2 * (slope * s * u0).abs_().sum(2)
-    by_y = 2 * (slope * (s * u1 + r * u2)).abs_().sum(2)
-    return torch.stack([by_x, by_y], 2)
 
 
 # -- the walk over all tiles ---------------------------------------------------------------------------------------
@@ -269,13 +241,13 @@ def blend_all(
 
     `heaviest`, where given, receives each list entry's largest blending weight.
     """
-    pictures = tables.basis.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
+    pictures = tables.channels.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
     fronts: list[Front] = []
     for batch in batches(blocks, tables.settings):
         for front, light, weight in walk(tables, blocks, batch):
             pictures.index_add_(0, front.tiles, light)
             if heaviest is not None:
-                heaviest[front.blocks] = weight.amax(2)
+                heaviest[front.blocks] = weight.amax(2).to(heaviest)
             if keep:
                 fronts.append(front)
     return pictures, fronts
@@ -285,10 +257,10 @@ def all_gradients(
     tables: Tables, fronts: list[Front], gradient: Float[Tensor, "T C P"], absolute: bool
 ) -> tuple[Float[Tensor, "S K 6"], Float[Tensor, "S K C"], Float[Tensor, "S K 2"] | None]:
     """Gradients of every list entry: of its row, its channels and, if asked, the absolute one of its mean."""
-    shape = tables.rows.shape[:2]
+    shape, of_pair = tables.rows.shape[:2], tables.rows
     rest = gradient.new_zeros(gradient.shape[0], gradient.shape[2])
-    rows, channels = gradient.new_zeros(*shape, 6), torch.zeros_like(tables.channels)
-    means = gradient.new_zeros(*shape, 2) if absolute else None
+    rows, channels = of_pair.new_zeros(*shape, 6), of_pair.new_zeros(*shape, tables.channels.shape[2])
+    means = of_pair.new_zeros(*shape, 2) if absolute else None
     for front in reversed(fronts):
         seen, behind = gradient.index_select(0, front.tiles), rest.index_select(0, front.tiles)
         part = front_gradient(tables, front, seen, behind, absolute)
@@ -300,15 +272,6 @@ def all_gradients(
     return rows, channels, means
 
 
-def splat_gradient(rows: Float[Tensor, "S K 6"], tables: Tables) -> Float[Tensor, "S K 6"]:
-    """Gradient of (mean x, mean y, u0, u1, u2, log o) from that of (u0, u1, k0, u2, k1, log o)."""
-    by_u0, by_u1, by_k0, by_u2, by_k1, by_opacity = rows.unbind(-1)
-    x, y = tables.offsets.unbind(-1)
-    u0, u1, u2 = tables.rows[..., 0], tables.rows[..., 1], tables.rows[..., 4]
-    by_mean = [-u0 * by_k0, -u1 * by_k0 - u2 * by_k1]
-    return torch.stack([*by_mean, by_u0 - x * by_k0, by_u1 - y * by_k0, by_u2 - y * by_k1, by_opacity], -1)
-
-
 def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: int) -> Float[Tensor, "M V"]:
     """Sums over the list entries of each splat, always in the same order (as index_add_ is, but on a CPU only)."""
     if values.device.type == "cpu":
@@ -318,6 +281,21 @@ def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: 
     return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, initial=0)
 
 
+def in_units(
+    gradient: Float[Tensor, "T C P"], precision: Precision
+) -> tuple[Float[Tensor, "T C P"], Float[Tensor, ""] | None]:
+    """The picture's gradient in the dtype of accumulation, where that is narrow in units of its largest pixel sum."""
+    if not precision.narrow or not gradient.numel():
+        return gradient.to(precision.accumulation), None
+    unit = power_of_two_above(gradient.abs().sum(1).amax())
+    return (gradient / unit).to(precision.accumulation), unit
+
+
+def channel_units(channels: Float[Tensor, "M C"]) -> Float[Tensor, "C"]:
+    """Powers of two above each channel's largest magnitude."""
+    return power_of_two_above(torch.cat([channels, torch.zeros_like(channels[:1])]).detach().abs().amax(0))
+
+
 class Composite(torch.autograd.Function):
     """See `composite` for the arguments."""
 
@@ -325,17 +303,22 @@ class Composite(torch.autograd.Function):
     def forward(ctx, means, factors, log_opacities, channels, probe, blocks, grid, settings, heaviest):
         tables = make_tables(means, factors, log_opacities, channels, blocks, grid, settings)
         keep = any(ctx.needs_input_grad)
-        pictures, fronts = blend_all(tables, blocks, keep, heaviest)
+        with tables.precision.products():
+            pictures, fronts = blend_all(tables, blocks, keep, heaviest)
         if keep:
             ctx.kept = (tables, blocks, grid, fronts, len(means), probe is not None)
-        return grid.to_raster(pictures)
+        return grid.to_raster(pictures).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
         tables, blocks, grid, fronts, count, absolute = ctx.kept
-        rows, channels, means = all_gradients(tables, fronts, grid.to_tiles(gradient), absolute)
-        parts = [splat_gradient(rows, tables), channels[..., :-1], *([] if means is None else [means])]
+        tiles, unit = in_units(grid.to_tiles(gradient), tables.precision)
+        with tables.precision.products():
+            rows, channels, means = all_gradients(tables, fronts, tiles, absolute)
+        by_splat = tables.exponent.by_splat(rows, tables.rows, tables.offsets)
+        parts = [by_splat, channels[..., :-1], *([] if means is None else [means])]
         total = sum_by_splat(torch.cat(parts, -1).flatten(0, 1), blocks.splats.view(-1), count + 1)[:-1]
+        total = (total if unit is None else total * unit).to(gradient.dtype)
         width = 6 + channels.shape[2] - 1
         probe = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], probe, None, None, None, None)
@@ -358,4 +341,9 @@ def composite(
     `probe` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
     mean (px). `heaviest` receives the largest blending weight of each list entry.
     """
-    return Composite.apply(means, factors, log_opacities, channels, probe, blocks, grid, settings, heaviest)
+    if not Precision.of(settings, means.dtype).narrow:
+        return Composite.apply(means, factors, log_opacities, channels, probe, blocks, grid, settings, heaviest)
+    # 16 bits hold neither a depth of 1e5 nor a colour of 1e-6: blend what lies within 1
+    units = channel_units(channels)
+    blended = Composite.apply(means, factors, log_opacities, channels / units, probe, blocks, grid, settings, heaviest)
+    return blended * torch.cat([units, units.new_ones(1)])[:, None, None]

@@ -1,4 +1,9 @@
-"""Which splats reach which tiles, front to back. Nothing here is differentiated."""
+"""Which splats reach which tiles, front to back. Nothing here is differentiated.
+
+A splat is cut into its rows of tiles; on each row the ellipse alpha >= alpha_min spans an exact interval of columns, so
+no candidate is made that is not a pair. Screen splats come nearest first, hence so do the pairs, and one stable sort
+by tile keeps them so.
+"""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera, Frame
-from gsx.core.errors import InputError
+from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
@@ -15,7 +20,7 @@ from gsx.core.shapes import Float, Int
 
 FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""
-REACH_SLACK = 1e-4
+REACH_SLACK = 1e-3
 """Added to ln(alpha / alpha_min) when tiles are chosen, so that rounding never drops a pixel at the cut-off."""
 
 
@@ -29,6 +34,12 @@ class Pairs:
     """Tile, row-major over the grid."""
     starts: Int[Tensor, "T_plus_1"]
     """First pair of each tile, then P."""
+    slots: Int[Tensor, "P"]
+    """Place of each pair in the list sorted by splat, nearest splat first: a permutation."""
+    order: Int[Tensor, "V"]
+    """Rows of the screen splats that have a tile in their box, nearest first."""
+    counts: Int[Tensor, "V"]
+    """Pairs of each of them."""
     radii: Int[Tensor, "M"]
     """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
 
@@ -64,44 +75,55 @@ def tile_ranges(
     half = (2 * limits.clamp_min(0)[:, None] * screen.covariances[:, ::2]).sqrt()
     begin = torch.tensor(grid.first, device=half.device, dtype=torch.int32)
     end = begin + torch.tensor(grid.shape, device=half.device, dtype=torch.int32)
-    # a tile counts where one of its pixel centres, at +0.5, lies inside
-    first = ((screen.means - half - 0.5).ceil() / grid.tile).floor().nan_to_num().clamp(-FAR, FAR).int()
-    last = ((screen.means + half - 0.5).floor() / grid.tile).floor().nan_to_num().clamp(-FAR, FAR).int() + 1
+    first, last = touched(screen.means - half, grid.tile), touched(screen.means + half, grid.tile, past=True)
     first, last = first.maximum(begin), last.minimum(end)
     return first, torch.where((limits >= 0)[:, None], last, first).maximum(first)
 
 
-def least_exponent(
-    mean: Float[Tensor, "P 2"], factor: Float[Tensor, "P 3"], corner: Int[Tensor, "P 2"], tile: int
-) -> Float[Tensor, "P"]:
-    """Smallest s^2 + r^2 over the rectangle of a tile's pixel centres; exact for the convex quadratic."""
-    low = corner + 0.5 - mean
-    high = low + (tile - 1)
+def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
+    """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
+    pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
+    return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
+
+
+def row_spans(
+    mean: Float[Tensor, "R 2"],
+    factor: Float[Tensor, "R 3"],
+    limit: Float[Tensor, "R"],
+    row: Int[Tensor, "R"],
+    tile: int,
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """First and past-the-last column (counted on the frame) at which the ellipse s^2 + r^2 <= limit meets a tile row.
+
+    Exact: the part of an ellipse between two lines is convex, so its tiles on the row are those of its x-interval.
+    """
     u0, u1, u2 = factor.unbind(1)
-    nearest_x, nearest_y = (torch.minimum(torch.maximum(torch.zeros_like(low), low), high)).unbind(1)
-    # on the vertical edge nearest the mean the best y, and on the horizontal edge the best x
-    curvature_y = u1 * u1 + u2 * u2
-    best_y = (-u0 * u1 / curvature_y * nearest_x).maximum(low[:, 1]).minimum(high[:, 1])
-    best_x = (-u1 / u0 * nearest_y).maximum(low[:, 0]).minimum(high[:, 0])
+    top = row * tile + 0.5 - mean[:, 1]
+    height = limit.sqrt() / u2
+    low, high = top.maximum(-height), (top + (tile - 1)).minimum(height)
+    rightmost = -u1 * height * torch.rsqrt(u1 * u1 + u2 * u2)
 
-    def exponent(x: Tensor, y: Tensor) -> Tensor:
-        return (u0 * x + u1 * y).square() + (u2 * y).square()
+    def half_width(y: Tensor) -> Tensor:
+        return (limit - (u2 * y).square()).clamp_min(0).sqrt()
 
-    return torch.minimum(exponent(nearest_x, best_y), exponent(best_x, nearest_y))
+    at_right, at_left = rightmost.maximum(low).minimum(high), (-rightmost).maximum(low).minimum(high)
+    right = mean[:, 0] + (half_width(at_right) - u1 * at_right) / u0
+    left = mean[:, 0] - (half_width(at_left) + u1 * at_left) / u0
+    first, last = touched(left, tile), touched(right, tile, past=True)
+    return first, torch.where(low <= high, last, first)
 
 
-def expand(counts: Int[Tensor, "M"]) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """For each of sum(counts) items: its owner and its number within the owner."""
-    owner = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    before = counts.cumsum(0) - counts
-    return owner, torch.arange(len(owner), device=counts.device) - before[owner]
+def nearest_first(depths: Float[Tensor, "M"]) -> Int[Tensor, "M"]:
+    """Order by depth, ties by row. Positive floats sort like the integers of their bits, which torch sorts faster."""
+    bits = depths.contiguous().view({4: torch.int32, 8: torch.int64}[depths.element_size()])
+    return torch.argsort(bits, stable=True)
 
 
 def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pairs:
     """Pairs of every splat with every tile where its alpha may reach alpha_min.
 
     Raises:
-        InputError: more than `settings.max_pairs` pairs would be needed.
+        TooManyPairs: more than `settings.max_pairs` pairs would be needed.
     """
     with torch.no_grad():
         grid = TileGrid.of(camera, settings.tile_size)
@@ -112,15 +134,9 @@ def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pair
         if settings.cull == "published":
             first = first.maximum(window_first // grid.tile)
             last = last.minimum(window_last // grid.tile).maximum(first)
-        splats, tiles = reached_tiles(screen, limits, first, last, grid, settings)
         seen = (window_last > window_first).all(1)
-        columns, rows = grid.shape
-        return Pairs(
-            splats=splats,
-            tiles=tiles,
-            starts=torch.searchsorted(tiles, torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)),
-            radii=torch.where(seen, radii, 0.0).nan_to_num().clamp_max(FAR).int(),
-        )
+        radii = torch.where(seen, radii, 0.0).nan_to_num().clamp_max(FAR).int()
+        return reached_tiles(screen, limits, first, last, grid, settings, radii)
 
 
 def reached_tiles(
@@ -130,26 +146,61 @@ def reached_tiles(
     last: Int[Tensor, "M 2"],
     grid: TileGrid,
     settings: RasterSettings,
-) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """(splat, tile) of every pair, sorted by tile, then depth; tiles that the ellipse misses are left out."""
-    order = torch.argsort(screen.depths, stable=True)
-    spans = (last - first)[order]
-    counts = spans.long().prod(1)
-    refuse_too_many(int(counts.sum()), grid, settings)
-    owner, number = expand(counts)
-    splat, columns = order[owner], spans[owner, 0]
-    position = first[splat] + torch.stack([number % columns, number // columns], 1).int()
-    nearest = least_exponent(screen.means[splat], screen.factors[splat], position * grid.tile, grid.tile)
-    kept = (nearest <= limits[splat]).nonzero()[:, 0]
-    column, row = (position[kept] - torch.tensor(grid.first, device=kept.device)).unbind(1)
-    tiles, by_tile = torch.sort((row * grid.shape[0] + column).int(), stable=True)
-    return splat[kept][by_tile], tiles
+    radii: Int[Tensor, "M"],
+) -> Pairs:
+    """The pairs, given each splat's box of tiles (first, past the last)."""
+    order = nearest_first(screen.depths)
+    order = order[((last > first).all(1))[order]]
+    heights = (last - first)[order, 1]
+    refuse_too_many(int(heights.sum()), grid, settings)
+    rank = torch.repeat_interleave(heights)
+    owner = order[rank]
+    row = first[owner, 1] + (torch.arange(len(rank), device=rank.device) - (heights.cumsum(0) - heights)[rank]).int()
+    begin, end = row_spans(screen.means[owner], screen.factors[owner], limits[owner], row, grid.tile)
+    begin, end = begin.maximum(first[owner, 0]), end.minimum(last[owner, 0])
+    widths = (end - begin).clamp_min_(0).long()
+    refuse_too_many(int(widths.sum()), grid, settings)
+    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, grid, radii)
+
+
+def sorted_pairs(
+    order: Int[Tensor, "V"],
+    rank: Int[Tensor, "R"],
+    row: Int[Tensor, "R"],
+    begin: Int[Tensor, "R"],
+    widths: Int[Tensor, "R"],
+    grid: TileGrid,
+    radii: Int[Tensor, "M"],
+) -> Pairs:
+    """Expand spans of `widths` tiles from column `begin` of a tile row into pairs, and sort them by tile."""
+    columns, rows = grid.shape
+    line = torch.repeat_interleave(widths)
+    before = widths.cumsum(0) - widths
+    place = torch.arange(len(line), device=line.device)
+    tiles = (place + (row * columns + begin - before)[line]).to(index_type(columns * rows))
+    tiles, slots = torch.sort(tiles, stable=True)
+    counts = torch.zeros_like(order).index_add_(0, rank, widths)
+    edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
+    return Pairs(
+        splats=order[rank][line[slots]],
+        tiles=tiles.int(),
+        starts=torch.searchsorted(tiles.int(), edges),
+        slots=slots,
+        order=order,
+        counts=counts,
+        radii=radii,
+    )
+
+
+def index_type(count: int) -> torch.dtype:
+    """The smallest integer type that holds `count`; torch sorts narrow integers fastest."""
+    return torch.int16 if count <= torch.iinfo(torch.int16).max else torch.int32
 
 
 def refuse_too_many(count: int, grid: TileGrid, settings: RasterSettings) -> None:
-    """Raise InputError before memory for too many pairs is asked for."""
+    """Raise TooManyPairs before memory for too many pairs is asked for."""
     if count > settings.max_pairs:
-        raise InputError(
+        raise TooManyPairs(
             f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile pairs, more than "
             f"rasterizer.max_pairs={settings.max_pairs:,}: render it in smaller pieces or raise the limit"
         )

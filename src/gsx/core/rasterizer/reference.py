@@ -3,6 +3,8 @@
 Shares no code with the fast path; O(splats x pixels) memory. Differentiable by plain autograd.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -13,10 +15,23 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.splats import Splats
 
 
-def screen_covariances(
+def whole(camera: Camera) -> Camera:
+    """The camera whose raster is the frame that `camera` was cropped from."""
+    frame = camera.frame
+    cx, cy = camera.cx + frame.left, camera.cy + frame.top
+    return replace(camera, cx=cx, cy=cy, width=frame.width, height=frame.height, cut_from=None)
+
+
+def frame_pixels(camera: Camera) -> Float[Tensor, "H W 2"]:
+    """Pixel centres of the camera's raster on its frame."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    return torch.stack([x + camera.frame.left, y + camera.frame.top], -1).double()
+
+
+def screen_roots(
     splats: Splats, points: Float[Tensor, "N 3"], camera: Camera, settings: RasterSettings
-) -> Float[Tensor, "N 2 2"]:
-    """J W Sigma W^T J^T + dilation (spec 3.2, off-centre form)."""
+) -> Float[Tensor, "N 5 2"]:
+    """A with A^T A = J W Sigma W^T J^T + dilation (spec 3.2, off-centre form)."""
     x, y, z = points.unbind(1)
     widen_x = settings.jacobian_margin * camera.width / (2 * camera.fx)
     widen_y = settings.jacobian_margin * camera.height / (2 * camera.fy)
@@ -27,7 +42,16 @@ def screen_covariances(
     row_y = torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1)
     jacobian = torch.stack([row_x, row_y], 1) @ camera.rotation.double()
     spread = rotation_matrices(splats.quats.double()) @ torch.diag_embed(splats.scales.double())
-    return jacobian @ spread @ spread.mT @ jacobian.mT + settings.dilation * torch.eye(2, dtype=torch.float64)
+    dilation = (settings.dilation**0.5 * torch.eye(2, dtype=torch.float64)).expand(len(points), 2, 2)
+    return torch.cat([(jacobian @ spread).mT, dilation], 1)
+
+
+def squared_distances(roots: Float[Tensor, "N 5 2"], offset: Float[Tensor, "N H W 2"]) -> Float[Tensor, "N H W"]:
+    """d^T (A^T A)^-1 d = |R^-T d|^2 with A = Q R: the inverse of a needle's covariance would lose half the digits."""
+    triangle = torch.linalg.qr(roots).R[:, None, None]
+    first = offset[..., 0] / triangle[..., 0, 0]
+    second = (offset[..., 1] - triangle[..., 0, 1] * first) / triangle[..., 1, 1]
+    return first.square() + second.square()
 
 
 def windows(
@@ -53,25 +77,23 @@ def alpha_maps(
     rows = rows[torch.argsort(points[rows, 2].float(), stable=True)]
     points = points[rows]
     chosen = Splats(**{name: getattr(splats, name)[rows] for name in splats.__dataclass_fields__})
-    covariances = screen_covariances(chosen, points, camera, settings)
+    roots = screen_roots(chosen, points, camera, settings)
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
     means = points[:, :2] / points[:, 2:] * focal + torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
-    offset = xy - means[:, None, None]
-    distance = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(covariances), offset)
+    distance = squared_distances(roots, xy - means[:, None, None])
     alpha = torch.exp(chosen.log_opacities.double()[:, None, None] - distance / 2)
     clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (spec 4)
     keep = clamped >= settings.alpha_min
     if settings.cull == "published":
-        keep = keep & windows(means, covariances, xy)
+        keep = keep & windows(means, roots.mT @ roots, xy)
     return torch.where(keep, clamped, 0.0), rows
 
 
 def render_reference(
     splats: Splats, camera: Camera, settings: RasterSettings, *, background: Float[Tensor, "C"] | None = None
 ) -> tuple[Float[Tensor, "C H W"], Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(image, alpha, depth) in float64; `depth` is the blending-weighted sum of camera z."""
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    alpha, rows = alpha_maps(splats, camera, settings, torch.stack([x, y], -1).double())
+    """(image, alpha, depth) in float64; `depth` is the blending-weighted sum of camera z. A crop sees its frame."""
+    alpha, rows = alpha_maps(splats, whole(camera), settings, frame_pixels(camera))
     after = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     weight = alpha * before * (after >= settings.transmittance_stop)

@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
+from gsx.core.rasterizer.cap import capped
+from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import Blocks, composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import pair
-from gsx.core.rasterizer.projection import project
+from gsx.core.rasterizer.pairs import Pairs, pair
+from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.splats import Splats
@@ -66,39 +68,54 @@ def heaviest_by_splat(by_entry: Float[Tensor, "S K"], blocks: Blocks, count: int
     return zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
 
 
+def blend(
+    screen: ScreenSplats,
+    shift: Float[Tensor, "M 2"],
+    channels: Float[Tensor, "M C"],
+    pairs: Pairs,
+    camera: Camera,
+    settings: RasterSettings,
+    probe: Float[Tensor, "M 2"] | None,
+    max_weight: bool,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+    """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for."""
+    inputs = (screen.means + shift, screen.factors, screen.log_opacities, channels)
+    grid = TileGrid.of(camera, settings.tile_size)
+    if takes(settings, channels.shape[1], len(pairs.splats), max_weight, shift.device.type):
+        return composite_compiled(*inputs, pairs, grid, settings, probe=probe), None
+    blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
+    by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
+    blended = composite(*inputs, blocks, grid, settings, probe=probe, heaviest=by_entry)
+    return blended, None if by_entry is None else heaviest_by_splat(by_entry, blocks, len(screen.ids))
+
+
 def rasterize(
     splats: Splats,
     camera: Camera,
     settings: RasterSettings,
     *,
     background: Float[Tensor, "C"] | None = None,
+    intrinsics: Float[Tensor, "4"] | None = None,
     depth: bool = False,
     absolute_gradient: bool = False,
     max_weight: bool = False,
 ) -> Rendering:
     """Render `splats` from `camera`; differentiable in every field of the splats and in the background.
 
+    It is differentiable in the camera's rotation (as nine free numbers) and translation as well, and in `intrinsics`:
+    (fx, fy, cx, cy) in px of the camera's raster, which then take the place of the camera's own.
+
     Raises:
-        InputError: the picture needs more splat-tile pairs than `settings.max_pairs`.
+        InputError: the camera's numbers allow no picture.
+        TooManyPairs: the picture needs more splat-tile pairs than `settings.max_pairs`.
     """
-    screen = project(splats, camera, settings)
-    pairs = pair(screen, camera, settings)
-    blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
+    screen = project(splats, camera, settings, intrinsics)
+    pairs = capped(pair(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
     shift = torch.zeros_like(screen.means, requires_grad=learning)
     probe = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
-    by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
-    blended = composite(
-        screen.means + shift,
-        screen.factors,
-        screen.log_opacities,
-        torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels,
-        blocks,
-        TileGrid.of(camera, settings.tile_size),
-        settings,
-        probe=probe,
-        heaviest=by_entry,
-    )
+    channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
+    blended, heaviest = blend(screen, shift, channels, pairs, camera, settings, probe, max_weight)
     count = splats.colours.shape[1]
     image, alpha = blended[:count], blended[-1]
     if background is not None:
@@ -114,7 +131,7 @@ def rasterize(
             radii=pairs.radii,
             shift=shift,
             probe=probe,
-            heaviest=None if by_entry is None else heaviest_by_splat(by_entry, blocks, len(screen.ids)),
+            heaviest=heaviest,
             size=camera.size,
         ),
     )

@@ -1,5 +1,6 @@
 """The knobs of the rasterizer. Values live in `conf/rasterizer`; the defaults here are the published 3D-GS rules."""
 
+import math
 from dataclasses import dataclass
 
 WINDOW_TILE = 16
@@ -14,6 +15,11 @@ CHOICES = {
     "accumulation": ("float32", "float64", "bfloat16", "float16"),
 }
 """Values of the settings that are names; the first is not always the default."""
+
+SIGNIFICANT_BITS = {"float64": 53, "float32": 24, "tf32": 24, "bfloat16": 8, "float16": 11}
+LEAST_NORMAL = {"bfloat16": 2.0**-126, "float16": 2.0**-14}
+LARGEST_HALF = 65504.0
+"""Of float16."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,14 +42,21 @@ class RasterSettings:
     tile_size: int = 8
     """Edge of the compositing tiles, px; with cull=published it must divide 16."""
     chunk: int = 16
-    """Splats composited per step of a tile."""
+    """Eager path: splats composited per step of a tile."""
     batch_values: int = 1 << 18
-    """Alpha values evaluated at once: bounds working memory and should fit the CPU's cache."""
+    """Eager path: alpha values evaluated at once; bounds working memory and should fit the CPU's cache."""
+    unrolled: int = 8
+    """Compiled path: splats composited per step of a tile, unrolled in one loop; compile time grows with it."""
+    compiled_values: int = 1 << 22
+    """Compiled path: alpha values evaluated at once."""
     max_pairs: int = 100_000_000
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
-    `auto`: a run decides (compiled where a compiler works and the run is long enough to repay it)."""
+    Blending more than 8 channels, sums in 16 bits and largest weights take the eager way regardless.
+    `auto`: a training run decides (`auto_steps`); everything else is eager."""
+    auto_steps: int = 300
+    """path=auto compiles for runs of at least this many steps, where a compiler works."""
     schedule: str = "auto"
     """Of the compiled path. `chunks`: front to back, saturated tiles leave. `segments`: all chunks of all tiles at
     once, joined by an associative scan. `auto`: chunks on a CPU, segments on a GPU."""
@@ -51,26 +64,73 @@ class RasterSettings:
     """How ln alpha is evaluated: `squares` (two affine squares), `direct` (from the offset to the mean),
     `expanded` (a quadratic polynomial in tile coordinates)."""
     evaluation: str = "float32"
-    """Precision in which alphas are evaluated: float64, float32, tf32 (GPU matrix products), bfloat16 or float16."""
+    """Format in which ln alpha and alpha are evaluated: float64, float32, tf32, bfloat16 or float16. Geometry keeps the
+    splats' dtype. float32 is at least the splats' own: float64 splats are evaluated in float64. tf32 is float32 whose
+    matrix products, those of light included, may round their factors to 10 bits on a GPU; on a CPU it is float32."""
     accumulation: str = "float32"
-    """Precision in which transmittance and light are accumulated: float64, float32, bfloat16 or float16."""
+    """Format of transmittance, weights and sums of light: float64, float32 (at least the splats' own), bfloat16 or
+    float16. Sums over pixels that make a splat's gradient are never narrower than the splats."""
     tile_cap: int = 0
     """At most this many splats are blended per tile, the nearest; 0: all."""
 
     def __post_init__(self) -> None:
-        if self.tile_size < 1 or (self.cull == "published" and WINDOW_TILE % self.tile_size):
-            raise ValueError(
-                f"rasterizer.tile_size is {self.tile_size}; with cull=published it must divide {WINDOW_TILE}"
-            )
-        if not self.dilation > 0:
-            raise ValueError(f"rasterizer.dilation is {self.dilation}; give a positive number of px^2")
-        if self.chunk < 1 or self.batch_values < 1:
-            raise ValueError("rasterizer.chunk and rasterizer.batch_values must be at least 1")
         for name, choices in CHOICES.items():
             value = getattr(self, name)
             if value not in choices:
                 raise ValueError(f"rasterizer.{name} is '{value}'; choose {', '.join(choices)}")
-        if self.tile_cap < 0:
-            raise ValueError(f"rasterizer.tile_cap is {self.tile_cap}; give a number of splats, or 0 for no cap")
+        self._check_rules()
+        self._check_sizes()
+        self._check_formats()
+
+    def _check_rules(self) -> None:
+        if not self.dilation > 0:
+            raise ValueError(f"rasterizer.dilation is {self.dilation}; give a positive number of px^2")
         if not 0 < self.alpha_min < self.alpha_max < 1:
             raise ValueError(f"need 0 < alpha_min < alpha_max < 1, got {self.alpha_min} and {self.alpha_max}")
+        if not 0 <= self.transmittance_stop < 1:
+            raise ValueError(
+                f"rasterizer.transmittance_stop is {self.transmittance_stop}; give 0 (never stop) or more, below 1"
+            )
+        if not self.jacobian_margin >= 0:
+            raise ValueError(f"rasterizer.jacobian_margin is {self.jacobian_margin}; give a number of 0 or more")
+
+    def _check_sizes(self) -> None:
+        if self.tile_size < 1:
+            raise ValueError(f"rasterizer.tile_size is {self.tile_size}; give a number of px")
+        if self.cull == "published" and WINDOW_TILE % self.tile_size:
+            raise ValueError(
+                f"rasterizer.tile_size is {self.tile_size}; with cull=published it must divide {WINDOW_TILE}"
+            )
+        for name in ("chunk", "batch_values", "unrolled", "compiled_values", "max_pairs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"rasterizer.{name} is {getattr(self, name)}; give at least 1")
+        if self.tile_cap < 0:
+            raise ValueError(f"rasterizer.tile_cap is {self.tile_cap}; give a number of splats, or 0 for no cap")
+
+    def _check_formats(self) -> None:
+        """What the chosen formats cannot express would be silently wrong, or divide by 1 - alpha = 0."""
+        for role in ("evaluation", "accumulation"):
+            name = getattr(self, role)
+            if 1 - self.alpha_max < 2.0 ** -SIGNIFICANT_BITS[name]:
+                raise ValueError(f"rasterizer.alpha_max={self.alpha_max} is 1 in {role}={name}; lower it")
+        if self.alpha_min < LEAST_NORMAL.get(self.evaluation, 0.0):
+            raise ValueError(
+                f"rasterizer.alpha_min={self.alpha_min} is below the {LEAST_NORMAL[self.evaluation]:.1e} that "
+                f"evaluation={self.evaluation} resolves; raise it or choose bfloat16 or float32"
+            )
+        unseen = 2.0 ** -(1 + SIGNIFICANT_BITS[self.accumulation])
+        if self.accumulation in LEAST_NORMAL and self.alpha_min < unseen:
+            raise ValueError(
+                f"rasterizer.alpha_min={self.alpha_min}: an alpha below {unseen:.1e} takes nothing from a T of 1 "
+                f"in accumulation={self.accumulation}; raise it or accumulate in float32"
+            )
+        if self.evaluation == "float16" and self.largest_exponent > LARGEST_HALF:
+            raise ValueError(
+                f"rasterizer.evaluation=float16 cannot hold ln alpha = {-self.largest_exponent:.3g}, which "
+                f"tile_size={self.tile_size} and dilation={self.dilation} px^2 allow; choose bfloat16 or smaller tiles"
+            )
+
+    @property
+    def largest_exponent(self) -> float:
+        """Bound of s^2 + r^2 in a tile that a splat reaches: dilation alone is the narrowest splat, a diagonal away."""
+        return (self.tile_size / math.sqrt(self.dilation) + math.sqrt(-math.log(self.alpha_min))) ** 2

@@ -1,0 +1,80 @@
+"""All that the benchmarks know of the rasterizer's inside. When pairing or blending change shape, mend it here."""
+
+import torch
+from torch import Tensor
+
+from gsx.cli import plugins
+from gsx.core.camera import Camera
+from gsx.core.config import compose
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer.compiled import composite_compiled
+from gsx.core.rasterizer.composite import composite, make_blocks
+from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.pairs import Pairs, pair
+from gsx.core.rasterizer.projection import ScreenSplats
+from gsx.core.shapes import Float
+
+
+def settings_of(path: str, *overrides: str) -> RasterSettings:
+    """The shipped settings of a path (eager, compiled), with overrides such as `rasterizer.tile_size=16`."""
+    return compose([f"rasterizer={path}", *overrides], plugins()).raster
+
+
+def missing(path: str, device: torch.device) -> str:
+    """Why a path cannot be measured; empty when it can. Without a compiler the compiled path would be eager."""
+    if path != "compiled":
+        return ""
+    try:
+        torch.compile(torch.cos)(torch.ones(8, device=device))
+    except Exception as error:  # whatever a broken compiler or a missing header raises
+        return f"torch.compile fails here: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+    return ""
+
+
+def pair_screen(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pairs:
+    """Which splats reach which tiles, sorted."""
+    return pair(screen, camera, settings)
+
+
+def count_pairs(pairs: Pairs) -> int:
+    """Splat-tile pairs."""
+    return len(pairs.splats)
+
+
+def blend_pairs(screen: ScreenSplats, pairs: Pairs, camera: Camera, settings: RasterSettings) -> Float[Tensor, "C H W"]:
+    """Blended channels, differentiable in means, factors, log-opacities and channels of the screen splats."""
+    grid = TileGrid.of(camera, settings.tile_size)
+    inputs = (screen.means, screen.factors, screen.log_opacities, screen.channels)
+    if settings.path == "compiled":
+        return composite_compiled(*inputs, pairs, grid, settings)[:-1]
+    return composite(*inputs, make_blocks(pairs, settings.chunk, len(screen.ids)), grid, settings)[:-1]
+
+
+def blend_screen(
+    screen: ScreenSplats, camera: Camera, settings: RasterSettings
+) -> tuple[Float[Tensor, "C H W"], Pairs]:
+    """Everything behind projection: pair, then blend."""
+    pairs = pair_screen(screen, camera, settings)
+    return blend_pairs(screen, pairs, camera, settings), pairs
+
+
+def to_raster(tiles: Float[Tensor, "T P C"], camera: Camera, tile: int) -> Float[Tensor, "C H W"]:
+    """Tiles laid out as a picture."""
+    return TileGrid.of(camera, tile).to_raster(tiles)
+
+
+def to_tiles(raster: Float[Tensor, "C H W"], camera: Camera, tile: int) -> Float[Tensor, "T P C"]:
+    """A picture cut into tiles, zero beyond the raster."""
+    return TileGrid.of(camera, tile).to_tiles(raster).mT.contiguous()
+
+
+def learnable(screen: ScreenSplats) -> ScreenSplats:
+    """The same splats with leaves that gather gradients."""
+    leaves = ("means", "factors", "log_opacities", "channels")
+    made = {name: getattr(screen, name).detach().clone().requires_grad_() for name in leaves}
+    return ScreenSplats(**(vars(screen) | made))
+
+
+def leaves_of(screen: ScreenSplats) -> list[Tensor]:
+    """The leaves that `learnable` made."""
+    return [value for value in vars(screen).values() if isinstance(value, torch.Tensor) and value.requires_grad]

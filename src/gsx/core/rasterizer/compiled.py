@@ -1,0 +1,370 @@
+"""The compiled path: the picture and gradient of composite.py through loops that are compiled once (kernels.py).
+
+Two schedules of the same loops. `chunks`: front to back, one chunk of all groups at a time, and groups whose pixels
+have all ended leave. `segments`: the share of light that passes each block first; an associative scan makes of it the
+transmittance before every block; then all blocks at once. On the way back the scan runs from behind.
+"""
+
+import functools
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.rasterizer.composite import NOTHING
+from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
+from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
+from gsx.core.rasterizer.pairs import Pairs
+from gsx.core.rasterizer.precision import Precision
+from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
+from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.shapes import Bool, Float, Int
+
+logger = logging.getLogger(__name__)
+
+MOST_CHANNELS = 8
+"""Channels are unrolled: beyond this number compilation takes longer than it saves."""
+CHECK_EVERY = 4
+"""Chunks between looks at which groups have ended."""
+WORTH_LEAVING = 0.75
+"""Groups are picked out when at most this share of them is still going: picking costs a copy."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Basis:
+    """Pixel centres of a tile relative to its middle, and their products."""
+
+    x: Float[Tensor, "P 1"]
+    y: Float[Tensor, "P 1"]
+    products: Float[Tensor, "3 P 1"]
+    """x^2, x y, y^2."""
+
+
+def basis_of(grid: TileGrid, like: Tensor) -> Basis:
+    """The basis of a grid's tiles."""
+    x, y = grid.basis(like)[:2, :, None].unbind(0)
+    return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Job:
+    """One picture to blend."""
+
+    lanes: Lanes
+    grid: TileGrid
+    basis: Basis
+    centre: Float[Tensor, "S 2 1 L"]
+    loops: Kernels
+    rules: Rules
+    precision: Precision
+    batch: int
+    """Groups, or blocks of segments, worked on at once."""
+    segments: bool
+
+
+def batch_groups(settings: RasterSettings) -> int:
+    """Groups of a batch: about `compiled_values` alphas at once, at least two groups."""
+    return max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
+
+
+def rules_of(settings: RasterSettings, channels: int, absolute: bool, like: Tensor) -> Rules:
+    """What the compiled code depends on."""
+    powers, squarings = exp_polynomial(math.log(settings.alpha_min))
+    return Rules(
+        chunk=settings.unrolled,
+        channels=channels,
+        alpha_min=settings.alpha_min,
+        alpha_max=settings.alpha_max,
+        stop=settings.transmittance_stop,
+        exponent=settings.exponent,
+        evaluation=Precision.of(settings, like.dtype).evaluation,
+        absolute=absolute,
+        device=like.device.type,
+        powers=powers,
+        squarings=squarings,
+    )
+
+
+def padded_table(means: Tensor, factors: Tensor, log_opacities: Tensor, channels: Tensor) -> Float[Tensor, "M_1 F"]:
+    """Everything blending needs of each splat in one row, and last a row that draws nothing."""
+    table = torch.cat([means, factors, log_opacities[:, None], channels], 1)
+    nothing = table.new_zeros(1, table.shape[1])
+    nothing[0, TABLE - 1] = NOTHING
+    return torch.cat([table, nothing])
+
+
+# -- chunks --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One chunk of some groups of a batch: slices, or indices once groups have left."""
+
+    blocks: slice | Int[Tensor, "B"]
+    groups: slice | Int[Tensor, "B"]
+    previous: slice | Int[Tensor, "B"] | None
+    """Blocks of the same groups one chunk before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chunks:
+    """What the chunk schedule keeps for its way back."""
+
+    stages: list[Stage]
+    inside: Float[Tensor, "G P L"]
+    after: Float[Tensor, "S P L"]
+    """Transmittance behind every block."""
+
+    def before(self, stage: Stage) -> Float[Tensor, "B P L"]:
+        """Transmittance in front of a stage's blocks."""
+        return take(self.inside, stage.groups) if stage.previous is None else take(self.after, stage.previous)
+
+
+def take(values: Float[Tensor, "N *rest"], where: slice | Int[Tensor, "B"]) -> Float[Tensor, "B *rest"]:
+    """Rows as a view of something: torch compiles anew for arguments that are no views."""
+    return values[where] if isinstance(where, slice) else values[where][:]
+
+
+def stage_of(job: Job, number: int, begin: int, left: Int[Tensor, "B"] | None) -> Stage | None:
+    """Chunk `number` of the batch from group `begin`, or of the groups `left`; None where no group has it."""
+    lanes = job.lanes
+    if number >= len(lanes.active) or lanes.active[number] <= begin:
+        return None
+    end, base = min(lanes.active[number], begin + job.batch), lanes.bases[number]
+    last = lanes.bases[number - 1] if number else 0
+    if left is None:
+        previous = slice(last + begin, last + end) if number else None
+        return Stage(slice(base + begin, base + end), slice(begin, end), previous)
+    groups = left[left < end]
+    return Stage(base + groups, groups, last + groups) if len(groups) else None
+
+
+def still_going(after: Float[Tensor, "B P L"], stop: float) -> Bool[Tensor, "B"]:
+    """Groups with a pixel that has not ended."""
+    return after.amax((1, 2)) >= stop
+
+
+def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
+    """Groups that go on, where enough have ended for the others to be picked out; at least two, for the compiler."""
+    going = still_going(kept.after[stage.blocks], job.rules.stop)
+    total = int(going.sum())
+    if total > WORTH_LEAVING * len(going):
+        return None
+    going[: 2 if total else 0] = True
+    groups = stage.groups
+    if isinstance(groups, slice):
+        groups = torch.arange(groups.start, groups.stop, device=going.device)
+    return groups[going]
+
+
+def blend_stage(
+    job: Job, stage: Stage, rows: Float[Tensor, "S K F L"], light: list[Float[Tensor, "G P L"]], kept: Chunks
+) -> None:
+    """Blend one stage into `light` and `kept.after`."""
+    part = [take(channel, stage.groups) for channel in light]
+    picked = not isinstance(stage.blocks, slice)
+    after = take(kept.after, stage.blocks)
+    job.loops.blend(take(rows, stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
+    if picked:
+        kept.after[stage.blocks] = after
+        for channel, value in zip(light, part, strict=True):
+            channel[stage.groups] = value
+
+
+def blend_chunks(
+    job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
+) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
+    """Channels and coverage, front to back."""
+    light = [torch.zeros_like(inside) for _ in range(job.rules.channels + 1)]
+    kept = Chunks([], inside, inside.new_empty(len(rows), *inside.shape[1:]))
+    for begin in range(0, len(inside), job.batch):
+        number, left = 0, None
+        while (stage := stage_of(job, number, begin, left)) is not None:
+            blend_stage(job, stage, rows, light, kept)
+            kept.stages.append(stage)
+            number += 1
+            if number % CHECK_EVERY == 0:
+                fewer = leave(job, stage, kept)
+                left = left if fewer is None else fewer
+    return light, kept
+
+
+def chunk_moments(
+    job: Job, rows: Float[Tensor, "S K F L"], kept: Chunks, gradient: list[Float[Tensor, "G P L"]]
+) -> Float[Tensor, "S K V L"]:
+    """Moments of every entry, back to front; zero for blocks that were not blended."""
+    behind, basis = torch.zeros_like(kept.inside), job.basis
+    width = TABLE + job.rules.channels + 2 * job.rules.absolute
+    moments = kept.inside.new_zeros(*rows.shape[:2], width, rows.shape[3])
+    for stage in reversed(kept.stages):
+        part, seen = take(rows, stage.blocks), [take(g, stage.groups) for g in gradient]
+        rest = take(behind, stage.groups)
+        slope, weight = job.loops.slopes(part, basis.x, basis.y, kept.before(stage), rest, seen)
+        if not isinstance(stage.groups, slice):
+            behind[stage.groups] = rest
+        moments[stage.blocks] = job.loops.moments(part, slope, weight, basis.x, basis.y, basis.products, seen)
+    return moments
+
+
+# -- segments ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """What the segment schedule keeps for its way back."""
+
+    passed: Float[Tensor, "S P L"]
+    """Share of light that passes each block."""
+    before: Float[Tensor, "S P L"]
+    """Transmittance in front of each block."""
+    light: Float[Tensor, "C_1 S P L"]
+    """What each block adds to the channels and the coverage."""
+
+
+def blend_segments(
+    job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
+) -> tuple[list[Float[Tensor, "G P L"]], Segments]:
+    """Channels and coverage, all blocks at once."""
+    x, y, lanes = job.basis.x, job.basis.y, job.lanes
+    passed = torch.cat([job.loops.fade(rows[part], x, y).to(inside.dtype) for part in parts(len(rows), job.batch)])
+    before = before_blocks(passed, inside, lanes)
+    light = inside.new_zeros(job.rules.channels + 1, len(rows), *inside.shape[1:])
+    scratch = torch.empty_like(before)
+    for part in parts(len(rows), job.batch):
+        job.loops.blend(rows[part], x, y, before[part], scratch[part], [channel[part] for channel in light])
+    total = inside.new_zeros(len(light), *inside.shape)
+    for active, base in zip(lanes.active, lanes.bases, strict=True):
+        total[:, :active] += light[:, base : base + active]
+    return list(total.unbind(0)), Segments(passed, before, light)
+
+
+def segment_moments(
+    job: Job, rows: Float[Tensor, "S K F L"], kept: Segments, gradient: list[Float[Tensor, "G P L"]]
+) -> Float[Tensor, "S K V L"]:
+    """Moments of every entry, all blocks at once."""
+    seen = [g[job.lanes.groups] for g in gradient]
+    shine = sum(channel * g for channel, g in zip(kept.light, seen, strict=True))
+    own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
+    behind, basis, out = behind_blocks(kept.passed, own, job.lanes), job.basis, []
+    for part in parts(len(rows), job.batch):
+        here = [g[part] for g in seen]
+        slope, weight = job.loops.slopes(rows[part], basis.x, basis.y, kept.before[part], behind[part], here)
+        out.append(job.loops.moments(rows[part], slope, weight, basis.x, basis.y, basis.products, here))
+    return torch.cat(out)
+
+
+# -- the autograd function -----------------------------------------------------------------------------------------
+
+
+def sum_by_splat(values: Float[Tensor, "E V"], pairs: Pairs, lanes: Lanes, count: int) -> Float[Tensor, "M V"]:
+    """Sums over the entries of each splat, always in the same order."""
+    offsets = (pairs.counts.cumsum(0) - pairs.counts).int()
+    sums = torch.nn.functional.embedding_bag(lanes.places, values, offsets, mode="sum")
+    return values.new_zeros(count, values.shape[1]).index_copy_(0, pairs.order, sums)
+
+
+def inside_of(job: Job, like: Tensor) -> Float[Tensor, "G P L"]:
+    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
+    ones = like.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
+    return to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()
+
+
+class CompiledComposite(torch.autograd.Function):
+    """See `composite_compiled` for the arguments."""
+
+    @staticmethod
+    def forward(ctx, means, factors, log_opacities, channels, probe, pairs, job):
+        table = padded_table(means, factors, log_opacities, channels).to(job.precision.exact)
+        rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
+        light, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside_of(job, means))
+        if any(ctx.needs_input_grad):
+            ctx.kept = (job, pairs, table, rows, kept, probe is not None, means.dtype)
+        columns, lines = job.grid.shape
+        return job.grid.to_raster(from_lanes(light, job.lanes, columns * lines)).to(means.dtype)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        job, pairs, table, rows, kept, absolute, dtype = ctx.kept
+        seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
+        moments = (segment_moments if job.segments else chunk_moments)(job, rows, kept, seen)
+        values = job.loops.entry_gradients(table, job.lanes.entries, job.centre, moments)
+        total = sum_by_splat(values.view(-1, values.shape[-1]), pairs, job.lanes, len(table) - 1).to(dtype)
+        width = TABLE + job.rules.channels
+        probe = total[:, width:] if absolute else None
+        return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], probe, None, None)
+
+
+def composite_compiled(
+    means: Float[Tensor, "M 2"],
+    factors: Float[Tensor, "M 3"],
+    log_opacities: Float[Tensor, "M"],
+    channels: Float[Tensor, "M C"],
+    pairs: Pairs,
+    grid: TileGrid,
+    settings: RasterSettings,
+    *,
+    probe: Float[Tensor, "M 2"] | None = None,
+) -> Float[Tensor, "C_plus_1 H W"]:
+    """What `composite` returns, through compiled loops; `probe` as there. There must be a pair."""
+    rules, precision = (
+        rules_of(settings, channels.shape[1], probe is not None, means),
+        Precision.of(settings, means.dtype),
+    )
+    batch = batch_groups(settings)
+    lanes = lay_out(pairs, len(means), settings.unrolled, batch)
+    exact = means.detach().to(precision.exact)
+    job = Job(
+        lanes=lanes,
+        grid=grid,
+        basis=basis_of(grid, exact),
+        centre=centres(lanes, grid, exact),
+        loops=kernels(rules),
+        rules=rules,
+        precision=precision,
+        batch=batch,
+        segments=settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"),
+    )
+    return CompiledComposite.apply(means, factors, log_opacities, channels, probe, pairs, job)
+
+
+# -- is it there? --------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache
+def complaint(device: str) -> str:
+    """Why nothing can be compiled for this device; empty where it can. Asked by compiling two operations."""
+    try:
+        torch.compile(lambda x: 2 * x + 1, fullgraph=True)(torch.zeros(32, device=device))
+    except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return ""
+
+
+def available(device: str = "cpu") -> bool:
+    """Whether the compiled path works on this machine."""
+    return not complaint(device)
+
+
+@functools.lru_cache
+def warn_once(device: str) -> None:
+    """Say why the eager path is taken instead."""
+    logger.warning(
+        "rasterizer.path=compiled: nothing can be compiled here (%s); going on with the eager path, which is several "
+        "times slower. Install a C++ compiler (g++ or clang++), or choose rasterizer=eager",
+        complaint(device),
+    )
+
+
+def takes(settings: RasterSettings, channels: int, pairs: int, max_weight: bool, device: str) -> bool:
+    """Whether this picture goes the compiled way: asked for, possible here, and nothing only the eager path does."""
+    if settings.path != "compiled" or settings.accumulation in ("bfloat16", "float16"):
+        return False
+    if channels > MOST_CHANNELS or max_weight or pairs == 0:
+        return False
+    if not available(device):
+        warn_once(device)
+        return False
+    return True

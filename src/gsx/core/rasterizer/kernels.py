@@ -1,0 +1,333 @@
+"""The loops of the compiled path, in plain torch: what `torch.compile` turns into one fused loop each.
+
+Every function works on blocks in lanes (see lanes.py): B blocks of K entries, P pixels of a tile, L lanes. The loop
+over the K entries is unrolled; sums over a tile's pixels are the only reductions, so nothing of size [B, K, P, L]
+need outlive a cache. Rules are constants of the compiled code.
+"""
+
+import functools
+import math
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.shapes import Float, Int
+
+TABLE = 6
+"""Columns of a splat's table before its channels: mean x, mean y, u0, u1, u2, ln opacity."""
+ROW = 7
+"""Columns of a row before its channels: five of its exponent, ln opacity, and where alpha is clamped."""
+EXP_DEGREE = 7
+"""Degree of the polynomial for exp on a quarter (eighth, ...) of its range: relative error below 1e-7 before rounding."""
+EXP_TOP = 0.02
+"""Exponents are at most 0 but for rounding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """Everything that compiled code depends on."""
+
+    chunk: int
+    channels: int
+    alpha_min: float
+    alpha_max: float
+    stop: float
+    exponent: str
+    evaluation: torch.dtype
+    absolute: bool
+    device: str
+    powers: tuple[float, ...]
+    """Coefficients of `exp_polynomial`, lowest first."""
+    squarings: int
+
+    @property
+    def least(self) -> float:
+        """ln alpha_min."""
+        return math.log(self.alpha_min)
+
+
+# -- alphas --------------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache
+def exp_polynomial(least: float) -> tuple[tuple[float, ...], int]:
+    """Coefficients of p and a number q of squarings with exp(x) = p(x)^(2^q) on [least, EXP_TOP].
+
+    Least squares of the relative error at Chebyshev nodes, in float64. Exponents below `least` are cut off anyway,
+    so no range reduction is needed: this is twice as fast as a library's exp.
+    """
+    low, squarings = least - 0.05, 0
+    while (EXP_TOP - low) / 2**squarings > 1.5:
+        squarings += 1
+    nodes = torch.cos(torch.pi * (torch.arange(64, dtype=torch.float64) + 0.5) / 64)
+    x = low + (EXP_TOP - low) * (nodes + 1) / 2
+    truth = torch.exp(x / 2**squarings)
+    powers = x[:, None] ** torch.arange(EXP_DEGREE + 1)
+    fit = torch.linalg.lstsq(powers / truth[:, None], torch.ones(64, 1, dtype=torch.float64), driver="gelsd")
+    return tuple(fit.solution[:, 0].tolist()), squarings
+
+
+def cut_exp(x: Tensor, rules: Rules) -> Tensor:
+    """exp(x) where x >= ln alpha_min, else 0."""
+    if x.dtype != torch.float32:
+        return torch.where(x >= rules.least, torch.exp(x), 0.0)
+    *others, highest = rules.powers
+    value = highest * x + others[-1]
+    for coefficient in reversed(others[:-1]):
+        value = value * x + coefficient
+    for _ in range(rules.squarings):
+        value = value * value
+    return torch.where(x >= rules.least, value, 0.0)
+
+
+def log_alpha(row: Float[Tensor, "F B 1 L"], x: Float[Tensor, "P 1"], y: Float[Tensor, "P 1"], form: str) -> Tensor:
+    """ln alpha of one entry at every pixel, [B P L]; the columns of a row are those of `make_rows`."""
+    a, b, c, d, e, log_opacity = row[: ROW - 1]
+    if form == "squares":
+        s, r = a * x + (b * y + c), d * y + e
+        return log_opacity - r * r - s * s
+    if form == "direct":
+        dx, dy = x - c, y - e
+        s, r = a * dx + b * dy, d * dy
+        return log_opacity - r * r - s * s
+    return log_opacity - (a * x + (b * y + c)) * x - (d * y + e) * y
+
+
+def gaussian(row: Tensor, x: Tensor, y: Tensor, rules: Rules) -> Tensor:
+    """o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max; [B P L]."""
+    row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
+    return cut_exp(log_alpha(row, x, y, rules.exponent), rules)
+
+
+def clamped(value: Tensor, row: Float[Tensor, "F B 1 L"]) -> Tensor:
+    """min(value, highest), as a selection: cheaper than a minimum that honours NaN."""
+    highest = row[ROW - 1].to(value.dtype)
+    return torch.where(value > highest, highest, value)
+
+
+def entries(rows: Float[Tensor, "B K F L"]) -> list[Float[Tensor, "F B 1 L"]]:
+    """The rows of each of the K entries."""
+    return list(rows.permute(1, 2, 0, 3)[:, :, :, None].unbind(0))
+
+
+# -- loops ---------------------------------------------------------------------------------------------------------
+
+
+def blend(
+    rows: Float[Tensor, "B K F L"],
+    x: Float[Tensor, "P 1"],
+    y: Float[Tensor, "P 1"],
+    before: Float[Tensor, "B P L"],
+    after: Float[Tensor, "B P L"],
+    light: list[Float[Tensor, "B P L"]],
+    rules: Rules,
+) -> None:
+    """Blend one block of every group into `light`, the channels and, last, the coverage.
+
+    `before` is the transmittance in front of the block, `after` receives that behind it. It goes on falling below the
+    stop value, so that a pixel that has ended stays ended.
+    """
+    t, sums = before, list(light)
+    for row in entries(rows):
+        alpha = clamped(gaussian(row, x, y, rules), row).to(t.dtype)
+        weight = alpha * t
+        t = t - weight
+        weight = torch.where(t >= rules.stop, weight, 0.0)
+        sums = [sums[c] + weight * row[ROW + c] for c in range(rules.channels)] + [sums[-1] + weight]
+    after.copy_(t)
+    for target, value in zip(light, sums, strict=True):
+        target.copy_(value)
+
+
+def fade(
+    rows: Float[Tensor, "B K F L"], x: Float[Tensor, "P 1"], y: Float[Tensor, "P 1"], rules: Rules
+) -> Float[Tensor, "B P L"]:
+    """Share of the light that passes each block, without regard to where pixels end."""
+    passed = None
+    for row in entries(rows):
+        passing = 1 - clamped(gaussian(row, x, y, rules), row).to(rows.dtype)
+        passed = passing if passed is None else passed * passing
+    assert passed is not None
+    return passed
+
+
+def slopes(
+    rows: Float[Tensor, "B K F L"],
+    x: Float[Tensor, "P 1"],
+    y: Float[Tensor, "P 1"],
+    before: Float[Tensor, "B P L"],
+    behind: Float[Tensor, "B P L"],
+    gradient: list[Float[Tensor, "B P L"]],
+    rules: Rules,
+) -> tuple[Float[Tensor, "B K P L"], Float[Tensor, "B K P L"]]:
+    """d loss / d ln alpha and the blending weight of every entry at every pixel.
+
+    `behind`, updated in place, is the picture behind the block as seen from there, weighted by the gradient; with it
+    the slope is weight (channels . gradient - behind): no division, and no difference of large sums.
+    """
+    kept, t = [], before
+    for row in entries(rows):
+        raw = gaussian(row, x, y, rules).to(t.dtype)
+        alpha = clamped(raw, row)
+        following = t - alpha * t
+        going = following >= rules.stop
+        raw, alpha = torch.where(going, raw, 0.0), torch.where(going, alpha, 0.0)
+        kept.append((row, raw * t, alpha, alpha * t))
+        t = following
+    out, rest = [], behind
+    for row, raw_weight, alpha, _ in reversed(kept):
+        shade = gradient[-1]
+        for c in range(rules.channels):
+            shade = shade + row[ROW + c] * gradient[c]
+        out.append(raw_weight * (shade - rest))
+        rest = rest + alpha * (shade - rest)
+    behind.copy_(rest)
+    return torch.stack(out[::-1], 1), torch.stack([weight for *_, weight in kept], 1)
+
+
+def moments(
+    rows: Float[Tensor, "B K F L"],
+    slope: Float[Tensor, "B K P L"],
+    weight: Float[Tensor, "B K P L"],
+    x: Float[Tensor, "P 1"],
+    y: Float[Tensor, "P 1"],
+    products: Float[Tensor, "3 P 1"],
+    gradient: list[Float[Tensor, "B P L"]],
+    rules: Rules,
+) -> Float[Tensor, "B K V L"]:
+    """Sums over a tile's pixels of slope d and weight for every entry.
+
+    The V columns: d, d x, d y, d x^2, d x y, d y^2, weight times gradient per channel and, if asked, the absolute
+    gradient of the mean per axis.
+    """
+    sums = [slope.sum(2), *((slope * b).sum(2) for b in (x, y, *products.unbind(0)))]
+    sums += [(weight * g[:, None]).sum(2) for g in gradient[:-1]]
+    if rules.absolute:
+        sums += absolute_moments(rules, rows, slope, x, y)
+    return torch.stack(sums, 2)
+
+
+def absolute_moments(
+    rules: Rules, rows: Float[Tensor, "B K F L"], slope: Float[Tensor, "B K P L"], x: Tensor, y: Tensor
+) -> list[Float[Tensor, "B K L"]]:
+    """Sums over pixels of |d loss / d mean| per axis: minus the slope of ln alpha along x and y."""
+    a, b, c, d, e = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
+    if rules.exponent == "expanded":
+        by_x, by_y = 2 * a * x + b * y + c, b * x + 2 * d * y + e
+    else:
+        shift = (c, e) if rules.exponent == "squares" else (-(a * c + b * e), -d * e)
+        s, r = a * x + b * y + shift[0], d * y + shift[1]
+        by_x, by_y = 2 * a * s, 2 * (b * s + d * r)
+    return [(slope * by_x).abs().sum(2), (slope * by_y).abs().sum(2)]
+
+
+# -- tables in and out ---------------------------------------------------------------------------------------------
+
+
+def make_rows(
+    table: Float[Tensor, "N F"], places: Int[Tensor, "S K L"], centre: Float[Tensor, "S 2 1 L"], rules: Rules
+) -> Float[Tensor, "S K F L"]:
+    """What blending reads of every entry. `table`: mean x, mean y, u0, u1, u2, ln opacity, channels of every splat.
+
+    The exponent's columns, in tile-centred coordinates, with ln alpha = ln o - ...
+    squares: u0, u1, k0, u2, k1 for (u0 x + u1 y + k0)^2 + (u2 y + k1)^2; direct: u0, u1, mean x, u2, mean y;
+    expanded: the polynomial's coefficients of x^2, x y, x, y^2, y.
+    """
+    columns = [table[places, f] for f in range(table.shape[1])]
+    x, y = columns[0] - centre[:, 0], columns[1] - centre[:, 1]
+    u0, u1, u2, log_opacity = columns[2:TABLE]
+    highest = torch.where(places < table.shape[0] - 1, rules.alpha_max, 0.0).to(table.dtype)
+    k0, k1 = -(u0 * x + u1 * y), -u2 * y
+    if rules.exponent == "squares":
+        head = [u0, u1, k0, u2, k1, log_opacity]
+    elif rules.exponent == "direct":
+        head = [u0, u1, x, u2, y, log_opacity]
+    else:
+        cross = 2 * (u1 * k0 + u2 * k1)
+        head = [u0 * u0, 2 * u0 * u1, 2 * u0 * k0, u1 * u1 + u2 * u2, cross, log_opacity - k0 * k0 - k1 * k1]
+    return torch.stack([*head, highest, *columns[TABLE:]], 2)
+
+
+def entry_gradients(
+    table: Float[Tensor, "N F"],
+    places: Int[Tensor, "S K L"],
+    centre: Float[Tensor, "S 2 1 L"],
+    moments: Float[Tensor, "S K V L"],
+    rules: Rules,
+) -> Float[Tensor, "S K L V"]:
+    """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments."""
+    mean_x, mean_y, u0, u1, u2 = (table[places, f] for f in range(TABLE - 1))
+    x, y = mean_x - centre[:, 0], mean_y - centre[:, 1]
+    k0, k1 = -(u0 * x + u1 * y), -u2 * y
+    one, mx, my, mxx, mxy, myy, *others = moments.unbind(2)
+    by_k0, by_k1 = -2 * (u0 * mx + u1 * my + k0 * one), -2 * (u2 * my + k1 * one)
+    by_u0 = -2 * (u0 * mxx + u1 * mxy + k0 * mx) - x * by_k0
+    by_u1 = -2 * (u0 * mxy + u1 * myy + k0 * my) - y * by_k0
+    by_u2 = -2 * (u2 * myy + k1 * my) - y * by_k1
+    return torch.stack([-u0 * by_k0, -u1 * by_k0 - u2 * by_k1, by_u0, by_u1, by_u2, one, *others], -1)
+
+
+# -- compilation ---------------------------------------------------------------------------------------------------
+
+ONE_LOOP = {
+    "max_fusion_size": 4096,
+    "cpp.max_horizontal_fusion_size": 4096,
+    "cpp.enable_floating_point_contract_flag": "fast",
+    "cpp.dynamic_threads": True,
+}
+"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
+SHARING = {"blend": 30, "fade": 30, "slopes": 50}
+"""Operations after which the compiler shares an intermediate value instead of repeating it; found by trying: fewer
+cuts these loops into several that talk through memory, more multiplies compile times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernels:
+    """The compiled loops of one set of rules."""
+
+    blend: Callable[..., None]
+    fade: Callable[..., Tensor]
+    slopes: Callable[..., tuple[Tensor, Tensor]]
+    moments: Callable[..., Tensor]
+    make_rows: Callable[..., Tensor]
+    entry_gradients: Callable[..., Tensor]
+
+
+@functools.lru_cache
+def kernels(rules: Rules) -> Kernels:
+    """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
+    loops = (blend, fade, slopes, moments, make_rows, entry_gradients)
+    return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
+
+
+def compiled(loop: Callable[..., object], rules: Rules) -> Callable[..., object]:
+    """`loop` of these rules through torch.compile, as code of its own: torch counts compilations by code object."""
+    own = types.FunctionType(loop.__code__.replace(), loop.__globals__, loop.__name__, argdefs=(rules,))
+    sharing = SHARING.get(loop.__name__, 50)
+    options = ONE_LOOP | {"realize_opcount_threshold": sharing, "realize_cpu_opcount_threshold": sharing}
+    return first_size_free(torch.compile(own, fullgraph=True, options=options))
+
+
+def first_size_free(loop: Callable[..., object]) -> Callable[..., object]:
+    """Marks the first size of every large argument as variable at the first call, so that one compilation serves all."""
+
+    def call(*arguments: Tensor | list[Tensor]) -> object:
+        if not marked:
+            marked.append(True)
+            for argument in arguments:
+                for tensor in argument if isinstance(argument, list) else [argument]:
+                    mark(tensor)
+        return loop(*arguments)
+
+    marked: list[bool] = []
+    return call
+
+
+def mark(tensor: Tensor) -> None:
+    """Blocks vary in number, and splats; pixels and products (at most three dimensions ending in one) do not."""
+    if tensor.shape[-1] > 1:
+        torch._dynamo.mark_dynamic(tensor, 0)

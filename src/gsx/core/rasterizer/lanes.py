@@ -1,0 +1,112 @@
+"""Tile lists laid out for compiled loops: 16 tiles of similar length side by side, one in each lane of a register.
+
+A group is L tiles; a block is K list entries of every tile of a group. Blocks lie chunk after chunk: first the first
+K entries of all groups, then the next K of those groups that have more, and so on. Groups are sorted by list length,
+so each chunk is a contiguous slice that begins at the first group. A pixel of a group is a vector of L values, and
+sums over a tile's pixels need no shuffling between lanes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.pairs import Pairs
+from gsx.core.shapes import Float, Int
+
+LANES = 16
+"""Tiles of a group: a 512-bit register of float32."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lanes:
+    """G groups of L tiles and their S blocks."""
+
+    tiles: Int[Tensor, "G L"]
+    """Tile of each lane; T, one past the last, fills the last group up."""
+    entries: Int[Tensor, "S K L"]
+    """Row of the screen splat; M, one past the last, is padding."""
+    groups: Int[Tensor, "S"]
+    """Group of each block."""
+    chunks: Int[Tensor, "S"]
+    """Number of each block within its group, from 0."""
+    active: list[int]
+    """Groups that have each chunk."""
+    bases: list[int]
+    """First block of each chunk."""
+    places: Int[Tensor, "P"]
+    """Entry of each pair, pairs sorted by splat."""
+
+
+def lay_out(pairs: Pairs, splats: int, chunk: int, batch: int) -> Lanes:
+    """Lay the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
+
+    The first two groups of every `batch` groups get equally many chunks (torch specialises on sizes of one).
+    """
+    lengths = pairs.starts.diff()
+    ranks, tiles = rank_tiles(lengths)
+    counts = chunk_counts(lengths, tiles, chunk, batch)
+    active = (len(counts) - counts.bincount().cumsum(0))[:-1]
+    bases = active.cumsum(0) - active
+    places = entry_places(pairs, ranks, bases, chunk)
+    blocks = int(active.sum())
+    entries = places.new_full((blocks * chunk * LANES,), splats, dtype=torch.int32)
+    entries[places] = pairs.splats.int()
+    chunks = torch.repeat_interleave(active)
+    return Lanes(
+        tiles=tiles,
+        entries=entries.view(blocks, chunk, LANES),
+        groups=torch.arange(blocks, device=chunks.device) - bases[chunks],
+        chunks=chunks,
+        active=active.tolist(),
+        bases=bases.tolist(),
+        places=torch.empty_like(places, dtype=torch.int32).index_copy_(0, pairs.slots, places.int()),
+    )
+
+
+def rank_tiles(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "G L"]]:
+    """Rank of every tile by list length, longest first, and the tiles by rank in groups; at least two groups."""
+    order = torch.argsort(lengths, descending=True, stable=True)
+    ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
+    filled = order[: int((lengths > 0).sum())]
+    groups = max(2, -(-len(filled) // LANES))
+    tiles = filled.new_full((groups * LANES,), len(lengths))
+    tiles[: len(filled)] = filled
+    return ranks, tiles.view(groups, LANES)
+
+
+def chunk_counts(lengths: Int[Tensor, "T"], tiles: Int[Tensor, "G L"], chunk: int, batch: int) -> Int[Tensor, "G"]:
+    """Chunks of each group: those of its first, longest list."""
+    longest = torch.cat([lengths, lengths.new_zeros(1)])[tiles[:, 0]].long()
+    counts = (longest + (chunk - 1)) // chunk
+    counts[1::batch] = counts[::batch][: len(counts[1::batch])]
+    return counts
+
+
+def entry_places(pairs: Pairs, ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int) -> Int[Tensor, "P"]:
+    """Place of every pair (sorted by tile) in the flat [S K L] entries."""
+    tiles = pairs.tiles.long()
+    number = torch.arange(len(tiles), device=tiles.device) - pairs.starts[tiles]
+    rank = ranks[tiles]
+    block = bases[number // chunk] + rank // LANES
+    return (block * chunk + number % chunk) * LANES + rank % LANES
+
+
+def centres(lanes: Lanes, grid: TileGrid, like: Tensor) -> Float[Tensor, "S 2 1 L"]:
+    """Middle of the tile of every block's lanes on the frame, px."""
+    positions = grid.centres(lanes.tiles.view(-1), like).view(*lanes.tiles.shape, 2)
+    return positions[lanes.groups].permute(0, 2, 1)[:, :, None].contiguous()
+
+
+def to_lanes(tiles: Float[Tensor, "T C P"], lanes: Lanes) -> list[Float[Tensor, "G P L"]]:
+    """Each channel of a picture cut into tiles, in lanes."""
+    padded = torch.cat([tiles, tiles.new_zeros(1, *tiles.shape[1:])])
+    return list(padded[lanes.tiles].permute(2, 0, 3, 1).contiguous().unbind(0))
+
+
+def from_lanes(channels: list[Float[Tensor, "G P L"]], lanes: Lanes, count: int) -> Float[Tensor, "T P C"]:
+    """Tiles of a picture from channels in lanes; tiles without a list are zero."""
+    values = torch.stack(channels, 3).permute(0, 2, 1, 3)
+    picture = values.new_zeros(count + 1, values.shape[2], values.shape[3])
+    return picture.index_copy_(0, lanes.tiles.view(-1), values.flatten(0, 1))[:count]

@@ -1,0 +1,147 @@
+"""Pictures of any size under a memory cap: rendered window by window, without gradient, gathered on the CPU."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.errors import InputError, TooManyPairs
+from gsx.core.rasterizer.render import Rendering, rasterize
+from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
+from gsx.core.shapes import Bool, Float
+from gsx.core.splats import Splats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Part of a raster, px."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the raster."""
+        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+
+    def halves(self, unit: int) -> tuple["Window", "Window"]:
+        """Two windows, cut across the longer side a multiple of `unit` px from its beginning."""
+        if self.width >= self.height:
+            cut = cut_of(self.width, unit)
+            parts = (0, 0, cut, self.height), (cut, 0, self.width - cut, self.height)
+        else:
+            cut = cut_of(self.height, unit)
+            parts = (0, 0, self.width, cut), (0, cut, self.width, self.height - cut)
+        first, second = (
+            Window(left=self.left + x, top=self.top + y, width=width, height=height) for x, y, width, height in parts
+        )
+        return first, second
+
+
+def cut_of(size: int, unit: int) -> int:
+    """The multiple of `unit` nearest half of `size`, inside it."""
+    return max(1, round(size / 2 / unit)) * unit
+
+
+def windows(width: int, height: int, pixels: int, unit: int) -> Iterator[Window]:
+    """Squares of at most `pixels` px (but at least one unit) that cover a raster, edges at multiples of `unit` px."""
+    edge = max(1, math.isqrt(pixels) // unit) * unit
+    for top in range(0, height, edge):
+        for left in range(0, width, edge):
+            yield Window(left=left, top=top, width=min(edge, width - left), height=min(edge, height - top))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mosaic:
+    """A picture gathered from pieces; its tensors are on the CPU and have no gradient."""
+
+    image: Float[Tensor, "C H W"]
+    """Blended colours over the background; not clamped."""
+    alpha: Float[Tensor, "H W"]
+    """Coverage in [0, 1]."""
+    depth: Float[Tensor, "H W"] | None
+    """Blending-weighted sum of camera z, scene units; None unless asked for."""
+    visible: Bool[Tensor, "N"]
+    """Splats with a radius on the whole raster."""
+    dropped: int
+    """Splats left out because a value of theirs is not finite."""
+    pieces: int
+    """Windows rendered."""
+
+    @staticmethod
+    def empty(splats: Splats, camera: Camera, depth: bool) -> "Mosaic":
+        """Room for the picture."""
+        raster, like = (camera.height, camera.width), splats.colours.new_empty(0, device="cpu")
+        return Mosaic(
+            image=like.new_empty(splats.colours.shape[1], *raster),
+            alpha=like.new_empty(raster),
+            depth=like.new_empty(raster) if depth else None,
+            visible=torch.zeros(len(splats), dtype=torch.bool),
+            dropped=0,
+            pieces=0,
+        )
+
+    def put(self, window: Window, part: Rendering) -> None:
+        """Write one piece into its place."""
+        rows, columns = window.pixels
+        self.image[:, rows, columns] = part.image.cpu()
+        self.alpha[rows, columns] = part.alpha.cpu()
+        if self.depth is not None and part.depth is not None:
+            self.depth[rows, columns] = part.depth.cpu()
+        self.visible[part.screen.ids[part.screen.visible].cpu()] = True
+
+
+def renderings(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    window: Window,
+    background: Float[Tensor, "C"] | None,
+    depth: bool,
+) -> Iterator[tuple[Window, Rendering]]:
+    """The window's rendering, or those of its halves where it needs too many pairs, and so on down to one tile."""
+    unit = max(WINDOW_TILE, settings.tile_size)
+    crop = camera.crop(window.left, window.top, window.width, window.height)
+    try:
+        part = rasterize(splats, crop, settings, background=background, depth=depth)
+    except TooManyPairs:
+        if max(window.width, window.height) <= unit:
+            raise
+    else:
+        yield window, part
+        return
+    for half in window.halves(unit):
+        yield from renderings(splats, camera, settings, half, background, depth)
+
+
+@torch.no_grad()
+def rasterize_pieces(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    background: Float[Tensor, "C"] | None = None,
+    depth: bool = False,
+    pixels: int = 1 << 20,
+) -> Mosaic:
+    """What `rasterize` would draw, bit for bit, in windows of at most `pixels` px (but at least a tile).
+
+    Beyond the result, memory grows with `pixels` and with the pairs of one window, not with the raster. Windows that
+    need more than `settings.max_pairs` pairs are halved until they do not.
+
+    Raises:
+        InputError: a single tile needs more pairs than `settings.max_pairs`, or `pixels` is not positive.
+    """
+    if pixels < 1:
+        raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {1 << 20}")
+    mosaic, count, dropped = Mosaic.empty(splats, camera, depth), 0, 0
+    for window in windows(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
+        for place, part in renderings(splats, camera, settings, window, background, depth):
+            mosaic.put(place, part)
+            count, dropped = count + 1, part.dropped
+    return replace(mosaic, pieces=count, dropped=dropped)

@@ -1,0 +1,155 @@
+"""The compiled path draws what the float64 truth draws, forward and backward, by both schedules; and it stays compiled."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
+
+from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer.compiled import available, takes
+from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial
+from gsx.core.rasterizer.scan import parts
+from gsx.core.splats import Splats
+
+pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
+
+QUICK = RasterSettings(cull="tight", path="compiled", unrolled=2)
+"""Two splats unrolled: the loops compile several times faster."""
+
+
+def opaque(count: int, seed: int) -> Splats:
+    """Large opaque splats: pixels and whole groups of tiles end early."""
+    splats = random_splats(count, seed=seed, size=0.5)
+    return changed(splats, log_opacities=splats.log_opacities / 30)
+
+
+@pytest.mark.parametrize("schedule", ["chunks", "segments"])
+@pytest.mark.parametrize("scene", ["mixed", "opaque", "single"])
+def test_picture_and_gradient_are_those_of_the_truth(schedule: str, scene: str) -> None:
+    splats = {"mixed": random_splats(300, seed=4), "opaque": opaque(400, 5), "single": random_splats(1, seed=1)}[scene]
+    rules = replace(QUICK, schedule=schedule)
+    errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
+    assert errors.largest <= 1e-5
+    assert errors.gradient <= 1e-4
+
+
+def test_the_shipped_number_of_unrolled_splats() -> None:
+    rules = replace(QUICK, unrolled=RasterSettings().unrolled, cull="published")
+    splats = random_splats(300, seed=7)
+    errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
+    assert errors.largest <= 1e-5
+    assert errors.gradient <= 1e-4
+
+
+@pytest.mark.parametrize("form", ["direct", "expanded"])
+def test_other_forms_of_the_exponent(form: str) -> None:
+    rules, splats = replace(QUICK, exponent=form), random_splats(200, seed=8)
+    errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
+    assert errors.largest <= 2e-5
+    assert errors.gradient <= 2e-4
+
+
+def test_float64_splats_are_drawn_in_float64() -> None:
+    wide = changed(random_splats(150, seed=9), dtype=torch.float64)
+    errors = errors_of(wide, front_camera(), QUICK, truth_of(wide, front_camera(), QUICK))
+    assert errors.largest <= 1e-12
+    assert errors.gradient <= 1e-10
+
+
+def test_absolute_gradient_is_that_of_the_eager_path() -> None:
+    def probe(rules: RasterSettings) -> torch.Tensor:
+        rendering = rasterize(leaves(random_splats(200, seed=3)), front_camera(), rules, absolute_gradient=True)
+        weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
+        (rendering.image * weights).sum().backward()
+        assert rendering.screen.probe is not None and rendering.screen.probe.grad is not None
+        return rendering.screen.probe.grad
+
+    eager, compiled = probe(replace(QUICK, path="eager")), probe(QUICK)
+    assert eager.abs().sum() > 0
+    assert (compiled - eager).norm() <= 1e-5 * eager.norm()
+
+
+def test_a_crop_is_the_crop_of_the_picture() -> None:
+    splats, camera = random_splats(300, seed=4), front_camera()
+    whole = rasterize(splats, camera, QUICK).image
+    part = rasterize(splats, camera.crop(8, 16, 24, 16), QUICK).image
+    assert torch.equal(part, whole[:, 16:32, 8:32])
+
+
+def test_two_runs_give_the_same_bits() -> None:
+    (first, ones), (second, others) = (render_with_gradients(opaque(400, 5), front_camera(), QUICK) for _ in range(2))
+    assert torch.equal(first.image, second.image)
+    assert all(torch.equal(ones[name], others[name]) for name in ones)
+
+
+def test_nothing_compiles_anew_in_steady_state() -> None:
+    def draw(count: int, seed: int, schedule: str) -> None:
+        render_with_gradients(random_splats(count, seed=seed), front_camera(), replace(QUICK, schedule=schedule))
+        render_with_gradients(opaque(count, seed), front_camera(), replace(QUICK, schedule=schedule))
+
+    for schedule in ("chunks", "segments"):
+        draw(400, 5, schedule)
+    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    assert before > 0
+    for count in (1, 40, 397, 700, 1500):
+        for schedule in ("chunks", "segments"):
+            draw(count, count, schedule)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
+
+
+@pytest.mark.parametrize("alpha_min", [0.05, 1 / 255, 1e-3, 1e-6])
+def test_the_polynomial_is_exp_where_it_counts(alpha_min: float) -> None:
+    least = float(torch.tensor(alpha_min).log())
+    powers, squarings = exp_polynomial(least)
+    x = torch.linspace(least, EXP_TOP, 10_000, dtype=torch.float64)
+    value = sum(power * x**i for i, power in enumerate(powers)) ** (2**squarings)
+    assert (value / x.exp() - 1).abs().max() < 3e-7
+
+
+def test_parts_cover_everything_and_none_is_single() -> None:
+    for total, size in [(1, 4), (2, 4), (5, 4), (8, 4), (9, 4), (100, 7), (99, 7)]:
+        slices = parts(total, size)
+        assert [i for part in slices for i in range(total)[part]] == list(range(total))
+        assert total == 1 or all(part.stop - part.start > 1 for part in slices)
+
+
+def test_what_goes_the_eager_way() -> None:
+    assert takes(QUICK, 3, 10, False, "cpu")
+    for refused in [
+        takes(replace(QUICK, path="eager"), 3, 10, False, "cpu"),
+        takes(replace(QUICK, path="auto"), 3, 10, False, "cpu"),
+        takes(replace(QUICK, accumulation="bfloat16"), 3, 10, False, "cpu"),
+        takes(QUICK, 9, 10, False, "cpu"),
+        takes(QUICK, 3, 0, False, "cpu"),
+        takes(QUICK, 3, 10, True, "cpu"),
+    ]:
+        assert not refused
+
+
+BROKEN = """
+import torch
+from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer.prepare import prepare, warm_splats
+from gsx.core.camera import look_at
+import logging
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=32, height=32)
+splats = warm_splats(torch.device("cpu"))
+pictures = [rasterize(splats, camera, RasterSettings(path=path)).image for path in ("compiled", "compiled", "eager")]
+assert torch.equal(pictures[0], pictures[2]) and torch.equal(pictures[1], pictures[2])
+assert prepare(RasterSettings(path="auto"), 10_000, torch.device("cpu")).path == "eager"
+"""
+
+
+def test_without_a_compiler_one_warning_and_the_eager_picture(tmp_path) -> None:
+    wrong = {"CXX": str(tmp_path / "no-such-compiler"), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", BROKEN], env=os.environ | wrong, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("nothing can be compiled here") == 1
+    assert "rasterizer: eager path (no working compiler" in done.stderr

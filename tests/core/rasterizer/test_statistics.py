@@ -1,0 +1,64 @@
+"""The absolute gradient against per-pixel Jacobians of the truth, and sums that come out the same every time."""
+
+import pytest
+import torch
+from raster_scenes import changed, front_camera, leaves, random_splats, run_script
+
+from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer.reference import alpha_maps, frame_pixels
+from gsx.core.splats import Splats
+
+
+def brute_force(
+    splats: Splats, rules: RasterSettings, weights: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(gradient of every screen mean, its absolute values added up over pixels, rows), from the reference's alphas.
+
+    The derivative of a splat's alpha by its mean is minus that by the pixel's position.
+    """
+    camera = front_camera()
+    xy = frame_pixels(camera).requires_grad_()
+    alpha, rows = alpha_maps(splats, camera, rules, xy)
+    by_mean = torch.stack([-torch.autograd.grad(map.sum(), xy, retain_graph=True)[0] for map in alpha])
+    live = alpha.detach().requires_grad_()
+    after = torch.cumprod(1 - live, 0)
+    weight = live * torch.cat([torch.ones_like(after[:1]), after[:-1]]) * (after >= rules.transmittance_stop)
+    (torch.einsum("nhw,nc->chw", weight, splats.colours[rows]) * weights).sum().backward()
+    terms = live.grad[..., None] * by_mean
+    return terms.sum((1, 2)), terms.abs().sum((1, 2)), rows
+
+
+@pytest.mark.parametrize("exponent", ["squares", "direct", "expanded"])
+@pytest.mark.parametrize("seed", range(3))
+def test_absolute_gradient_is_that_of_every_pixel_of_the_truth(seed: int, exponent: str) -> None:
+    splats, rules = changed(random_splats(60, seed), dtype=torch.float64), RasterSettings(cull="tight")
+    weights = torch.randn(3, 52, 70, generator=torch.Generator().manual_seed(seed)).double()
+    signed, absolute, rows = brute_force(splats, rules, weights)
+    rules = RasterSettings(cull="tight", exponent=exponent)
+    rendering = rasterize(leaves(splats), front_camera(), rules, absolute_gradient=True)
+    (rendering.image * weights).sum().backward()
+    screen = rendering.screen
+    truth = torch.zeros(2, len(splats), 2, dtype=torch.float64)
+    truth[:, rows] = torch.stack([signed, absolute])
+    assert torch.allclose(screen.shift.grad, truth[0, screen.ids], rtol=1e-9, atol=1e-10)
+    assert torch.allclose(screen.probe.grad, truth[1, screen.ids], rtol=1e-9, atol=1e-10)
+    assert float(screen.probe.grad.sum()) > 3 * float(screen.shift.grad.abs().sum())  # the two do differ
+
+
+REPEATED = """
+import hashlib, json, sys, torch
+from raster_scenes import front_camera, random_splats, render_with_gradients
+from gsx.core.rasterizer import RasterSettings
+torch.set_num_threads(int(sys.argv[1]))
+def bits():
+    rendering, found = render_with_gradients(random_splats(800), front_camera(160, 120), RasterSettings())
+    values = [rendering.image.detach(), *found.values()]
+    return [hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest() for value in values]
+print(json.dumps([bits() for _ in range(2)]))
+"""
+
+
+def test_pictures_and_gradients_are_the_same_bits_in_every_run_with_one_thread_and_with_two() -> None:
+    for threads in ("1", "2"):
+        first, *others = [run for _ in range(2) for run in run_script(REPEATED, threads)]  # in two processes
+        assert all(other == first for other in others), threads

@@ -1,0 +1,289 @@
+"""The benchmarks on tiny sizes: that they measure what they say, on yardsticks that are right themselves."""
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import rasterizer as benchmark
+from gsx.core.rasterizer.projection import project
+from gsx.core.rasterizer.reference import render_reference
+from measuring import naive, rival
+from measuring.adapter import settings_of
+from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, splats_of
+from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, backward_bytes, evaluation_limit, forward_bytes
+from measuring.memory import HostPeaks, peak_memory, unmeasurable
+from measuring.prototype import factors_of
+from measuring.results import cell, merged, scaling_plot
+from measuring.scaling import growth
+from measuring.watches import LEAST, Patience, Watch, take_turns
+
+CPU = torch.device("cpu")
+CASE = Case(splats=60, width=43, height=30)
+
+
+def run(folder: Path, *words: str) -> int:
+    return benchmark.main(["--quick", "--paths", "eager", "--no-memory", "--to", str(folder), *words])
+
+
+def results(folder: Path) -> dict:
+    return json.loads((folder / "rasterizer_cpu_quick.json").read_text())
+
+
+def test_naive_loop_draws_the_truth_and_its_gradient() -> None:
+    settings = settings_of("eager", "rasterizer.cull=tight")
+    splats, truth = splats_of(CASE, CPU), splats_of(CASE, CPU)
+    camera, gradient = camera_of(CASE), gradient_of(CASE, CPU)
+    image = naive.render(project(splats, camera, settings), camera, settings)
+    reference = render_reference(truth, camera, settings)[0]
+    assert torch.allclose(image.double(), reference, atol=1e-5)
+    image.backward(gradient)
+    reference.backward(gradient.double())
+    for name, leaf in vars(splats).items():
+        other = getattr(truth, name).grad
+        assert torch.allclose(leaf.grad, other, rtol=1e-3, atol=1e-4 * float(other.abs().max())), name
+
+
+def test_cases_are_the_same_each_time_and_lie_on_the_raster() -> None:
+    one, two = splats_of(CASE, CPU), splats_of(CASE, CPU)
+    assert all(torch.equal(value, getattr(two, name)) for name, value in vars(one).items())
+    places, depths = camera_of(CASE).project(one.means.detach())
+    assert bool(((places >= 0) & (places <= torch.tensor([43.0, 30.0]))).all())
+    assert 1 <= float(depths.min()) < float(depths.max()) <= 11
+    pixels = one.scales.detach() / depths[:, None] * 43
+    assert 0.4999 < float(pixels.min()) < 0.8
+    assert 4 < float(pixels.max()) < 6.001
+
+
+def test_pairs_are_those_of_the_picture() -> None:
+    from gsx.core.rasterizer import rasterize
+
+    settings = settings_of("eager")
+    assert pairs_of(CASE, CPU, settings) == rasterize(splats_of(CASE, CPU), camera_of(CASE), settings).pairs
+
+
+def test_rivals_take_turns_after_one_call_each() -> None:
+    calls: list[str] = []
+
+    def job(name: str):
+        def work(watch: Watch) -> None:
+            watch.begin()
+            calls.append(name)
+            watch.lap("only")
+
+        return work
+
+    timings = take_turns({"a": job("a"), "b": job("b")}, CPU, Patience(5, 100.0))
+    assert calls == ["a", "b"] * 6
+    assert len(timings["a"].rounds) == 5
+    calls.clear()
+    take_turns({"a": job("a")}, CPU, Patience(50, 0.0))
+    assert len(calls) == 1 + LEAST
+
+
+def test_memory_traffic_and_operations_by_hand() -> None:
+    # splat: 14 numbers in, 9 out; pair: 4 times 8 bytes and 9 numbers; pixel: 4 numbers
+    assert forward_bytes(1, 0, 0) == 92
+    assert forward_bytes(0, 1, 0) == 68
+    assert forward_bytes(2, 3, 5) == 2 * 92 + 3 * 68 + 5 * 16
+    assert backward_bytes(2, 3, 5) == 2 * 184 + 3 * 112 + 5 * 32
+    assert (sum(FORWARD_FLOPS.values()), sum(BACKWARD_FLOPS.values())) == (22, 50)
+    # 1 ns for the exponential and 22 operations at 11 a nanosecond: 3 ns
+    rates = [Limit("a", 1e9, "exp/s"), Limit("b", 5e8, "exp/s"), Limit("c", 11e9, "flop/s")]
+    assert evaluation_limit(rates, 22) == pytest.approx(1e9 / 3)
+
+
+@pytest.mark.skipif(bool(unmeasurable(CPU)), reason=unmeasurable(CPU))
+def test_peaks_are_those_of_the_phase() -> None:
+    watch = HostPeaks()
+    watch.begin()
+    kept = torch.ones(5_000_000)
+    torch.ones(10_000_000)
+    watch.lap("first")
+    torch.ones(2_500_000)
+    watch.lap("second")
+    assert watch.phases["first"] == pytest.approx(60e6, rel=0.05)
+    assert watch.phases["second"] == pytest.approx(30e6, rel=0.05)
+    assert len(kept)
+
+
+@pytest.mark.skipif(bool(unmeasurable(CPU)), reason=unmeasurable(CPU))
+def test_peak_memory_of_a_process_of_its_own() -> None:
+    case = Case(splats=2000, width=648, height=420)
+    peaks = peak_memory("eager", case, CPU, settings_of("eager"))
+    picture_mb = 648 * 420 * 4 * 4 / 1e6  # three channels and coverage
+    assert picture_mb < peaks["forward"] < 40 * picture_mb
+    assert peaks["whole"] > peaks["backward"] > picture_mb
+
+
+def test_every_section_runs_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tmp_path, "--only", "limits,splats,step,gpu") == 0
+    found = results(tmp_path)
+    rows = {name: section["rows"] for name, section in found["sections"].items()}
+    assert list(rows) == ["limits", "splats", "step", "gpu"]
+    assert {row["path"] for row in rows["splats"]} == {"eager", "naive"}
+    eager, loop = rows["splats"][:2]
+    assert eager["naive_ratio"] == pytest.approx(loop["total_ms"] / eager["total_ms"])
+    assert eager["forward_rate"] == pytest.approx(eager["pairs"] * 64 / eager["forward_ms"] / 1e3)
+    assert all(row["forward_share"] > 0 for row in rows["gpu"])
+    assert rows["step"][0]["steps"] == 2
+    page = (tmp_path / "rasterizer_cpu_quick.md").read_text()
+    assert "rasterizer_cpu_quick.svg" in page
+    assert (tmp_path / "rasterizer_cpu_quick.svg").read_text().count("<polyline") == 3
+    assert "--to " + tmp_path.name in page
+    assert str(tmp_path.parent) not in page + json.dumps(found)
+    assert "gsplat: not runnable here" in capsys.readouterr().out
+
+
+def test_sections_of_earlier_runs_stay_on_the_same_machine(tmp_path: Path) -> None:
+    assert run(tmp_path, "--only", "tile") == 0
+    assert run(tmp_path, "--only", "overlap") == 0
+    found = results(tmp_path)
+    assert list(found["sections"]) == ["tile", "overlap"]
+    other = merged(tmp_path / "rasterizer_cpu_quick.json", found["machine"] | {"cpu": "another"}, {"step": {}})
+    assert list(other["sections"]) == ["step"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--only", "splat"], "Did you mean 'splats'?"),
+        (["--paths", "fast"], "--paths has no 'fast'"),
+        (["--only", "prototype"], "needs --prototype FILE"),
+        (["--only", "prototype", "--prototype", "nowhere.py"], "is no Python file"),
+        (["--repeats", "0"], "must be at least 1"),
+    ],
+)
+def test_mistakes_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    assert benchmark.main(["--quick", "--paths", "eager", "--to", str(tmp_path), *words]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_gsplat_is_not_measured_without_a_gpu() -> None:
+    assert "CUDA" in rival.missing(CPU)
+
+
+def test_gsplat_is_asked_for_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    splats, camera, asked = splats_of(CASE, CPU), camera_of(CASE).crop(5, -3, 20, 10), {}
+
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **rest):
+        seen = means @ viewmats[0, :3, :3].T + viewmats[0, :3, 3]
+        asked.update(rest, places=(seen @ Ks[0].T)[:, :2] / seen[:, 2:], opacities=opacities)
+        return torch.zeros(1, height, width, 3), None, {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    image = rival.render(splats, camera, settings_of("eager", "rasterizer.dilation=0.4"))
+    assert image.shape == (3, 10, 20)
+    assert torch.allclose(asked["places"], camera.project(splats.means)[0], atol=1e-4)
+    assert torch.equal(asked["opacities"], splats.log_opacities.exp())
+    assert (asked["near_plane"], asked["eps2d"]) == (camera.near, 0.4)
+
+
+def test_growth_compares_time_per_pair() -> None:
+    def row(splats: int, pairs: int, total: float) -> dict:
+        return {"path": "eager", "raster": "8x8", "splats": splats, "pairs": pairs, "total_ms": total}
+
+    # 1 ms a pair at 10 k splats, 1.5 ms at 1 M; the smallest case does not count
+    text = growth([row(100, 7, 700.0), row(10_000, 50, 50.0), row(100_000, 400, 500.0), row(1_000_000, 4000, 6000.0)])
+    assert text.endswith("eager 8x8: 1.50.")
+
+
+def test_cells_have_three_digits() -> None:
+    assert [cell(v) for v in (None, "a", 1234567, 1234.5, 12.345, 0.12345, 0.0)] == [
+        "", "a", "1,234,567", "1,234", "12.3", "0.123", "0",
+    ]  # fmt: skip
+
+
+def test_plot_needs_two_points_of_a_curve() -> None:
+    def row(pairs: int, raster: str = "8x8") -> dict:
+        return {"path": "compiled", "raster": raster, "pairs": pairs, "total_ms": 2.0 * pairs}
+
+    assert not scaling_plot([row(10), row(10, "9x9")])
+    assert scaling_plot([row(10), row(1000)]).count("<circle") == 2
+
+
+# -- prototype -----------------------------------------------------------------------------------------------------
+
+
+def test_factors_are_half_the_inverse_covariance() -> None:
+    u0, u1, u2 = factors_of(torch.tensor([[4.0, 1.5, 2.0]], dtype=torch.float64))[0]
+    upper = torch.stack([torch.stack([u0, u1]), torch.stack([u2 * 0, u2])])
+    covariance = torch.tensor([[4.0, 1.5], [1.5, 2.0]], dtype=torch.float64)
+    assert torch.allclose(upper.T @ upper, torch.linalg.inv(covariance) / 2)
+
+
+STAND_IN = """
+import torch
+from measuring import naive
+from measuring.adapter import learnable, settings_of, to_raster, to_tiles
+from measuring.prototype import flat_camera, screen_of
+
+W, H = 40, 24
+CAMERA = flat_camera(W, H)
+
+
+def random_splats(n):
+    draw = torch.Generator().manual_seed(0)
+    covariance = torch.tensor([[3.0, 0.5, 2.0]]).repeat(n, 1)
+    means = torch.rand(n, 2, generator=draw) * torch.tensor([W, H])
+    return means, covariance, torch.full((n,), 0.05), torch.rand(n, 3, generator=draw), torch.rand(n, generator=draw)
+
+
+class Prototype:
+    # the interface of the prototype, one "pair" for each splat
+    def __init__(self, splats, tile):
+        self.screen, self.order = screen_of(*splats)
+        self.tile, self.splat = tile, self.order
+
+    def pair(self):
+        self.screen = learnable(self.screen)
+
+    def gather(self):
+        pass
+
+    def forward(self):
+        self.picture = naive.render(self.screen, CAMERA, settings_of("eager", "rasterizer.cull=tight"))
+        self.image = to_tiles(self.picture.detach(), CAMERA, self.tile) + OFFSET
+        self.T = torch.ones_like(self.image[..., 0])
+
+    def backward(self, gradient):
+        seen = to_raster(gradient, CAMERA, self.tile)
+        return None, torch.autograd.grad(self.picture, [self.screen.channels], seen, retain_graph=True)[0]
+
+
+def measure(n, tile, repeats):
+    return {"total": 1.0}
+"""
+
+
+def stand_in(folder: Path, offset: float) -> str:
+    path = folder / "stand_in.py"
+    path.write_text(STAND_IN.replace("OFFSET", str(offset)))
+    return str(path)
+
+
+def test_prototype_is_timed_on_the_same_splats(tmp_path: Path) -> None:
+    assert run(tmp_path, "--only", "prototype", "--prototype", stand_in(tmp_path, 0.0)) == 0
+    section = results(tmp_path)["sections"]["prototype"]
+    prototype, eager = section["rows"]
+    phases = ("pair_ms", "forward_ms", "backward_ms")
+    assert eager["total_ms"] == pytest.approx(sum(eager[phase] for phase in phases), rel=0.5)
+    assert eager["share"] == pytest.approx(eager["total_ms"] / prototype["total_ms"])
+    assert float(section["notes"][1].split("colours to ")[1].split(" ")[0]) < 1e-5
+
+
+def test_another_picture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tmp_path, "--only", "prototype", "--prototype", stand_in(tmp_path, 2e-4)) == 2
+    assert "draw different pictures" in capsys.readouterr().err
+
+
+def test_eager_path_draws_what_the_naive_loop_draws() -> None:
+    settings, camera = settings_of("eager", "rasterizer.cull=tight"), camera_of(CASE)
+    with torch.no_grad():
+        pictures = [picture(path, splats_of(CASE, CPU), camera, settings) for path in ("eager", "naive")]
+    assert torch.allclose(*pictures, atol=1e-5)
