@@ -244,7 +244,7 @@ def verb_resume(words: list[str]) -> int:
 
     folder, overrides = run_words("resume", words)
     loaded = plugins()
-    run, settings = open_run(folder, loaded, overrides)
+    run, settings = open_run(folder, loaded, overrides, training=True)
     if run.complete and (folder / "evaluation.json").is_file():
         raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
     write_config(folder / "config.yaml", settings.resolved)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core import checkpoint
 from gsx.core.backbone import Beginning
+from gsx.core.cache import cache_root
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.errors import ConfigError, InputError, TrainingError
@@ -31,7 +32,7 @@ from gsx.core.orbit import orbit_cameras, write_animation
 from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.progress import MetricsLog, Progress, read_curves
-from gsx.core.rasterizer.prepare import prepare
+from gsx.core.rasterizer.prepare import compiler, decide, warm
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.scene import Scene
@@ -98,19 +99,27 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
     raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
-def build(settings: Settings, scene: Scene, folder: Path) -> Run:
-    """Everything of a run in memory, at step 0."""
+def build(settings: Settings, scene: Scene, folder: Path, training: bool = False) -> Run:
+    """Everything of a run in memory, at step 0; `training` decides what path=auto of the rasterizer means."""
     general = settings.general
     device = choose_device(general.device)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
-    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, generator=generator)
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
+    raster = decide(settings.raster, general.iterations, device) if training else settings.raster
+    beginning = Beginning(
+        scene=scene,
+        iterations=general.iterations,
+        device=device,
+        generator=generator,
+        compile=compiler(raster, device),
+    )
     return Run(
         config=settings.resolved,
         folder=folder,
         scene=scene,
         backbone=settings.backbone.component.factory(settings.backbone.options, beginning),
-        raster=settings.raster,
+        raster=raster,
         training=settings.training,
         iterations=general.iterations,
         device=device,
@@ -128,6 +137,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
+        "rasterizer": run.raster.path,
         "device": torch.cuda.get_device_name(run.device)
         if run.device.type == "cuda"
         else platform.processor() or "cpu",
@@ -197,7 +207,7 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     choose_device(settings.general.device)
     refuse_used(settings.general.folder)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
-    run = build(settings, load_scene(settings), Path())
+    run = build(settings, load_scene(settings), Path(), training=True)
     run.folder = new_folder(settings, run.scene)
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
@@ -208,8 +218,10 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     return run
 
 
-def open_run(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> tuple[Run, Settings]:
-    """A run as its newest checkpoint left it.
+def open_run(
+    folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False
+) -> tuple[Run, Settings]:
+    """A run as its newest checkpoint left it; `training`: it is about to go on.
 
     Raises:
         InputError: the folder is no run.
@@ -218,7 +230,7 @@ def open_run(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> t
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
     settings = read_config(folder / "config.yaml", plugins, overrides)
-    run = build(settings, load_scene(settings), folder)
+    run = build(settings, load_scene(settings), folder, training)
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     return run, settings
@@ -232,7 +244,7 @@ def status(run: Run, state: str, reason: str = "") -> None:
 def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint."""
     announce(run, plugins)
-    run.raster = prepare(run.raster, run.iterations, run.device)
+    warm(run.raster, run.device)
     status(run, "running")
     listeners = (Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress())
     try:

@@ -15,7 +15,8 @@ from gsx.core.config import compose
 from gsx.core.errors import GsxError, InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.compiled import available, complaint, takes
+from gsx.core.rasterizer.available import available, complaint
+from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
 from gsx.core.splats import Splats

@@ -1,4 +1,4 @@
-"""The compiled path draws what the float64 truth draws, forward and backward, by both schedules; and it stays compiled."""
+"""The compiled path draws what the float64 truth draws, forward and backward, by both schedules; it stays compiled."""
 
 import os
 import subprocess
@@ -65,7 +65,8 @@ def test_absolute_gradient_is_that_of_the_eager_path() -> None:
         rendering = rasterize(leaves(random_splats(200, seed=3)), front_camera(), rules, absolute_gradient=True)
         weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
         (rendering.image * weights).sum().backward()
-        assert rendering.screen.probe is not None and rendering.screen.probe.grad is not None
+        assert rendering.screen.probe is not None
+        assert rendering.screen.probe.grad is not None
         return rendering.screen.probe.grad
 
     eager, compiled = probe(replace(QUICK, path="eager")), probe(QUICK)

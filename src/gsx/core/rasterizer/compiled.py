@@ -5,14 +5,13 @@ have all ended leave. `segments`: the share of light that passes each block firs
 transmittance before every block; then all blocks at once. On the way back the scan runs from behind.
 """
 
-import functools
-import logging
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from gsx.core.rasterizer.available import available, warn_once
 from gsx.core.rasterizer.composite import NOTHING
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
@@ -22,8 +21,6 @@ from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-
-logger = logging.getLogger(__name__)
 
 MOST_CHANNELS = 8
 """Channels are unrolled: beyond this number compilation takes longer than it saves."""
@@ -330,32 +327,7 @@ def composite_compiled(
     return CompiledComposite.apply(means, factors, log_opacities, channels, probe, pairs, job)
 
 
-# -- is it there? --------------------------------------------------------------------------------------------------
-
-
-@functools.lru_cache
-def complaint(device: str) -> str:
-    """Why nothing can be compiled for this device; empty where it can. Asked by compiling two operations."""
-    try:
-        torch.compile(lambda x: 2 * x + 1, fullgraph=True)(torch.zeros(32, device=device))
-    except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
-        return (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return ""
-
-
-def available(device: str = "cpu") -> bool:
-    """Whether the compiled path works on this machine."""
-    return not complaint(device)
-
-
-@functools.lru_cache
-def warn_once(device: str) -> None:
-    """Say why the eager path is taken instead."""
-    logger.warning(
-        "rasterizer.path=compiled: nothing can be compiled here (%s); going on with the eager path, which is several "
-        "times slower. Install a C++ compiler (g++ or clang++), or choose rasterizer=eager",
-        complaint(device),
-    )
+# -- when? --------------------------------------------------------------------------------------------------------
 
 
 def takes(settings: RasterSettings, channels: int, pairs: int, max_weight: bool, device: str) -> bool:

@@ -10,11 +10,11 @@ import math
 import types
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
 
 TABLE = 6
@@ -22,7 +22,7 @@ TABLE = 6
 ROW = 7
 """Columns of a row before its channels: five of its exponent, ln opacity, and where alpha is clamped."""
 EXP_DEGREE = 7
-"""Degree of the polynomial for exp on a quarter (eighth, ...) of its range: relative error below 1e-7 before rounding."""
+"""Degree of the polynomial for exp on a quarter (eighth, ...) of its range: relative error < 3e-7 but for rounding."""
 EXP_TOP = 0.02
 """Exponents are at most 0 but for rounding."""
 
@@ -273,7 +273,7 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-ONE_LOOP = {
+ONE_LOOP: dict[str, str | int | bool] = {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
     "cpp.enable_floating_point_contract_flag": "fast",
@@ -304,18 +304,21 @@ def kernels(rules: Rules) -> Kernels:
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 
-def compiled(loop: Callable[..., object], rules: Rules) -> Callable[..., object]:
-    """`loop` of these rules through torch.compile, as code of its own: torch counts compilations by code object."""
+def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
+    """`loop` of these rules through torch.compile, as code of its own: torch counts compilations by code."""
     own = types.FunctionType(loop.__code__.replace(), loop.__globals__, loop.__name__, argdefs=(rules,))
     sharing = SHARING.get(loop.__name__, 50)
-    options = ONE_LOOP | {"realize_opcount_threshold": sharing, "realize_cpu_opcount_threshold": sharing}
+    options: dict[str, Any] = ONE_LOOP | {
+        "realize_opcount_threshold": sharing,
+        "realize_cpu_opcount_threshold": sharing,
+    }
     return first_size_free(torch.compile(own, fullgraph=True, options=options))
 
 
-def first_size_free(loop: Callable[..., object]) -> Callable[..., object]:
-    """Marks the first size of every large argument as variable at the first call, so that one compilation serves all."""
+def first_size_free(loop: Callable[..., Any]) -> Callable[..., Any]:
+    """Marks the first size of large arguments as variable at the first call, so that one compilation serves all."""
 
-    def call(*arguments: Tensor | list[Tensor]) -> object:
+    def call(*arguments: Tensor | list[Tensor]) -> Any:
         if not marked:
             marked.append(True)
             for argument in arguments:

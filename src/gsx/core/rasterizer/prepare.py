@@ -2,12 +2,13 @@
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
 from gsx.core.camera import look_at
-from gsx.core.rasterizer.compiled import available
+from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.render import rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.splats import Splats
@@ -18,18 +19,30 @@ WARM_SPLATS, WARM_SIZE = 2000, 128
 """Of the picture that has everything compiled: lists of several chunks in several groups."""
 
 
-def prepare(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
-    """Settings for a run of `steps`: `auto` decided, and the compiled path compiled, with a word about it."""
-    if settings.path == "auto":
-        long_enough = steps >= settings.auto_steps
-        chosen = "compiled" if long_enough and available(device.type) else "eager"
-        reason = f"{steps} steps" if available(device.type) or not long_enough else "no working compiler"
-        logger.info("rasterizer: %s path (%s; rasterizer=eager or compiled decides otherwise)", chosen, reason)
-        settings = replace(settings, path=chosen)
+def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
+    """Settings for a training run of `steps`: path=auto becomes eager or compiled, with a word about why."""
+    if settings.path != "auto":
+        return settings
+    long_enough = steps >= settings.auto_steps
+    compiled = long_enough and available(device.type)
+    reason = f"{steps} steps" if compiled or not long_enough else "no working compiler"
+    path = "compiled" if compiled else "eager"
+    logger.info("rasterizer: %s path (%s; rasterizer=eager or rasterizer=compiled decides otherwise)", path, reason)
+    return replace(settings, path=path)
+
+
+def compiler(settings: RasterSettings, device: torch.device) -> Callable[[Callable], Callable]:
+    """torch.compile, for any number of rows, where the run is compiled; the function itself where it is not."""
     if settings.path == "compiled" and available(device.type):
-        logger.info("compiling the rasterizer once (later runs find it on disk) ...")
+        return lambda function: torch.compile(function, dynamic=True)
+    return lambda function: function
+
+
+def warm(settings: RasterSettings, device: torch.device) -> None:
+    """Have everything compiled before the first step, and say so."""
+    if settings.path == "compiled" and available(device.type):
+        logger.info("compiling the rasterizer once; later runs find it on disk ...")
         logger.info("compiled in %.0f s", compile_now(settings, device))
-    return settings
 
 
 def compile_now(settings: RasterSettings, device: torch.device) -> float:

@@ -1,6 +1,8 @@
 """World Gaussians to screen Gaussians, stable by construction (docs/numerics.md; 3D-GS sections 3.1 and 3.2)."""
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +10,8 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, Frame
 from gsx.core.errors import InputError
+from gsx.core.rasterizer.available import available
+from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.splats import Splats
@@ -37,16 +41,6 @@ class ScreenSplats:
     channels: Float[Tensor, "M C"]
     dropped: int
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
-
-
-def rotate_back(quats: Float[Tensor, "M 4"], vectors: Float[Tensor, "M V 3"]) -> Float[Tensor, "M V 3"]:
-    """R(q)^T v for quaternions (w, x, y, z) of any length; a zero quaternion is the identity."""
-    # the largest part first: the square of a long quaternion would overflow. q / max(|q|, 1e-12) in the end
-    largest = quats.detach().abs().amax(1, keepdim=True).clamp_min(1e-12)
-    unit = torch.nn.functional.normalize(quats / largest, dim=1, eps=1.0)[:, None, :].expand(-1, vectors.shape[1], -1)
-    w, axis = unit[..., :1], unit[..., 1:]
-    twice_cross = 2 * torch.linalg.cross(axis, vectors)
-    return vectors - w * twice_cross + torch.linalg.cross(axis, twice_cross)
 
 
 def lens_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
@@ -88,53 +82,6 @@ def refuse_unusable(camera: Camera, lens: Float[Tensor, "4"], margin: float) -> 
     if not bool(torch.isfinite(camera.rotation).all() & torch.isfinite(camera.translation).all()):
         pose = f"rotation {camera.rotation.tolist()}, translation {camera.translation.tolist()}"
         raise InputError(f"the pose of a camera is not finite: {pose}")
-
-
-def clamped_slopes(
-    camera_points: Float[Tensor, "M 3"], lens: Float[Tensor, "4"], frame: Frame, margin: float
-) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
-    """x/z and y/z, clamped to `slope_bounds`."""
-    low, high = slope_bounds(lens, frame, margin)
-    slopes = camera_points[:, :2] / camera_points[:, 2:]
-    x, y = slopes.clamp(low.to(slopes), high.to(slopes)).unbind(1)
-    return x, y
-
-
-def screen_axes(
-    splats: Splats,
-    camera_points: Float[Tensor, "M 3"],
-    ids: Int[Tensor, "M"],
-    camera: Camera,
-    lens: Float[Tensor, "4"],
-    margin: float,
-) -> tuple[Float[Tensor, "M 2 3"], Float[Tensor, "M 3"]]:
-    """J W R diag(s) as axes diag(sizes): rows without unit, and standard deviations in px at the splat's depth."""
-    slope_x, slope_y = clamped_slopes(camera_points, lens, camera.frame, margin)
-    world_to_camera = camera.rotation.to(camera_points)
-    longest = lens[:2].detach().amax()
-    stretch_x, stretch_y = (lens[:2] / longest).to(camera_points)
-    row_x = stretch_x * (world_to_camera[0] - slope_x[:, None] * world_to_camera[2])
-    row_y = stretch_y * (world_to_camera[1] - slope_y[:, None] * world_to_camera[2])
-    sizes = splats.scales[ids] * (longest.to(camera_points) / camera_points[:, 2:])
-    return rotate_back(splats.quats[ids], torch.stack([row_x, row_y], 1)), sizes
-
-
-def covariance_and_factor(
-    axes: Float[Tensor, "M 2 3"], sizes: Float[Tensor, "M 3"], dilation: float
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Dilated covariance (xx, xy, yy) and the factor U; with rows p, q of axes diag(sizes) the former is P P^T + d I.
-
-    Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative;
-    p x q comes from the unscaled rows, so that a needle's thickness is not a difference of products of its length.
-    """
-    p, q = (axes * sizes[:, None, :]).unbind(1)
-    pp, pq, qq = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1)
-    xx, yy = pp + dilation, qq + dilation
-    others = sizes.roll(-1, 1) * sizes.roll(-2, 1)
-    area = torch.linalg.cross(axes[:, 0], axes[:, 1]) * others * yy.rsqrt()[:, None]  # |p x q| / sqrt(yy)
-    remainder = area.square().sum(1) + dilation * (pp / yy + 1)  # determinant / yy: squares of px, not fourth powers
-    u0 = (2 * remainder).rsqrt()
-    return torch.stack([xx, pq, yy], 1), torch.stack([u0, -pq / yy * u0, (2 * yy).rsqrt()], 1)
 
 
 def camera_points(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
@@ -180,18 +127,54 @@ def project(
     in_front = points[:, 2].to(splats.means) > camera.near
     good = usable(splats) & (in_range(splats, points, lens, camera.frame, margin) | ~in_front)
     ids = (good & in_front).nonzero()[:, 0]
-    points = points[ids]
-    means = points[:, :2] / points[:, 2:] * lens[:2] + lens[2:]
-    points = points.to(splats.means)
-    axes, sizes = screen_axes(splats, points, ids, camera, lens, margin)
-    covariances, factors = covariance_and_factor(axes, sizes, settings.dilation)
+    points, scales, quats, log_opacities, channels = (
+        take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
+    )
+    low, high = slope_bounds(lens, camera.frame, margin)
+    rotation = camera.rotation.to(scales)
+    means, covariances, factors = geometry_of(settings, ids)(
+        points, scales, quats, rotation, lens, low.to(scales), high.to(scales), settings.dilation
+    )
     return ScreenSplats(
         ids=ids,
-        means=means.to(splats.means),
-        depths=points[:, 2],
+        means=means,
+        depths=points[:, 2].to(scales),
         covariances=covariances,
         factors=factors,
-        log_opacities=splats.log_opacities[ids],
-        channels=splats.colours[ids],
+        log_opacities=log_opacities,
+        channels=channels,
         dropped=len(good) - int(good.sum()),
     )
+
+
+class TakeRows(torch.autograd.Function):
+    """Selects distinct rows; their gradients are copied back, where indexing would have to add."""
+
+    @staticmethod
+    def forward(ctx, values, ids):
+        ctx.save_for_backward(ids)
+        ctx.shape = values.shape
+        return values.index_select(0, ids)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (ids,) = ctx.saved_tensors
+        return gradient.new_zeros(ctx.shape).index_copy_(0, ids, gradient), None
+
+
+def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
+    """`values[ids]` for ids that are all different."""
+    return TakeRows.apply(values, ids)
+
+
+def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """`geometry`, compiled where the settings ask for it, it is possible, and there is more than one splat."""
+    if settings.path == "compiled" and len(ids) > 1 and available(ids.device.type):
+        return compiled_geometry()
+    return geometry
+
+
+@functools.lru_cache
+def compiled_geometry() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """`geometry` and its backward through torch.compile, for any number of splats."""
+    return torch.compile(geometry, fullgraph=True, dynamic=True)

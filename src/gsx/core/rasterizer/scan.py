@@ -1,5 +1,7 @@
 """Associative scans over the chunks of every group, in log2(chunks) steps: what lets all blocks be blended at once."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,7 @@ from gsx.core.shapes import Bool, Float, Int
 def parts(total: int, size: int) -> list[slice]:
     """Slices of about `size` that cover `total`; none has a single element unless there is only one."""
     edges = [*range(0, max(total - 1, 1), size), total]
-    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def neighbour(lanes: Lanes, distance: int) -> tuple[Int[Tensor, "S"], Bool[Tensor, "S"]]:
