@@ -39,7 +39,18 @@ from gsx.core.trade import (
     single_changes,
     table,
 )
-from gsx.core.trade_measure import EXACT, Bench, Times, at_pace, check_truth, resolved, sweep, timed, unsteady
+from gsx.core.trade_measure import (
+    EXACT,
+    Bench,
+    Times,
+    at_pace,
+    check_truth,
+    fell_back,
+    resolved,
+    sweep,
+    timed,
+    unsteady,
+)
 from gsx.core.trade_page import write_trade
 from gsx.core.trade_subject import Shot, Subject, framing_cameras, open_subject
 
@@ -308,9 +319,11 @@ def test_errors_of_trials_are_those_against_the_untiled_reference() -> None:
 
 
 def test_what_only_the_eager_path_does_is_told() -> None:
-    bench = Bench(tiny_subject(path="compiled"), RasterSettings(path="compiled"))
-    halves = bench.measured(Trial(knob="accumulation", changes={"accumulation": "float16"}))
-    assert halves.settings == "accumulation=float16 (by the eager path)"
+    halves = RasterSettings(path="compiled", accumulation="float16")
+    assert fell_back(halves, torch.device("cpu"))
+    assert not fell_back(replace(halves, path="eager"), torch.device("cpu"))
+    told = replace(row(1, 0, accumulation="float16"), fell_back=True)
+    assert told.settings == "accumulation=float16 (by the eager path)"
 
 
 def test_what_fails_is_a_row_with_its_reason() -> None:

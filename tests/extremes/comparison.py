@@ -1,8 +1,6 @@
 """How a case is measured: the tiled rasterizer against the float64 reference, forward and backward."""
 
 import functools
-import importlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,6 +9,7 @@ from torch import Tensor
 from extremes.cases import Case
 from gsx.core.camera import Camera
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
+from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.reference import alpha_maps, frame_pixels, render_reference, whole
 from gsx.core.splats import Splats
 
@@ -20,11 +19,6 @@ FLOAT64_TOLERANCE = 1e-12
 
 def paths() -> list[str]:
     """The paths of the rasterizer that work here."""
-    try:
-        compiled = importlib.import_module("gsx.core.rasterizer.compiled")
-    except ImportError:
-        return ["eager"]
-    available: Callable[[], bool] = getattr(compiled, "available", lambda: False)
     return ["eager", "compiled"] if available() else ["eager"]
 
 

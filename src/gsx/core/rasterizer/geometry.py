@@ -32,30 +32,28 @@ def screen_axes(
     lens: Float[Tensor, "4"],
     low: Float[Tensor, "2"],
     high: Float[Tensor, "2"],
-) -> tuple[Float[Tensor, "M 2 3"], Float[Tensor, "M 3"]]:
-    """J W R diag(s) as axes diag(sizes): rows without unit, and standard deviations in px at the splat's depth."""
+) -> Float[Tensor, "M 2 3"]:
+    """Rows p, q of J W R diag(s), px; s is measured in px at the splat's depth first, so that nothing overflows."""
     slope_x, slope_y = clamped_slopes(camera_points, low, high)
     longest = lens[:2].detach().amax()
     stretch_x, stretch_y = (lens[:2] / longest).to(camera_points)
     row_x = stretch_x * (rotation[0] - slope_x[:, None] * rotation[2])
     row_y = stretch_y * (rotation[1] - slope_y[:, None] * rotation[2])
     sizes = scales * (longest.to(camera_points) / camera_points[:, 2:])
-    return rotate_back(quats, torch.stack([row_x, row_y], 1)), sizes
+    return rotate_back(quats, torch.stack([row_x, row_y], 1)) * sizes[:, None, :]
 
 
 def covariance_and_factor(
-    axes: Float[Tensor, "M 2 3"], sizes: Float[Tensor, "M 3"], dilation: float
+    axes: Float[Tensor, "M 2 3"], dilation: float
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Dilated covariance (xx, xy, yy) and the factor U; with rows p, q of axes diag(sizes) the former is P P^T + d I.
+    """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
 
-    Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative;
-    p x q comes from the unscaled rows, so that a needle's thickness is not a difference of products of its length.
+    Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
     """
-    p, q = (axes * sizes[:, None, :]).unbind(1)
+    p, q = axes.unbind(1)
     pp, pq, qq = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1)
     xx, yy = pp + dilation, qq + dilation
-    others = sizes.roll(-1, 1) * sizes.roll(-2, 1)
-    area = torch.linalg.cross(axes[:, 0], axes[:, 1]) * others * yy.rsqrt()[:, None]  # |p x q| / sqrt(yy)
+    area = torch.linalg.cross(p, q) * yy.rsqrt()[:, None]  # p x q / sqrt(yy)
     remainder = area.square().sum(1) + dilation * (pp / yy + 1)  # determinant / yy: squares of px, not fourth powers
     u0 = (2 * remainder).rsqrt()
     return torch.stack([xx, pq, yy], 1), torch.stack([u0, -pq / yy * u0, (2 * yy).rsqrt()], 1)
@@ -76,6 +74,6 @@ def geometry(
     `points` and `lens` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes in the Jacobian.
     """
     means = points[:, :2] / points[:, 2:] * lens[:2] + lens[2:]
-    axes, sizes = screen_axes(points.to(scales), scales, quats, rotation, lens, low, high)
-    covariances, factors = covariance_and_factor(axes, sizes, dilation)
+    axes = screen_axes(points.to(scales), scales, quats, rotation, lens, low, high)
+    covariances, factors = covariance_and_factor(axes, dilation)
     return means.to(scales), covariances, factors

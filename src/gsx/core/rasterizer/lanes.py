@@ -51,8 +51,8 @@ def lay_out(pairs: Pairs, splats: int, chunk: int, batch: int) -> Lanes:
     bases = active.cumsum(0) - active
     places = entry_places(pairs, ranks, bases, chunk)
     blocks = int(active.sum())
-    entries = places.new_full((blocks * chunk * LANES,), splats, dtype=torch.int32)
-    entries[places] = pairs.splats.int()
+    entries = places.new_full((blocks * chunk * LANES,), splats)
+    entries.scatter_(0, places.long(), pairs.splats.int())
     chunks = torch.repeat_interleave(active)
     return Lanes(
         tiles=tiles,
@@ -61,7 +61,7 @@ def lay_out(pairs: Pairs, splats: int, chunk: int, batch: int) -> Lanes:
         chunks=chunks,
         active=active.tolist(),
         bases=bases.tolist(),
-        places=torch.empty_like(places, dtype=torch.int32).index_copy_(0, pairs.slots, places.int()),
+        places=torch.empty_like(places).scatter_(0, pairs.slots, places),
     )
 
 
@@ -85,12 +85,13 @@ def chunk_counts(lengths: Int[Tensor, "T"], tiles: Int[Tensor, "G L"], chunk: in
 
 
 def entry_places(pairs: Pairs, ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int) -> Int[Tensor, "P"]:
-    """Place of every pair (sorted by tile) in the flat [S K L] entries."""
-    tiles = pairs.tiles.long()
-    number = torch.arange(len(tiles), device=tiles.device) - pairs.starts[tiles]
-    rank = ranks[tiles]
-    block = bases[number // chunk] + rank // LANES
-    return (block * chunk + number % chunk) * LANES + rank % LANES
+    """Place of every pair (sorted by tile) in the flat [S K L] entries; fewer than 2^31, as max_pairs sees to."""
+    # per tile: place of a list's first entry but for its chunk, and where the list begins
+    lane = (ranks // LANES * chunk * LANES + ranks % LANES).int()
+    lane, begin = torch.stack([lane, pairs.starts[:-1].int()], 1).index_select(0, pairs.tiles).unbind(1)
+    number = torch.arange(len(lane), device=lane.device, dtype=torch.int32) - begin
+    step = torch.div(number, chunk, rounding_mode="floor")
+    return lane + (number - step * chunk) * LANES + (bases * (chunk * LANES)).int().index_select(0, step)
 
 
 def centres(lanes: Lanes, grid: TileGrid, like: Tensor) -> Float[Tensor, "S 2 1 L"]:

@@ -154,10 +154,13 @@ def reached_tiles(
     heights = (last - first)[order, 1]
     refuse_too_many(int(heights.sum()), grid, settings)
     rank = torch.repeat_interleave(heights)
-    owner = order[rank]
-    row = first[owner, 1] + (torch.arange(len(rank), device=rank.device) - (heights.cumsum(0) - heights)[rank]).int()
-    begin, end = row_spans(screen.means[owner], screen.factors[owner], limits[owner], row, grid.tile)
-    begin, end = begin.maximum(first[owner, 0]), end.minimum(last[owner, 0])
+    # one gather of floats and one of integers for every row of tiles, in the order of memory
+    shapes = torch.cat([screen.means, screen.factors, limits[:, None]], 1)[order].index_select(0, rank)
+    top = first[order, 1] - (heights.cumsum(0) - heights).int()
+    top, left, right = torch.stack([top, first[order, 0], last[order, 0]], 1).index_select(0, rank).unbind(1)
+    row = top + torch.arange(len(rank), device=rank.device, dtype=torch.int32)
+    begin, end = row_spans(shapes[:, :2], shapes[:, 2:5], shapes[:, 5], row, grid.tile)
+    begin, end = begin.maximum(left), end.minimum(right)
     widths = (end - begin).clamp_min_(0).long()
     refuse_too_many(int(widths.sum()), grid, settings)
     return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, grid, radii)
@@ -177,12 +180,12 @@ def sorted_pairs(
     line = torch.repeat_interleave(widths)
     before = widths.cumsum(0) - widths
     place = torch.arange(len(line), device=line.device)
-    tiles = (place + (row * columns + begin - before)[line]).to(index_type(columns * rows))
+    tiles = (place + (row * columns + begin - before).index_select(0, line)).to(index_type(columns * rows))
     tiles, slots = torch.sort(tiles, stable=True)
     counts = torch.zeros_like(order).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
     return Pairs(
-        splats=order[rank][line[slots]],
+        splats=order[rank].index_select(0, line).index_select(0, slots),
         tiles=tiles.int(),
         starts=torch.searchsorted(tiles.int(), edges),
         slots=slots,
