@@ -440,8 +440,6 @@ def verb_trade(words: list[str]) -> int:
         most_combinations=combinations if given.combinations is None else given.combinations,
         notes=notes,
     )
-    for note in trade.notes[len(notes) :]:
-        logger.warning("%s", note)
     lines = ["", *table(trade.rows), "", *advice_lines(trade.rows, given.max_error)]
     sys.stdout.write("\n".join(lines) + f"\n{write_trade(trade, folder, given.max_error)}\n")
     return 0

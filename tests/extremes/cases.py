@@ -381,7 +381,7 @@ def corner_of_8k() -> tuple[Splats, Camera]:
 
 @case(
     "points in the far corner of an 8k image",
-    image=3e-4,
+    image=4e-4,
     gradient=1e-3,
     tolerance=2e-3,  # at the cut-off ln alpha of an opaque point falls by 6.1 per px
     why="float32 px beyond 4096 lie 4.9e-4 apart, and the flank of a point falls by up to 1.1 per px",

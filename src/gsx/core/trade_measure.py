@@ -306,10 +306,14 @@ def usable_paths(plugins: Plugins, device: torch.device) -> tuple[list[RasterSet
     return [presets["eager"]], [f"only eager settings are tried: nothing compiles here ({complaint(device.type)})"]
 
 
-def resolved(base: RasterSettings, presets: Sequence[RasterSettings]) -> RasterSettings:
-    """The base settings with path=auto decided: compiled where that works."""
-    best = "compiled" if any(preset.path == "compiled" for preset in presets) else "eager"
-    return replace(base, path=best) if base.path == "auto" else base
+def resolved(base: RasterSettings) -> tuple[RasterSettings, list[str]]:
+    """The base settings with path=auto decided, and a note on that: eager, or every single change would be compiled."""
+    if base.path != "auto":
+        return base, []
+    remedy = "begin with rasterizer.path=compiled to turn the other knobs there, each to be compiled once"
+    return replace(base, path="eager"), [
+        f"rasterizer.path=auto begins eager here, compiled is one of the knobs: {remedy}"
+    ]
 
 
 def sweep(
@@ -329,32 +333,47 @@ def sweep(
     Raises:
         InputError: the base settings themselves cannot be drawn.
     """
-    base = resolved(subject.raster, presets)
+    base, decided = resolved(subject.raster)
+    for note in decided:
+        logger.info("%s", note)
     logger.info("drawing the float64 truth")
     bench = Bench(subject, base)
-    check = check_truth(subject.shots[0], replace(base, **EXACT))
     trials = single_changes(base, presets, cuda=subject.device.type == "cuda", knobs=knobs)
-    compiling = any(replace(base, **trial.changes).path == "compiled" for trial in trials)
+    rows = measured_singles(bench, trials, repeats)
+    rows += measured_combinations(bench, rows, combinations(rows, most_combinations, max_error), repeats)
+    doubts = unsteady(rows)
+    for doubt in doubts:
+        logger.warning("%s", doubt)
+    return Trade(
+        subject=subject,
+        base=base,
+        check=check_truth(subject.shots[0], replace(base, **EXACT)),
+        ideal=bench.ideal_errors(),
+        repeats=repeats,
+        rows=ordered(rows),
+        notes=[*notes, *decided, *doubts],
+    )
+
+
+def measured_singles(bench: Bench, trials: Sequence[Trial], repeats: int) -> list[Row]:
+    """Rows of the base settings and of single changes."""
+    compiling = any(replace(bench.base, **trial.changes).path == "compiled" for trial in trials)
     wait = "; each new compiled one takes a while" if compiling else ""
     logger.info("measuring the errors of %d settings%s", len(trials), wait)
     rows = [bench.measured(trial) for trial in trials]
     refuse_failed_base(rows[0].failure)
     announce(rows, repeats)
-    rows = timed(bench, rows, repeats)
-    more = [bench.measured(trial) for trial in combinations(rows, most_combinations, max_error)]
-    if more:
-        announce(more, repeats)
-        again, *more = timed(bench, [rows[0], *more], repeats)
-        rows += [at_pace(row, rows[0], again) for row in more]
-    return Trade(
-        subject=subject,
-        base=base,
-        check=check,
-        ideal=bench.ideal_errors(),
-        repeats=repeats,
-        rows=ordered(rows),
-        notes=[*notes, *unsteady(rows)],
-    )
+    return timed(bench, rows, repeats)
+
+
+def measured_combinations(bench: Bench, rows: Sequence[Row], trials: Sequence[Trial], repeats: int) -> list[Row]:
+    """Rows of combinations; `rows` begin with that of the base settings, beside which they are timed again."""
+    if not trials:
+        return []
+    more = [bench.measured(trial) for trial in trials]
+    announce(more, repeats)
+    again, *more = timed(bench, [rows[0], *more], repeats)
+    return [at_pace(row, rows[0], again) for row in more]
 
 
 def unsteady(rows: Sequence[Row]) -> list[str]:

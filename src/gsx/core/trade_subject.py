@@ -112,16 +112,12 @@ def detached(splats: Splats) -> Splats:
 
 
 def subject_of_points(overrides: Sequence[str], views: int, plugins: Plugins) -> Subject:
-    """The points of a scene as splats of random shape: something to measure where there is no model yet.
-
-    Unless told otherwise it starts from eager settings, so that little has to be compiled for a first look.
-    """
-    chosen = any(override.startswith("rasterizer=") for override in overrides)
-    settings = compose(overrides if chosen else ["rasterizer=eager", *overrides], plugins)
+    """The points of a scene as splats of random shape: something to measure where there is no model yet."""
+    settings = compose(overrides, plugins)
     device, seed = choose_device(settings.general.device), settings.general.seed
     scene = load_scene(settings)
     splats = on(splats_on(scene.points, torch.Generator().manual_seed(seed)), device)
-    seen, note = choose_views(scene, views)
+    chosen, note = choose_views(scene, views)
     return Subject(
         name=f"points of scene {scene.name} as random splats",
         notes=(
@@ -129,7 +125,7 @@ def subject_of_points(overrides: Sequence[str], views: int, plugins: Plugins) ->
             "and opacities; give a run folder or a splat file to measure yours",
             note,
         ),
-        shots=tuple(Shot(name=view.name, camera=view.camera, splats=splats) for view in seen),
+        shots=tuple(Shot(name=view.name, camera=view.camera, splats=splats) for view in chosen),
         background=scene.background.to(device),
         raster=settings.raster,
         device=device,

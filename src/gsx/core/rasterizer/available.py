@@ -1,9 +1,12 @@
-"""Whether anything can be compiled on this machine."""
+"""Whether anything can be compiled on this machine, and compiling for any number of rows."""
 
 import functools
 import logging
+from collections.abc import Callable
+from typing import Any
 
 import torch
+from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
@@ -31,3 +34,22 @@ def warn_once(device: str) -> None:
         "times slower. Install a C++ compiler (g++ or clang++), or choose rasterizer=eager",
         complaint(device),
     )
+
+
+def compile_rows(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` through torch.compile, once for any number of rows.
+
+    Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
+    compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
+    """
+    compiled, marked = torch.compile(function), []
+
+    def call(*arguments: Any) -> Any:
+        if not marked:
+            marked.append(True)
+            for argument in arguments:
+                if isinstance(argument, Tensor) and argument.dim() and len(argument) == len(arguments[0]):
+                    torch._dynamo.mark_dynamic(argument, 0)
+        return compiled(*arguments)
+
+    return call

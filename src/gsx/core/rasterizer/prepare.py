@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from gsx.core.camera import look_at
-from gsx.core.rasterizer.available import available
+from gsx.core.rasterizer.available import available, compile_rows
 from gsx.core.rasterizer.render import rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.splats import Splats
@@ -34,7 +34,7 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
 def compiler(settings: RasterSettings, device: torch.device) -> Callable[[Callable], Callable]:
     """torch.compile, for any number of rows, where the run is compiled; the function itself where it is not."""
     if settings.path == "compiled" and available(device.type):
-        return lambda function: torch.compile(function, dynamic=True)
+        return compile_rows
     return lambda function: function
 
 

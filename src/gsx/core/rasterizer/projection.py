@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, Frame
 from gsx.core.errors import InputError
-from gsx.core.rasterizer.available import available
+from gsx.core.rasterizer.available import available, compile_rows
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -177,4 +177,4 @@ def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Callable[...
 @functools.lru_cache
 def compiled_geometry() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
     """`geometry` and its backward through torch.compile, for any number of splats."""
-    return torch.compile(geometry, fullgraph=True, dynamic=True)
+    return compile_rows(geometry)
