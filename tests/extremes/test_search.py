@@ -65,7 +65,10 @@ def cameras_with(
 def rules(alpha_min: st.SearchStrategy[float], dilation: st.SearchStrategy[float]) -> st.SearchStrategy[RasterSettings]:
     """Rules of every path; `alpha_min` of the eager one only, since compiled code holds it as a constant."""
     cull = st.sampled_from(["published", "tight"])
-    builds = [st.builds(RasterSettings, cull=cull, dilation=dilation, path=st.just(path)) for path in paths()]
+    builds = [
+        st.builds(RasterSettings, cull=cull, dilation=dilation, path=st.just(path), unrolled=st.just(2))
+        for path in paths()
+    ]
     return st.one_of(st.builds(RasterSettings, cull=cull, dilation=dilation, alpha_min=alpha_min), *builds)
 
 

@@ -42,14 +42,17 @@ def compile_rows(function: Callable[..., Any]) -> Callable[..., Any]:
     Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
     compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
     """
-    compiled, marked = torch.compile(function), []
+    compiled = torch.compile(function)
+    marked: list[bool] = []
 
     def call(*arguments: Any) -> Any:
+        # the sizes of parameters are constants to torch.compile, those of views are not
+        views = [a.view_as(a) if isinstance(a, torch.nn.Parameter) else a for a in arguments]
         if not marked:
             marked.append(True)
-            for argument in arguments:
-                if isinstance(argument, Tensor) and argument.dim() and len(argument) == len(arguments[0]):
-                    torch._dynamo.mark_dynamic(argument, 0)
-        return compiled(*arguments)
+            for view in views:
+                if isinstance(view, Tensor) and view.dim() and len(view) == len(views[0]):
+                    torch._dynamo.maybe_mark_dynamic(view, 0)
+        return compiled(*views)
 
     return call

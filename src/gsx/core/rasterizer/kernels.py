@@ -240,7 +240,7 @@ def make_rows(
     columns = [table[places, f] for f in range(table.shape[1])]
     x, y = columns[0] - centre[:, 0], columns[1] - centre[:, 1]
     u0, u1, u2, log_opacity = columns[2:TABLE]
-    highest = torch.where(places < table.shape[0] - 1, rules.alpha_max, 0.0).to(table.dtype)
+    highest = rules.alpha_max * (places < table.shape[0] - 1).to(table.dtype)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
     if rules.exponent == "squares":
         head = [u0, u1, k0, u2, k1, log_opacity]
@@ -333,4 +333,4 @@ def first_size_free(loop: Callable[..., Any]) -> Callable[..., Any]:
 def mark(tensor: Tensor) -> None:
     """Blocks vary in number, and splats; pixels and products (at most three dimensions ending in one) do not."""
     if tensor.shape[-1] > 1:
-        torch._dynamo.mark_dynamic(tensor, 0)
+        torch._dynamo.maybe_mark_dynamic(tensor, 0)

@@ -58,10 +58,11 @@ def warm_splats(device: torch.device) -> Splats:
     """Faint splats before the camera; their own generator, so that a run's randomness is not touched."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(WARM_SPLATS, 3, generator=generator) * 2 - 1
-    return Splats(
-        means=means.to(device).requires_grad_(),
-        scales=torch.full_like(means, 0.05).to(device),
-        quats=torch.nn.functional.one_hot(torch.zeros(WARM_SPLATS, dtype=torch.long), 4).float().to(device),
-        log_opacities=torch.full((WARM_SPLATS,), -2.0, device=device),
-        colours=torch.rand(WARM_SPLATS, 3, generator=generator).to(device),
-    )
+    fields = {
+        "means": means,
+        "scales": torch.full_like(means, 0.05),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(WARM_SPLATS, 1),
+        "log_opacities": torch.full((WARM_SPLATS,), -2.0),
+        "colours": torch.rand(WARM_SPLATS, 3, generator=generator),
+    }
+    return Splats(**{name: value.to(device).requires_grad_() for name, value in fields.items()})
