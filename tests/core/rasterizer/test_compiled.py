@@ -134,7 +134,7 @@ def test_what_goes_the_eager_way() -> None:
 BROKEN = """
 import torch
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.prepare import prepare, warm_splats
+from gsx.core.rasterizer.prepare import decide, warm_splats
 from gsx.core.camera import look_at
 import logging
 logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -142,7 +142,7 @@ camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=32, height=32)
 splats = warm_splats(torch.device("cpu"))
 pictures = [rasterize(splats, camera, RasterSettings(path=path)).image for path in ("compiled", "compiled", "eager")]
 assert torch.equal(pictures[0], pictures[2]) and torch.equal(pictures[1], pictures[2])
-assert prepare(RasterSettings(path="auto"), 10_000, torch.device("cpu")).path == "eager"
+assert decide(RasterSettings(path="auto"), 10_000, torch.device("cpu")).path == "eager"
 """
 
 
