@@ -2,11 +2,13 @@
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from gsx.core.rasterizer.settings import RasterSettings
 
 logger = logging.getLogger(__name__)
 
@@ -26,6 +28,11 @@ def available(device: str = "cpu") -> bool:
     return not complaint(device)
 
 
+def compiles(settings: RasterSettings, device: str) -> bool:
+    """Whether the settings ask for the compiled path and it works here."""
+    return settings.path == "compiled" and available(device)
+
+
 @functools.lru_cache
 def warn_once(device: str) -> None:
     """Say why the eager path is taken instead."""
@@ -42,17 +49,31 @@ def compile_rows(function: Callable[..., Any]) -> Callable[..., Any]:
     Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
     compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
     """
-    compiled = torch.compile(function)
-    marked: list[bool] = []
+    compiled = first_sizes_free(torch.compile(function), lambda views: [v for v in views if as_long(v, views[0])])
 
     def call(*arguments: Any) -> Any:
         # the sizes of parameters are constants to torch.compile, those of views are not
-        views = [a.view_as(a) if isinstance(a, torch.nn.Parameter) else a for a in arguments]
+        return compiled(*(a.view_as(a) if isinstance(a, torch.nn.Parameter) else a for a in arguments))
+
+    return call
+
+
+def as_long(value: Any, first: Tensor) -> bool:
+    """Whether `value` is a tensor with as many rows as `first`."""
+    return isinstance(value, Tensor) and value.dim() > 0 and len(value) == len(first)
+
+
+def first_sizes_free(
+    compiled: Callable[..., Any], varying: Callable[[tuple[Any, ...]], Iterable[Tensor]]
+) -> Callable[..., Any]:
+    """Tells torch at the first call which arguments vary in their first size, so that one compilation serves all."""
+    marked: list[bool] = []
+
+    def call(*arguments: Any) -> Any:
         if not marked:
             marked.append(True)
-            for view in views:
-                if isinstance(view, Tensor) and view.dim() and len(view) == len(views[0]):
-                    torch._dynamo.maybe_mark_dynamic(view, 0)
-        return compiled(*views)
+            for tensor in varying(arguments):
+                torch._dynamo.maybe_mark_dynamic(tensor, 0)
+        return compiled(*arguments)
 
     return call

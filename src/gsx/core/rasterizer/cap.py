@@ -17,13 +17,13 @@ def capped(pairs: Pairs, cap: int) -> Pairs:
     number = torch.arange(len(pairs.tiles), device=pairs.tiles.device) - pairs.starts[pairs.tiles.long()]
     kept = number < cap
     lengths = pairs.starts.diff().clamp(max=cap)
-    kept_by_splat = torch.empty_like(kept).index_put_((pairs.slots.long(),), kept)
-    owner = torch.repeat_interleave(torch.arange(len(pairs.counts), device=kept.device), pairs.counts.long())
+    kept_by_splat = torch.empty_like(kept).index_put_((pairs.slots,), kept)
+    owner = torch.repeat_interleave(pairs.counts)
     return replace(
         pairs,
         splats=pairs.splats[kept],
         tiles=pairs.tiles[kept],
         starts=torch.cat([pairs.starts[:1], lengths.cumsum(0).to(pairs.starts)]),
-        slots=(kept_by_splat.cumsum(0) - 1)[pairs.slots[kept].long()].to(pairs.slots),
-        counts=torch.bincount(owner[kept_by_splat], minlength=len(pairs.counts)).to(pairs.counts),
+        slots=(kept_by_splat.cumsum(0) - 1)[pairs.slots[kept]],
+        counts=torch.bincount(owner[kept_by_splat], minlength=len(pairs.counts)),
     )

@@ -67,7 +67,7 @@ def batch_groups(settings: RasterSettings) -> int:
     return max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
 
 
-def rules_of(settings: RasterSettings, channels: int, absolute: bool, like: Tensor) -> Rules:
+def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation: torch.dtype, device: str) -> Rules:
     """What the compiled code depends on."""
     powers, squarings = exp_polynomial(math.log(settings.alpha_min))
     return Rules(
@@ -77,9 +77,9 @@ def rules_of(settings: RasterSettings, channels: int, absolute: bool, like: Tens
         alpha_max=settings.alpha_max,
         stop=settings.transmittance_stop,
         exponent=settings.exponent,
-        evaluation=Precision.of(settings, like.dtype).evaluation,
+        evaluation=evaluation,
         absolute=absolute,
-        device=like.device.type,
+        device=device,
         powers=powers,
         squarings=squarings,
     )
@@ -91,6 +91,19 @@ def padded_table(means: Tensor, factors: Tensor, log_opacities: Tensor, channels
     nothing = table.new_zeros(1, table.shape[1])
     nothing[0, TABLE - 1] = NOTHING
     return torch.cat([table, nothing])
+
+
+def block_moments(
+    job: Job,
+    rows: Float[Tensor, "B K F L"],
+    before: Float[Tensor, "B P L"],
+    behind: Float[Tensor, "B P L"],
+    gradient: list[Float[Tensor, "B P L"]],
+) -> Float[Tensor, "B K V L"]:
+    """Moments of some blocks; `behind` is moved in front of them."""
+    basis = job.basis
+    slope, weight = job.loops.slopes(rows, basis.x, basis.y, before, behind, gradient)
+    return job.loops.moments(rows, slope, weight, basis.x, basis.y, basis.products, gradient)
 
 
 # -- chunks --------------------------------------------------------------------------------------------------------
@@ -193,16 +206,14 @@ def chunk_moments(
     job: Job, rows: Float[Tensor, "S K F L"], kept: Chunks, gradient: list[Float[Tensor, "G P L"]]
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, back to front; zero for blocks that were not blended."""
-    behind, basis = torch.zeros_like(kept.inside), job.basis
+    behind = torch.zeros_like(kept.inside)
     width = TABLE + job.rules.channels + 2 * job.rules.absolute
     moments = kept.inside.new_zeros(*rows.shape[:2], width, rows.shape[3])
     for stage in reversed(kept.stages):
-        part, seen = take(rows, stage.blocks), [take(g, stage.groups) for g in gradient]
-        rest = take(behind, stage.groups)
-        slope, weight = job.loops.slopes(part, basis.x, basis.y, kept.before(stage), rest, seen)
+        rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
+        moments[stage.blocks] = block_moments(job, take(rows, stage.blocks), kept.before(stage), rest, seen)
         if not isinstance(stage.groups, slice):
             behind[stage.groups] = rest
-        moments[stage.blocks] = job.loops.moments(part, slope, weight, basis.x, basis.y, basis.products, seen)
     return moments
 
 
@@ -245,12 +256,13 @@ def segment_moments(
     seen = [g[job.lanes.groups] for g in gradient]
     shine = sum(channel * g for channel, g in zip(kept.light, seen, strict=True))
     own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
-    behind, basis, out = behind_blocks(kept.passed, own, job.lanes), job.basis, []
-    for part in parts(len(rows), job.batch):
-        here = [g[part] for g in seen]
-        slope, weight = job.loops.slopes(rows[part], basis.x, basis.y, kept.before[part], behind[part], here)
-        out.append(job.loops.moments(rows[part], slope, weight, basis.x, basis.y, basis.products, here))
-    return torch.cat(out)
+    behind = behind_blocks(kept.passed, own, job.lanes)
+    return torch.cat(
+        [
+            block_moments(job, rows[part], kept.before[part], behind[part], [g[part] for g in seen])
+            for part in parts(len(rows), job.batch)
+        ]
+    )
 
 
 # -- the autograd function -----------------------------------------------------------------------------------------
@@ -306,10 +318,8 @@ def composite_compiled(
     probe: Float[Tensor, "M 2"] | None = None,
 ) -> Float[Tensor, "C_plus_1 H W"]:
     """What `composite` returns, through compiled loops; `probe` as there. There must be a pair."""
-    rules, precision = (
-        rules_of(settings, channels.shape[1], probe is not None, means),
-        Precision.of(settings, means.dtype),
-    )
+    precision = Precision.of(settings, means.dtype)
+    rules = rules_of(settings, channels.shape[1], probe is not None, precision.evaluation, means.device.type)
     batch = batch_groups(settings)
     lanes = lay_out(pairs, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsx.core.rasterizer.available import first_sizes_free
 from gsx.core.shapes import Float, Int
 
 TABLE = 6
@@ -312,25 +313,10 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
         "realize_opcount_threshold": sharing,
         "realize_cpu_opcount_threshold": sharing,
     }
-    return first_size_free(torch.compile(own, fullgraph=True, options=options))
+    return first_sizes_free(torch.compile(own, fullgraph=True, options=options), varying)
 
 
-def first_size_free(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Marks the first size of large arguments as variable at the first call, so that one compilation serves all."""
-
-    def call(*arguments: Tensor | list[Tensor]) -> Any:
-        if not marked:
-            marked.append(True)
-            for argument in arguments:
-                for tensor in argument if isinstance(argument, list) else [argument]:
-                    mark(tensor)
-        return loop(*arguments)
-
-    marked: list[bool] = []
-    return call
-
-
-def mark(tensor: Tensor) -> None:
+def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[Tensor]:
     """Blocks vary in number, and splats; pixels and products (at most three dimensions ending in one) do not."""
-    if tensor.shape[-1] > 1:
-        torch._dynamo.maybe_mark_dynamic(tensor, 0)
+    tensors = [tensor for argument in arguments for tensor in (argument if isinstance(argument, list) else [argument])]
+    return [tensor for tensor in tensors if tensor.shape[-1] > 1]

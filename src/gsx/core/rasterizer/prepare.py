@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from gsx.core.camera import look_at
-from gsx.core.rasterizer.available import available, compile_rows
+from gsx.core.rasterizer.available import available, compile_rows, compiles
 from gsx.core.rasterizer.render import rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.splats import Splats
@@ -33,14 +33,14 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
 
 def compiler(settings: RasterSettings, device: torch.device) -> Callable[[Callable], Callable]:
     """torch.compile, for any number of rows, where the run is compiled; the function itself where it is not."""
-    if settings.path == "compiled" and available(device.type):
+    if compiles(settings, device.type):
         return compile_rows
     return lambda function: function
 
 
 def warm(settings: RasterSettings, device: torch.device) -> None:
     """Have everything compiled before the first step, and say so."""
-    if settings.path == "compiled" and available(device.type):
+    if compiles(settings, device.type):
         logger.info("compiling the rasterizer once; later runs find it on disk ...")
         logger.info("compiled in %.0f s", compile_now(settings, device))
 

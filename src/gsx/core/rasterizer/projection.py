@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, Frame
 from gsx.core.errors import InputError
-from gsx.core.rasterizer.available import available, compile_rows
+from gsx.core.rasterizer.available import compile_rows, compiles
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -169,7 +169,7 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 
 def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
     """`geometry`, compiled where the settings ask for it, it is possible, and there is more than one splat."""
-    if settings.path == "compiled" and len(ids) > 1 and available(ids.device.type):
+    if len(ids) > 1 and compiles(settings, ids.device.type):
         return compiled_geometry()
     return geometry
 
