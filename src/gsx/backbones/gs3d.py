@@ -133,7 +133,6 @@ class GS3D:
         self.generator = beginning.generator
         self.schedule = beginning.schedule(options.published_iterations)
         self.active_degree = 0
-        self.final_colours = beginning.compile(colours_of)
         raw = initial_parameters(scene.points, options.sh_degree, options.initial_opacity)
         self.table = Table({name: Parameter(value.to(beginning.device)) for name, value in raw.items()})
         self.statistics = Statistics.zeros(len(self.table), beginning.device)
@@ -153,14 +152,12 @@ class GS3D:
         """All Gaussians with their colours as seen from the camera."""
         table = self.table
         offsets = table["means"] - camera.centre.to(table["means"])
-        # lower degrees last too short to be compiled each
-        shade = self.final_colours if self.active_degree == self.options.sh_degree else colours_of
         return Splats(
             means=table["means"],
             scales=table["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp(),
             quats=table["quats"],
             log_opacities=logsigmoid(table["opacity_logits"]),
-            colours=shade(table["sh_constant"], table["sh_rest"], offsets, self.active_degree),
+            colours=colours_of(table["sh_constant"], table["sh_rest"], offsets, self.active_degree),
         )
 
     def regulariser(self) -> Float[Tensor, ""] | None:

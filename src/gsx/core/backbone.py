@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -24,8 +24,6 @@ class Beginning:
     device: torch.device
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
-    compile: Callable[[Callable], Callable] = lambda function: function
-    """torch.compile where the run is compiled, else the function itself: for arithmetic on many rows."""
 
     def schedule(self, published_iterations: int) -> Schedule:
         """Maps steps of a published run of that length onto this run."""

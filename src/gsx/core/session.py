@@ -32,7 +32,7 @@ from gsx.core.orbit import orbit_cameras, write_animation
 from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.progress import MetricsLog, Progress, read_curves
-from gsx.core.rasterizer.prepare import compiler, decide, warm
+from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.scene import Scene
@@ -107,13 +107,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
-    beginning = Beginning(
-        scene=scene,
-        iterations=general.iterations,
-        device=device,
-        generator=generator,
-        compile=compiler(raster, device),
-    )
+    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, generator=generator)
     return Run(
         config=settings.resolved,
         folder=folder,

@@ -38,6 +38,21 @@ def band_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     ]
 
 
+class Contraction(torch.autograd.Function):
+    """sum over b of basis[n, b] rest[n, b, c]: no product of all three indices on the way, forward or backward."""
+
+    @staticmethod
+    def forward(ctx, basis, rest):
+        ctx.save_for_backward(basis, rest)
+        return (basis[:, None] @ rest)[:, 0]
+
+    @staticmethod
+    def backward(ctx, gradient):
+        basis, rest = ctx.saved_tensors
+        by_rest = basis[:, :, None] * gradient[:, None] if ctx.needs_input_grad[1] else None
+        return (rest @ gradient[:, :, None])[:, :, 0], by_rest
+
+
 def colours_of(
     constant: Float[Tensor, "N 1 3"],
     rest: Float[Tensor, "N B 3"],
@@ -48,7 +63,7 @@ def colours_of(
     colours = 0.5 + BAND_0 * constant[:, 0]
     if degree > 0:
         basis = harmonics(torch.nn.functional.normalize(offsets, dim=1), degree)
-        colours = colours + (basis[:, :, None] * rest[:, : basis.shape[1]]).sum(1)
+        colours = colours + Contraction.apply(basis, rest[:, : basis.shape[1]])
     return colours.clamp_min(0)
 
 

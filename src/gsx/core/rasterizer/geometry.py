@@ -1,62 +1,82 @@
-"""The differentiable mathematics of the projection, eager or compiled (docs/numerics.md; 3D-GS section 3.2)."""
+"""The differentiable mathematics of the projection, eager or compiled (docs/numerics.md; 3D-GS section 3.2).
+
+Vectors are tuples of columns, one tensor of [M] per component: a third of the time of the same formulas on rows of
+three, whose inner loops of length three leave vector units idle.
+"""
+
+from functools import reduce
+from operator import add
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
 from gsx.core.shapes import Float
 
-
-def rotate_back(quats: Float[Tensor, "M 4"], vectors: Float[Tensor, "M V 3"]) -> Float[Tensor, "M V 3"]:
-    """R(q)^T v for quaternions (w, x, y, z) of any length; a zero quaternion is the identity."""
-    # the largest part first: the square of a long quaternion would overflow. q / max(|q|, 1e-12) in the end
-    largest = quats.detach().abs().amax(1, keepdim=True).clamp_min(1e-12)
-    unit = torch.nn.functional.normalize(quats / largest, dim=1, eps=1.0)[:, None, :].expand(-1, vectors.shape[1], -1)
-    w, axis = unit[..., :1], unit[..., 1:]
-    twice_cross = 2 * torch.linalg.cross(axis, vectors)
-    return vectors - w * twice_cross + torch.linalg.cross(axis, twice_cross)
+Columns: TypeAlias = tuple[Tensor, ...]
+"""The components of M vectors, each [M], or [] when all vectors share it."""
 
 
-def clamped_slopes(
-    camera_points: Float[Tensor, "M 3"], low: Float[Tensor, "2"], high: Float[Tensor, "2"]
-) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
-    """x/z and y/z, clamped to [low, high]."""
-    x, y = (camera_points[:, :2] / camera_points[:, 2:]).clamp(low, high).unbind(1)
-    return x, y
+def dot(a: Columns, b: Columns) -> Tensor:
+    """a . b, [M]."""
+    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
+
+
+def cross(a: Columns, b: Columns) -> Columns:
+    """a x b."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def plus(a: Columns, factor: Tensor | float, b: Columns) -> Columns:
+    """a + factor b."""
+    return tuple(x + factor * y for x, y in zip(a, b, strict=True))
+
+
+def scaled(a: Columns, factors: Columns) -> Columns:
+    """Component by component."""
+    return tuple(x * factor for x, factor in zip(a, factors, strict=True))
+
+
+def unit(quats: Float[Tensor, "M 4"]) -> Columns:
+    """q / max(|q|, 1e-12)."""
+    # the largest part first: the square of a long quaternion would overflow
+    largest = quats.detach().abs().amax(1).clamp_min(1e-12)
+    parts = tuple(part / largest for part in quats.unbind(1))
+    length = dot(parts, parts).clamp_min(1).sqrt()
+    return tuple(part / length for part in parts)
+
+
+def rotate_back(quat: Columns, vector: Columns) -> Columns:
+    """R(q)^T v for unit quaternions (w, x, y, z); a zero quaternion is the identity."""
+    w, *axis = quat
+    half = cross(tuple(axis), vector)
+    return plus(plus(vector, -2 * w, half), 2, cross(tuple(axis), half))
 
 
 def screen_axes(
-    camera_points: Float[Tensor, "M 3"],
-    scales: Float[Tensor, "M 3"],
-    quats: Float[Tensor, "M 4"],
-    rotation: Float[Tensor, "3 3"],
-    lens: Float[Tensor, "4"],
-    low: Float[Tensor, "2"],
-    high: Float[Tensor, "2"],
-) -> Float[Tensor, "M 2 3"]:
-    """Rows p, q of J W R diag(s), px; s is measured in px at the splat's depth first, so that nothing overflows."""
-    slope_x, slope_y = clamped_slopes(camera_points, low, high)
-    longest = lens[:2].detach().amax()
-    stretch_x, stretch_y = (lens[:2] / longest).to(camera_points)
-    row_x = stretch_x * (rotation[0] - slope_x[:, None] * rotation[2])
-    row_y = stretch_y * (rotation[1] - slope_y[:, None] * rotation[2])
-    sizes = scales * (longest.to(camera_points) / camera_points[:, 2:])
-    return rotate_back(quats, torch.stack([row_x, row_y], 1)) * sizes[:, None, :]
+    slopes: Columns, stretches: Columns, sizes: Columns, quats: Columns, rotation: Float[Tensor, "3 3"]
+) -> tuple[Columns, Columns]:
+    """The rows p, q of J W R diag(s), px. `slopes` are x/z and y/z, `sizes` the scales in px at the splat's depth."""
+    right, down, forward = (row.unbind() for row in rotation)
+    p, q = (
+        scaled(rotate_back(quats, tuple(stretch * part for part in plus(row, -slope, forward))), sizes)
+        for row, slope, stretch in zip((right, down), slopes, stretches, strict=True)
+    )
+    return p, q
 
 
-def covariance_and_factor(
-    axes: Float[Tensor, "M 2 3"], dilation: float
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+def covariance_and_factor(p: Columns, q: Columns, dilation: float) -> tuple[Columns, Columns]:
     """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
 
     Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
     """
-    p, q = axes.unbind(1)
-    pp, pq, qq = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1)
+    pp, pq, qq = dot(p, p), dot(p, q), dot(q, q)
     xx, yy = pp + dilation, qq + dilation
-    area = torch.linalg.cross(p, q) * yy.rsqrt()[:, None]  # p x q / sqrt(yy)
-    remainder = area.square().sum(1) + dilation * (pp / yy + 1)  # determinant / yy: squares of px, not fourth powers
+    area = scaled(cross(p, q), (yy.rsqrt(),) * 3)  # p x q / sqrt(yy)
+    remainder = dot(area, area) + dilation * (pp / yy + 1)  # determinant / yy: squares of px, not fourth powers
     u0 = (2 * remainder).rsqrt()
-    return torch.stack([xx, pq, yy], 1), torch.stack([u0, -pq / yy * u0, (2 * yy).rsqrt()], 1)
+    return (xx, pq, yy), (u0, -pq / yy * u0, (2 * yy).rsqrt())
 
 
 def geometry(
@@ -71,9 +91,17 @@ def geometry(
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
 
-    `points` and `lens` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes in the Jacobian.
+    `points` and `lens` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
     """
-    means = points[:, :2] / points[:, 2:] * lens[:2] + lens[2:]
-    axes = screen_axes(points.to(scales), scales, quats, rotation, lens, low, high)
-    covariances, factors = covariance_and_factor(axes, dilation)
-    return means.to(scales), covariances, factors
+    x, y, z = points.unbind(1)
+    fx, fy, cx, cy = lens
+    slopes = x / z, y / z
+    means = slopes[0] * fx + cx, slopes[1] * fy + cy
+    clamped = tuple(s.to(scales).clamp(a, b) for s, a, b in zip(slopes, low, high, strict=True))
+    # scales in px at their depth come first, so that nothing overflows
+    longest = torch.maximum(fx, fy).detach()
+    stretches, magnification = ((fx / longest).to(scales), (fy / longest).to(scales)), (longest / z).to(scales)
+    sizes = scaled(scales.unbind(1), (magnification,) * 3)
+    p, q = screen_axes(clamped, stretches, sizes, unit(quats), rotation)
+    covariances, factors = covariance_and_factor(p, q, dilation)
+    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(factors, 1)

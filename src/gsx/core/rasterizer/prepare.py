@@ -2,13 +2,12 @@
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
 from gsx.core.camera import look_at
-from gsx.core.rasterizer.available import available, compile_rows, compiles
+from gsx.core.rasterizer.available import available, compiles
 from gsx.core.rasterizer.render import rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.splats import Splats
@@ -29,13 +28,6 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     path = "compiled" if compiled else "eager"
     logger.info("rasterizer: %s path (%s; rasterizer=eager or rasterizer=compiled decides otherwise)", path, reason)
     return replace(settings, path=path)
-
-
-def compiler(settings: RasterSettings, device: torch.device) -> Callable[[Callable], Callable]:
-    """torch.compile, for any number of rows, where the run is compiled; the function itself where it is not."""
-    if compiles(settings, device.type):
-        return compile_rows
-    return lambda function: function
 
 
 def warm(settings: RasterSettings, device: torch.device) -> None:
