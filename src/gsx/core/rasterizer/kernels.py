@@ -8,7 +8,7 @@ need outlive a cache. Rules are constants of the compiled code.
 import functools
 import math
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -281,8 +281,8 @@ ONE_LOOP: dict[str, str | int | bool] = {
     "cpp.dynamic_threads": True,
 }
 """Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
-SHARING = {"blend": 30, "fade": 30, "slopes": 50}
-"""Operations after which the compiler shares an intermediate value instead of repeating it; found by trying: fewer
+SHARING = {"blend": 30, "fade": 30, "slopes": 50, "moments": 50}
+"""Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it; found by trying: fewer
 cuts these loops into several that talk through memory, more multiplies compile times."""
 
 
@@ -313,7 +313,17 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
         "realize_opcount_threshold": sharing,
         "realize_cpu_opcount_threshold": sharing,
     }
+    if loop.__name__ in SHARING:
+        options["guard_filter_fn"] = without_symbols
     return first_sizes_free(torch.compile(own, fullgraph=True, options=options), varying)
+
+
+def without_symbols(guards: Sequence[Any]) -> list[bool]:
+    """Which guards to keep: not those on symbols, which ask where in its storage a view begins.
+
+    The code does not depend on that, and the only symbol, the number of blocks, is the same in all arguments.
+    """
+    return [guard.guard_type != "SHAPE_ENV" for guard in guards]
 
 
 def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[Tensor]:
