@@ -70,6 +70,7 @@ class HostPeaks:
 
     def lap(self, phase: str) -> None:
         self.phases[phase] = host_peak() - self.base
+        return_freed()  # or what this phase freed would count in the next as well
         forget_peak()
 
 

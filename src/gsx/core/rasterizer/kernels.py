@@ -282,8 +282,10 @@ ONE_LOOP: dict[str, str | int | bool] = {
 }
 """Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
 SHARING = {"blend": 30, "fade": 30, "slopes": 50, "moments": 50}
-"""Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it; found by trying: fewer
-cuts these loops into several that talk through memory, more multiplies compile times."""
+"""Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
+
+Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
