@@ -24,7 +24,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "chunk": (8, 16, 32),
     "cull": CHOICES["cull"],
     "alpha_min": (0.001, 1 / 255, 0.008, 0.016),
-    "transmittance_stop": (1e-4, 1e-3, 1e-2),
+    "transmittance_stop": (0.0, 1e-4, 1e-3, 1e-2),
     "evaluation": CHOICES["evaluation"],
     "accumulation": CHOICES["accumulation"],
     "exponent": CHOICES["exponent"],
