@@ -121,3 +121,13 @@ def test_constant_band_of_a_colour() -> None:
     torch.testing.assert_close(constant, torch.tensor([[-1.7724539, 0.0, 1.7724539]]))
     shown = colours_of(constant[:, None], torch.zeros(1, 15, 3), torch.ones(1, 3), 0)
     torch.testing.assert_close(shown, colour)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_gradient_is_that_of_finite_differences(degree: int) -> None:
+    generator = torch.Generator().manual_seed(degree)
+    constant, rest, offsets = (
+        torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
+        for shape in ((5, 1, 3), (5, 15, 3), (5, 3))
+    )
+    assert torch.autograd.gradcheck(lambda c, *a: colours_of(c + 30, *a, degree), (constant, rest, offsets))  # above 0

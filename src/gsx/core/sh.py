@@ -62,7 +62,7 @@ def colours_of(
     """max(0, 0.5 + SH): colours seen along `offsets` (splat minus camera centre, any length) up to `degree`."""
     colours = 0.5 + BAND_0 * constant[:, 0]
     if degree > 0:
-        basis = harmonics(torch.nn.functional.normalize(offsets, dim=1), degree)
+        basis = harmonics(torch.nn.functional.normalize(offsets, dim=1), degree).to(rest)
         colours = colours + Contraction.apply(basis, rest[:, : basis.shape[1]])
     return colours.clamp_min(0)
 

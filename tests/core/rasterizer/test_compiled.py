@@ -45,6 +45,15 @@ def test_the_shipped_number_of_unrolled_splats() -> None:
     assert errors.gradient <= 1e-4
 
 
+def test_one_tile_size_after_another() -> None:
+    for tile in (8, 4, 16):  # one set of loops: each size compiles for itself, for any number of blocks
+        rules = replace(QUICK, tile_size=tile, unrolled=1)
+        for splats in (random_splats(250, seed=tile), opaque(90, tile)):
+            errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
+            assert errors.largest <= 1e-5
+            assert errors.gradient <= 1e-4
+
+
 @pytest.mark.parametrize("form", ["direct", "expanded"])
 def test_other_forms_of_the_exponent(form: str) -> None:
     rules, splats = replace(QUICK, exponent=form), random_splats(200, seed=8)

@@ -6,6 +6,7 @@ from raster_scenes import changed, front_camera, leaves, random_splats, run_scri
 
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_pieces
+from gsx.core.rasterizer.compiled import available
 from gsx.core.rasterizer.pieces import Window, windows
 from gsx.core.rasterizer.reference import render_reference
 
@@ -21,6 +22,16 @@ def test_pieces_are_the_whole_bit_for_bit(pixels: int, cull: str) -> None:
     assert torch.equal(mosaic.depth, whole.depth)
     assert torch.equal(mosaic.visible.nonzero()[:, 0], whole.screen.ids[whole.screen.visible].sort().values)
     assert (mosaic.pieces > 1) is (pixels < 70 * 52)
+
+
+@pytest.mark.skipif(not available(), reason="no working compiler on this machine")
+def test_pieces_of_the_compiled_path_are_the_whole_without_gradients() -> None:
+    rules = RasterSettings(path="compiled", unrolled=2)
+    with torch.no_grad():
+        whole = rasterize(random_splats(), front_camera(), rules).image
+    mosaic = rasterize_pieces(random_splats(), front_camera(), rules, pixels=500)
+    assert mosaic.pieces > 1
+    assert torch.equal(mosaic.image, whole)
 
 
 def test_pieces_of_a_crop_and_of_large_tiles_are_the_whole_too() -> None:

@@ -49,13 +49,7 @@ def compile_rows(function: Callable[..., Any]) -> Callable[..., Any]:
     Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
     compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
     """
-    compiled = first_sizes_free(torch.compile(function), lambda views: [v for v in views if as_long(v, views[0])])
-
-    def call(*arguments: Any) -> Any:
-        # the sizes of parameters are constants to torch.compile, those of views are not
-        return compiled(*(a.view_as(a) if isinstance(a, torch.nn.Parameter) else a for a in arguments))
-
-    return call
+    return first_sizes_free(torch.compile(function), lambda all: [a for a in all if as_long(a, all[0])])
 
 
 def as_long(value: Any, first: Tensor) -> bool:

@@ -71,6 +71,7 @@ def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation
     """What the compiled code depends on."""
     powers, squarings = exp_polynomial(math.log(settings.alpha_min))
     return Rules(
+        tile_size=settings.tile_size,
         chunk=settings.unrolled,
         channels=channels,
         alpha_min=settings.alpha_min,

@@ -32,6 +32,8 @@ EXP_TOP = 0.02
 class Rules:
     """Everything that compiled code depends on."""
 
+    tile_size: int
+    """Makes the number of pixels a constant of the code."""
     chunk: int
     channels: int
     alpha_min: float
@@ -321,9 +323,10 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
 
 
 def without_symbols(guards: Sequence[Any]) -> list[bool]:
-    """Which guards to keep: not those on symbols, which ask where in its storage a view begins.
+    """Which guards to keep: not those on symbols, which are the number of blocks and where in storage a view begins.
 
-    The code does not depend on that, and the only symbol, the number of blocks, is the same in all arguments.
+    The former is the same in all arguments of a call, the latter enters no code: arguments are contiguous. Every other
+    size, dtypes, strides and devices are guarded one by one. 32-bit indices suffice: RasterSettings.compiled_values.
     """
     return [guard.guard_type != "SHAPE_ENV" for guard in guards]
 

@@ -129,7 +129,7 @@ def rasterize_pieces(
     depth: bool = False,
     pixels: int = 1 << 20,
 ) -> Mosaic:
-    """What `rasterize` would draw, bit for bit, in windows of at most `pixels` px (but at least a tile).
+    """What `rasterize` draws without gradients, bit for bit, in windows of at most `pixels` px (but at least a tile).
 
     Beyond the result, memory grows with `pixels` and with the pairs of one window, not with the raster. Windows that
     need more than `settings.max_pairs` pairs are halved until they do not.

@@ -168,7 +168,7 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 
 
 def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    """`geometry`, compiled where that is asked for, possible, and worth it: with a gradient, of many splats."""
+    """`geometry`, compiled where that is asked for, possible, and worth it: in grad mode, of more than one splat."""
     if len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type):
         return compiled_geometry()
     return geometry

@@ -20,6 +20,8 @@ SIGNIFICANT_BITS = {"float64": 53, "float32": 24, "tf32": 24, "bfloat16": 8, "fl
 LEAST_NORMAL = {"bfloat16": 2.0**-126, "float16": 2.0**-14}
 LARGEST_HALF = 65504.0
 """Of float16."""
+LARGEST_BATCH = 1 << 27
+"""Alpha values of the compiled path at once: with their rows and channels they are still counted in 32 bits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +106,8 @@ class RasterSettings:
         for name in ("chunk", "batch_values", "unrolled", "compiled_values", "max_pairs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"rasterizer.{name} is {getattr(self, name)}; give at least 1")
+        if self.compiled_values > LARGEST_BATCH:
+            raise ValueError(f"rasterizer.compiled_values is {self.compiled_values}; give at most {LARGEST_BATCH}")
         if self.tile_cap < 0:
             raise ValueError(f"rasterizer.tile_cap is {self.tile_cap}; give a number of splats, or 0 for no cap")
 
