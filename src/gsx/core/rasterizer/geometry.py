@@ -10,11 +10,14 @@ from typing import TypeAlias
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from gsx.core.shapes import Float
 
 Columns: TypeAlias = tuple[Tensor, ...]
 """The components of M vectors, each [M], or [] when all vectors share it."""
+LEAST_SHARE = 1e-30
+"""Floor of |S| / (|S + d I| - |S|) in the compensation: an opacity of 1 becomes 1e-15, which is not drawn."""
 
 
 def dot(a: Columns, b: Columns) -> Tensor:
@@ -66,17 +69,26 @@ def screen_axes(
     return p, q
 
 
-def covariance_and_factor(p: Columns, q: Columns, dilation: float) -> tuple[Columns, Columns]:
+def covariance_and_factor(p: Columns, q: Columns, dilation: float) -> tuple[Columns, Columns, Columns]:
     """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
 
     Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
+    Third are its two parts over yy: the determinant before dilation, and what dilation adds.
     """
     pp, pq, qq = dot(p, p), dot(p, q), dot(q, q)
     xx, yy = pp + dilation, qq + dilation
     area = scaled(cross(p, q), (yy.rsqrt(),) * 3)  # p x q / sqrt(yy)
-    remainder = dot(area, area) + dilation * (pp / yy + 1)  # determinant / yy: squares of px, not fourth powers
-    u0 = (2 * remainder).rsqrt()
-    return (xx, pq, yy), (u0, -pq / yy * u0, (2 * yy).rsqrt())
+    bare, added = dot(area, area), dilation * (pp / yy + 1)  # determinants / yy: squares of px, not fourth powers
+    u0 = (2 * (bare + added)).rsqrt()
+    return (xx, pq, yy), (u0, -pq / yy * u0, (2 * yy).rsqrt()), (bare, added)
+
+
+def log_compensation(bare: Float[Tensor, "M"], added: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
+    """ln sqrt(|S| / |S + d I|) of determinants |S| = bare and |S + d I| = bare + added (Mip-Splatting, spec 10.4).
+
+    The ratio is the sigmoid of ln(bare / added): exact near 0 and near 1; constant below the floor.
+    """
+    return logsigmoid((bare / added).clamp_min(LEAST_SHARE).log()) / 2
 
 
 def geometry(
@@ -88,9 +100,11 @@ def geometry(
     low: Float[Tensor, "2"],
     high: Float[Tensor, "2"],
     dilation: float,
-) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    compensate: bool,
+) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
     """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
 
+    Fourth is the ln of the factor on opacities that makes up for dilation; None unless asked for.
     `points` and `lens` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
     """
     x, y, z = points.unbind(1)
@@ -103,5 +117,6 @@ def geometry(
     stretches, magnification = ((fx / longest).to(scales), (fy / longest).to(scales)), (longest / z).to(scales)
     sizes = scaled(scales.unbind(1), (magnification,) * 3)
     p, q = screen_axes(clamped, stretches, sizes, unit(quats), rotation)
-    covariances, factors = covariance_and_factor(p, q, dilation)
-    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(factors, 1)
+    covariances, factors, determinants = covariance_and_factor(p, q, dilation)
+    gains = log_compensation(*determinants) if compensate else None
+    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(factors, 1), gains

@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ SQUARABLE = 0.4
 """Lengths in px stay below this power of their dtype's largest number: 3e15 in float32."""
 LENS_LIMIT = 1e12
 """No lens has a focal length of so many px, or sees so many focal lengths off its axis."""
+Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
+"""`geometry`, compiled or not."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,6 +41,7 @@ class ScreenSplats:
     factors: Float[Tensor, "M 3"]
     """(u0, u1, u2): half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]]."""
     log_opacities: Float[Tensor, "M"]
+    """Compensated for dilation where the settings ask for it."""
     channels: Float[Tensor, "M C"]
     dropped: int
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
@@ -132,8 +136,9 @@ def project(
     )
     low, high = slope_bounds(lens, camera.frame, margin)
     rotation = camera.rotation.to(scales)
-    means, covariances, factors = geometry_of(settings, ids)(
-        points, scales, quats, rotation, lens, low.to(scales), high.to(scales), settings.dilation
+    rules = settings.dilation, settings.compensate
+    means, covariances, factors, gains = geometry_of(settings, ids)(
+        points, scales, quats, rotation, lens, low.to(scales), high.to(scales), *rules
     )
     return ScreenSplats(
         ids=ids,
@@ -141,7 +146,7 @@ def project(
         depths=points[:, 2].to(scales),
         covariances=covariances,
         factors=factors,
-        log_opacities=log_opacities,
+        log_opacities=log_opacities if gains is None else log_opacities + gains,
         channels=channels,
         dropped=len(good) - int(good.sum()),
     )
@@ -167,14 +172,14 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
     return TakeRows.apply(values, ids)
 
 
-def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Geometry:
     """`geometry`, compiled where that is asked for, possible, and worth it: in grad mode, of more than one splat."""
     if len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type):
-        return compiled_geometry()
+        return compiled_geometry(settings.compensate)
     return geometry
 
 
 @functools.lru_cache
-def compiled_geometry() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    """`geometry` and its backward through torch.compile, for any number of splats."""
+def compiled_geometry(compensate: bool) -> Geometry:
+    """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
     return compile_rows(geometry)

@@ -54,6 +54,11 @@ def squared_distances(roots: Float[Tensor, "N 5 2"], offset: Float[Tensor, "N H 
     return first.square() + second.square()
 
 
+def compensation(roots: Float[Tensor, "N 5 2"]) -> Float[Tensor, "N"]:
+    """sqrt(|S| / |S + dilation I|), a ratio of products of singular values; S comes without the dilation's rows."""
+    return torch.linalg.svdvals(roots[:, :3]).prod(1) / torch.linalg.svdvals(roots).prod(1)
+
+
 def windows(
     means: Float[Tensor, "N 2"], covariances: Float[Tensor, "N 2 2"], xy: Float[Tensor, "H W 2"]
 ) -> Bool[Tensor, "N H W"]:
@@ -82,6 +87,8 @@ def alpha_maps(
     means = points[:, :2] / points[:, 2:] * focal + torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
     distance = squared_distances(roots, xy - means[:, None, None])
     alpha = torch.exp(chosen.log_opacities.double()[:, None, None] - distance / 2)
+    if settings.compensate:
+        alpha = alpha * compensation(roots)[:, None, None]
     clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (spec 4)
     keep = clamped >= settings.alpha_min
     if settings.cull == "published":

@@ -30,6 +30,9 @@ class RasterSettings:
 
     dilation: float = 0.3
     """Added to both diagonal entries of the screen covariance, px^2 (3D-GS, spec 3.1)."""
+    compensate: bool = False
+    """Opacity times sqrt(|S| / |S + dilation I|), S the screen covariance before dilation: Mip-Splatting's 2D filter
+    with dilation 0.1 (spec 10.4); published 3D-GS draws without."""
     alpha_min: float = 1 / 255
     """Contributions below are skipped (spec 3.4)."""
     alpha_max: float = 0.99
