@@ -11,6 +11,7 @@ from gsx.backbones.gs3d import GS3D, GS3DOptions
 from gsx.core.backbone import Beginning
 from gsx.core.camera import Camera, look_at
 from gsx.core.config import typed
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.scene import PointCloud, Scene, View
 
 
@@ -54,6 +55,7 @@ def small_gs3d(scene: Scene, *, iterations: int = 30000, seed: int = 0, options:
         scene=scene,
         iterations=iterations,
         device=torch.device("cpu"),
+        raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
     )
     return GS3D(options or published_options(), beginning)

@@ -56,7 +56,7 @@ def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     captured = capsys.readouterr()
     assert captured.out.strip() == str(tmp_path / "run" / "report.html")
     assert re.search(r"step 2/2 .* it/s .* loss .* PSNR .* splats .* MB .* ETA", captured.err)
-    assert "schedule densify" in (tmp_path / "run" / "log.txt").read_text() + captured.err
+    assert "plan of densify" in (tmp_path / "run" / "log.txt").read_text() + captured.err
 
 
 def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

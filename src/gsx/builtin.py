@@ -6,6 +6,7 @@ from gsx.core.plugins import Registry, hookimpl
 @hookimpl
 def gsx_register(registry: Registry) -> None:
     """Scenes and backbones of gsx itself."""
+    from gsx.backbones.anchors import ExplicitOptions, NeuralOptions, explicit_anchors, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
     from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
 
@@ -16,3 +17,7 @@ def gsx_register(registry: Registry) -> None:
     registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions)
     registry.add("scene", "bungee", bungee.load, bungee.BungeeOptions)
     registry.add("backbone", "gs3d", GS3D, GS3DOptions)
+    registry.add("backbone", "mip_splatting", GS3D, GS3DOptions)
+    registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
+    registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
+    registry.add("backbone", "octree_gs3d", explicit_anchors, ExplicitOptions)

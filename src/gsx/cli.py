@@ -295,14 +295,21 @@ def verb_render(words: list[str]) -> int:
 
 
 def verb_export(words: list[str]) -> int:
-    """gsx export RUN [FILE.ply]"""
-    from gsx.core.session import export, open_run, reimport_psnr
+    """gsx export RUN [FILE.ply] [--view NAME]"""
+    parser = argparse.ArgumentParser(prog="gsx export", description="Write a splat file (PLY), read back and compared.")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
+    parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
+    given = parser.parse_args(words)
+    from gsx.core.session import export, open_run, reimport_psnr, view_named
 
-    folder, rest = run_words("export", words)
-    run, settings = open_run(folder, plugins())
-    path = Path(rest[0]) if rest else folder / "point_cloud.ply"
-    export(run, path)
-    logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path))
+    run, settings = open_run(given.run, plugins())
+    view = view_named(run, given.view) if given.view else None
+    path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
+    export(run, path, view.camera if view else None)
+    if view is not None or run.backbone.standard_file:
+        views = [view] if view else run.scene.test
+        logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views))
     sys.stdout.write(f"{path}\n")
     return 0
 

@@ -72,7 +72,17 @@ class FourSplats:
 
     def discard(self) -> None: ...
 
-    def explicit(self) -> Gaussians:
+    raster = RasterSettings()
+    absolute_gradient = False
+    standard_file = False
+
+    def file(self) -> dict[str, Tensor]:
+        return {}
+
+    def export_notes(self) -> list[str]:
+        return []
+
+    def explicit(self, camera: Camera | None = None) -> Gaussians:
         raise NotImplementedError
 
     def plan(self) -> dict[str, Any]:

@@ -10,10 +10,21 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import logsigmoid, normalize
 
+from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.core.backbone import Beginning, Gaussians
 from gsx.core.camera import Camera
-from gsx.core.density import Statistics, Table, append_rows, keep_rows, reset_column
+from gsx.core.density import (
+    Statistics,
+    Table,
+    append_rows,
+    finite_rows,
+    keep_rows,
+    reset_column,
+    restored_table,
+    table_tensors,
+)
 from gsx.core.errors import InputError
+from gsx.core.export import columns_of
 from gsx.core.neighbours import mean_square_distance
 from gsx.core.quaternions import rotation_matrices
 from gsx.core.rasterizer import Rendering
@@ -51,6 +62,8 @@ class Density:
     every: int
     gradient: float
     """Mean NDC gradient at or above which a primitive is cloned or split."""
+    absolute: bool
+    """Also clone or split as many again by the mean of absolute gradients (Mip-Splatting of 2024, spec 10.5)."""
     split_extent: float
     """Primitives larger than this fraction of the extent are split, smaller ones cloned."""
     split_shrink: float
@@ -68,9 +81,11 @@ class Density:
 
 @dataclass(frozen=True, kw_only=True)
 class GS3DOptions:
-    """Options of the backbone; values in conf/backbone/gs3d.yaml."""
+    """Options of the backbone; values in conf/backbone/gs3d.yaml and mip_splatting.yaml."""
 
     name: str
+    filter: str
+    """none, or mip: both filters of Mip-Splatting."""
     published_iterations: int
     sh_degree: int
     sh_every: int
@@ -79,8 +94,10 @@ class GS3DOptions:
     """No primitive is added beyond this number."""
     rates: Rates
     density: Density
+    mip: MipOptions
 
     def __post_init__(self) -> None:
+        checked_filter(self.filter)
         if self.sh_degree not in range(4):
             raise ValueError(f"backbone.sh_degree is {self.sh_degree}; choose 0 to 3")
         if not 0 < self.initial_opacity < 1:
@@ -105,11 +122,6 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
     }
 
 
-def as_rows(values: Tensor) -> Tensor:
-    """[N, ...] with at least two dimensions."""
-    return values.view(len(values), -1)
-
-
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
     """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (spec 7, split)."""
     noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
@@ -123,6 +135,8 @@ def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator)
 class GS3D:
     """Explicit Gaussians, N rows in every parameter."""
 
+    standard_file = True
+
     def __init__(self, options: GS3DOptions, beginning: Beginning) -> None:
         scene = beginning.scene
         if len(scene.points) == 0:
@@ -133,9 +147,13 @@ class GS3D:
         self.generator = beginning.generator
         self.schedule = beginning.schedule(options.published_iterations)
         self.active_degree = 0
+        self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
+        self.absolute_gradient = options.density.absolute
+        self.cameras = [view.camera for view in scene.train]
         raw = initial_parameters(scene.points, options.sh_degree, options.initial_opacity)
         self.table = Table({name: Parameter(value.to(beginning.device)) for name, value in raw.items()})
-        self.statistics = Statistics.zeros(len(self.table), beginning.device)
+        self.statistics = Statistics.zeros(len(self.table), beginning.device, options.density.absolute)
+        self.refresh_filter()
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
@@ -152,13 +170,22 @@ class GS3D:
         """All Gaussians with their colours as seen from the camera."""
         table = self.table
         offsets = table["means"] - camera.centre.to(table["means"])
+        scales, log_opacities = self.extents()
         return Splats(
             means=table["means"],
-            scales=table["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp(),
+            scales=scales,
             quats=table["quats"],
-            log_opacities=logsigmoid(table["opacity_logits"]),
+            log_opacities=log_opacities,
             colours=colours_of(table["sh_constant"], table["sh_rest"], offsets, self.active_degree),
         )
+
+    def extents(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+        """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
+        scales = self.table["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
+        log_opacities = logsigmoid(self.table["opacity_logits"])
+        if self.options.filter == "none":
+            return scales, log_opacities
+        return smoothed(scales, log_opacities, self.table["filter"])
 
     def regulariser(self) -> Float[Tensor, ""] | None:
         """3D-GS has none (spec 5)."""
@@ -174,6 +201,8 @@ class GS3D:
         done: dict[str, int] = {}
         if self.density_due(step):
             done |= self.densify(step)
+        if done or self.filter_due(step):
+            self.refresh_filter()
         if self.reset_due(step):
             self.reset_opacities()
             done["opacity_resets"] = 1
@@ -193,10 +222,9 @@ class GS3D:
 
     def heal(self) -> int:
         """Remove rows with a value that is not finite, with their statistics; returns how many."""
-        finite = [torch.isfinite(as_rows(p.detach())).all(1) for p in self.table.parameters.values()]
-        kept = torch.stack(finite).all(0)
+        kept = finite_rows(self.table)
         keep_rows(self.table, kept)
-        self.statistics = Statistics(self.statistics.gradient[kept], self.statistics.count[kept])
+        self.statistics = self.statistics.rows(kept)
         return int((~kept).sum())
 
     def discard(self) -> None:
@@ -226,13 +254,21 @@ class GS3D:
         """Clone small and split large primitives with large gradients, then prune (spec 7, order in one event)."""
         density = self.options.density
         gradient = self.statistics.mean_gradient()
-        chosen = self.within_cap(gradient, gradient >= density.gradient)
+        chosen = self.within_cap(gradient, self.candidates(gradient))
         large = self.largest_scales() > density.split_extent * self.extent
         cloned, split = chosen & ~large, chosen & large
         self.clone_and_split(cloned, split)
         pruned = self.prune(step)
-        self.statistics = Statistics.zeros(len(self.table), gradient.device)
+        self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
         return {"cloned": int(cloned.sum()), "split": int(split.sum()), "pruned": pruned}
+
+    def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (spec 10.5)."""
+        chosen = gradient >= self.options.density.gradient
+        if not self.options.density.absolute:
+            return chosen
+        absolute = self.statistics.mean_absolute()
+        return chosen | (absolute >= absolute.quantile(1 - float(chosen.float().mean())))
 
     def within_cap(self, gradient: Float[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Of the chosen, those with the largest gradients that fit under max_primitives (each adds one)."""
@@ -244,7 +280,7 @@ class GS3D:
 
     def clone_and_split(self, cloned: Bool[Tensor, "N"], split: Bool[Tensor, "N"]) -> None:
         """Rows become: survivors, clones, first children, second children."""
-        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()}
+        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
         parents = {name: value[split] for name, value in raw.items()}
         shrink = self.options.density.split_shrink
         twins = [children(parents, shrink, self.generator) for _ in range(2)]
@@ -265,10 +301,24 @@ class GS3D:
         return int(doomed.sum())
 
     def reset_opacities(self) -> None:
-        """o <- min(o, reset_opacity), moments zeroed (spec 7)."""
-        highest = self.options.density.reset_opacity
-        logits = self.table["opacity_logits"].detach().clamp(max=math.log(highest / (1 - highest)))
-        reset_column(self.table, "opacity_logits", logits)
+        """o <- min(o, reset_opacity), moments zeroed (spec 7); with a 3D filter o is what is drawn (spec 10.5)."""
+        highest, logits = self.options.density.reset_opacity, self.table["opacity_logits"].detach()
+        excess = (self.extents()[1].detach() - math.log(highest)).clamp_min(0)
+        lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
+        reset_column(self.table, "opacity_logits", lowered)
+
+    # -- the 3D filter -----------------------------------------------------------------------------------------
+
+    def filter_due(self, step: int) -> bool:
+        """Every interval between the end of density control and the freezing of the filter (spec 10.2)."""
+        mip, begun = self.options.mip, self.schedule.step(self.options.density.stop)
+        return begun < step < self.schedule.step(mip.stop) and step % self.schedule.interval(mip.every) == 0
+
+    def refresh_filter(self) -> None:
+        """Filter sizes from where the primitives are now (spec 10.1)."""
+        if self.options.filter == "mip":
+            means = self.table["means"].detach()
+            self.table.columns["filter"] = filter_sizes(means, self.cameras, self.options.mip)
 
     def largest_scales(self) -> Float[Tensor, "N"]:
         """Largest standard deviation of each primitive, world units."""
@@ -280,12 +330,23 @@ class GS3D:
         """(primitives, bytes of their parameters)."""
         return len(self.table), sum(p.numel() * p.element_size() for p in self.table.parameters.values())
 
-    def explicit(self) -> Gaussians:
-        """The raw parameters, as a splat file holds them."""
+    def explicit(self, camera: Camera | None = None) -> Gaussians:
+        """The parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9)."""
         raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()}
+        if self.options.filter == "mip":
+            scales, log_opacities = self.extents()
+            raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
         raw["sh_constant"] = raw["sh_constant"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)
         return Gaussians(**raw)
+
+    def file(self) -> dict[str, Tensor]:
+        """The standard 62 properties (spec 8.3)."""
+        return columns_of(self.explicit())
+
+    def export_notes(self) -> list[str]:
+        """Whether the 3D filter is in the file."""
+        return ["3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"]
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""
@@ -312,23 +373,10 @@ class GS3D:
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters, Adam moments and step counts, statistics."""
-        out: dict[str, Tensor] = {
-            "statistics.gradient": self.statistics.gradient,
-            "statistics.count": self.statistics.count,
-        }
-        for name, parameter in self.table.parameters.items():
-            out[f"parameters.{name}"] = parameter.detach()
-            for key, value in self.table.optimiser.state.get(parameter, {}).items():
-                out[f"adam.{name}.{key}"] = value
-        return out
+        return table_tensors(self.table) | self.statistics.tensors()
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take back what `tensors` gave."""
         device = self.statistics.gradient.device
-        names = list(self.table.parameters)
-        self.table = Table({n: Parameter(tensors[f"parameters.{n}"].to(device)) for n in names})
-        for name, parameter in self.table.parameters.items():
-            if f"adam.{name}.step" in tensors:
-                state = {key: tensors[f"adam.{name}.{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
-                self.table.optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
-        self.statistics = Statistics(tensors["statistics.gradient"].to(device), tensors["statistics.count"].to(device))
+        self.table = restored_table(self.table, tensors, device)
+        self.statistics = Statistics.restored(tensors, device)

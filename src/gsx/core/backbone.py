@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
-from gsx.core.rasterizer import Rendering
+from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.scene import Scene
 from gsx.core.schedule import Schedule
 from gsx.core.shapes import Float
@@ -22,6 +22,8 @@ class Beginning:
     scene: Scene
     iterations: int
     device: torch.device
+    raster: RasterSettings
+    """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
 
@@ -50,6 +52,16 @@ class Backbone(Protocol):
 
     A step calls, in this order: `begin`, `splats`, `regulariser`, (backward), `observe`, `adapt`, `update`.
     """
+
+    @property
+    def raster(self) -> RasterSettings:
+        """The rules its splats are drawn by: those of the beginning, with filters of its own."""
+        ...
+
+    @property
+    def absolute_gradient(self) -> bool:
+        """Whether `observe` wants absolute gradients in training renders."""
+        ...
 
     def begin(self, step: int) -> None:
         """Set learning rates and whatever else depends on the step (1-based)."""
@@ -91,12 +103,25 @@ class Backbone(Protocol):
         """(primitives, bytes of the parameters needed to render)."""
         ...
 
-    def explicit(self) -> Gaussians:
-        """Explicit Gaussians for export.
+    def explicit(self, camera: Camera | None = None) -> Gaussians:
+        """Explicit Gaussians of a standard splat file: those a camera draws, or those that hold for all cameras.
 
         Raises:
-            GsxError: there is no camera-independent explicit form.
+            GsxError: no camera is given, and there is no camera-independent form.
         """
+        ...
+
+    @property
+    def standard_file(self) -> bool:
+        """Whether `file` is a standard splat file of 3D-GS."""
+        ...
+
+    def file(self) -> dict[str, Float[Tensor, "N"]]:
+        """Columns of the backbone's own splat file, in order."""
+        ...
+
+    def export_notes(self) -> list[str]:
+        """Comments for the export: what a viewer must know beside the screen dilation."""
         ...
 
     def plan(self) -> dict[str, Any]:

@@ -230,6 +230,8 @@ def writable(node: DictConfig) -> DictConfig:
     for key in node:
         child = node._get_node(key)
         if isinstance(child, DictConfig):
+            if child._is_missing() and dataclasses.is_dataclass(child._metadata.ref_type):
+                child._set_value(child._metadata.ref_type)  # its fields must be there to be made writable
             writable(child)
     return node
 

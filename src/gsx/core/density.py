@@ -24,6 +24,8 @@ class Table:
     """Named parameters with N rows each, and the Adam that moves them."""
 
     parameters: dict[str, Parameter]
+    columns: dict[str, Tensor] = field(default_factory=dict)
+    """Values with N rows that are not learnt: levels, filter sizes, positions on a grid, statistics."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -33,8 +35,8 @@ class Table:
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))
 
-    def __getitem__(self, name: str) -> Parameter:
-        return self.parameters[name]
+    def __getitem__(self, name: str) -> Tensor:
+        return self.parameters[name] if name in self.parameters else self.columns[name]
 
     def set_rate(self, name: str, rate: float) -> None:
         """Learning rate of one parameter."""
@@ -66,20 +68,64 @@ def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def append_rows(table: Table, rows: dict[str, Tensor]) -> None:
-    """Append rows to every parameter; `rows` names all of them. New rows start with zero moments."""
+    """Append rows to every parameter and column; `rows` names all of them. New rows start with zero moments."""
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
+    for name, column in table.columns.items():
+        table.columns[name] = torch.cat([column, rows[name]])
 
 
 def keep_rows(table: Table, kept: Bool[Tensor, "N"]) -> None:
-    """Keep the marked rows of every parameter, with their moments."""
+    """Keep the marked rows of every parameter, with their moments, and of every column."""
     for name in table.parameters:
         edit(table, name, lambda old: old[kept], lambda moment: moment[kept])
+    for name, column in table.columns.items():
+        table.columns[name] = column[kept]
 
 
 def reset_column(table: Table, name: str, values: Tensor) -> None:
     """Replace all values of one parameter and zero its moments."""
     edit(table, name, lambda old: values, torch.zeros_like)
+
+
+def finite_rows(table: Table) -> Bool[Tensor, "N"]:
+    """Rows whose parameters are finite in every value."""
+    flat = [parameter.detach().reshape(len(parameter), -1) for parameter in table.parameters.values()]
+    return torch.stack([torch.isfinite(values).all(1) for values in flat]).all(0)
+
+
+def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
+    """Adam's step count and moments of one parameter, by the names they are saved under; none before its first step."""
+    return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
+
+
+def restore_adam(
+    name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor], device: torch.device
+) -> None:
+    """Take back what `adam_tensors` gave."""
+    if f"adam.{name}.step" in tensors:
+        state = {key: tensors[f"adam.{name}.{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+        optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
+
+
+def table_tensors(table: Table) -> dict[str, Tensor]:
+    """Everything of a table, by the names it is saved under."""
+    out = {f"columns.{name}": column for name, column in table.columns.items()}
+    for name, parameter in table.parameters.items():
+        out[f"parameters.{name}"] = parameter.detach()
+        out |= adam_tensors(name, parameter, table.optimiser)
+    return out
+
+
+def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device) -> Table:
+    """The table that `table_tensors` saw, with the parameters and columns of `like`."""
+    table = Table(
+        {name: Parameter(tensors[f"parameters.{name}"].to(device)) for name in like.parameters},
+        {name: tensors[f"columns.{name}"].to(device) for name in like.columns},
+    )
+    for name, parameter in table.parameters.items():
+        restore_adam(name, parameter, table.optimiser, tensors, device)
+    return table
 
 
 @dataclass(eq=False)
@@ -90,11 +136,14 @@ class Statistics:
     """Sum of the norm of the screen gradient in NDC units."""
     count: Int[Tensor, "N"]
     """Renders in which the primitive was visible."""
+    absolute: Float[Tensor, "N"] | None = None
+    """Sum of |g_x| + |g_y| over pixels, NDC units, where it is gathered (Mip-Splatting of 2024, spec 10.5)."""
 
     @staticmethod
-    def zeros(count: int, device: torch.device | str) -> "Statistics":
+    def zeros(count: int, device: torch.device | str, absolute: bool = False) -> "Statistics":
         """Fresh statistics of `count` primitives."""
-        return Statistics(torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device))
+        sums, seen = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
+        return Statistics(sums, seen, torch.zeros_like(sums) if absolute else None)
 
     def add(self, screen: ScreenStatistics) -> None:
         """Count one render in after its backward pass: a norm per view, visible primitives only (spec 4)."""
@@ -102,7 +151,28 @@ class Statistics:
         rows = screen.ids[visible]
         self.gradient.index_add_(0, rows, screen.ndc_gradient(screen.shift)[visible].norm(dim=1).to(self.gradient))
         self.count[rows] += 1
+        if self.absolute is not None and screen.probe is not None:
+            sums = screen.ndc_gradient(screen.probe)[visible].sum(1)
+            self.absolute.index_add_(0, rows, sums.to(self.absolute))
 
     def mean_gradient(self) -> Float[Tensor, "N"]:
         """Mean norm over the renders that saw the primitive; 0 for unseen ones."""
         return self.gradient / self.count.clamp_min(1)
+
+    def mean_absolute(self) -> Float[Tensor, "N"]:
+        """The same of the absolute gradients; 0 where they are not gathered."""
+        return torch.zeros_like(self.gradient) if self.absolute is None else self.absolute / self.count.clamp_min(1)
+
+    def rows(self, kept: Bool[Tensor, "N"]) -> "Statistics":
+        """Those of the marked primitives."""
+        return Statistics(**{name: value[kept] for name, value in vars(self).items() if value is not None})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By the names they are saved under."""
+        return {f"statistics.{name}": value for name, value in vars(self).items() if value is not None}
+
+    @staticmethod
+    def restored(tensors: dict[str, Tensor], device: torch.device) -> "Statistics":
+        """What `tensors` gave."""
+        found = {name: tensors.get(f"statistics.{name}") for name in ("gradient", "count", "absolute")}
+        return Statistics(**{name: value.to(device) for name, value in found.items() if value is not None})

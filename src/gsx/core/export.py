@@ -35,7 +35,12 @@ def write_gaussians(path: Path, gaussians: Gaussians, comments: Sequence[str] = 
     Raises:
         InputError: a value is not finite; the property and the number of rows are named.
     """
-    columns = {name: value.detach().float().cpu().numpy() for name, value in columns_of(gaussians).items()}
+    write_columns(path, columns_of(gaussians), comments)
+
+
+def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = ()) -> None:
+    """Write a splat file of any properties; errors as `write_gaussians`."""
+    columns = {name: value.detach().float().cpu().numpy() for name, value in values.items()}
     for name, value in columns.items():
         bad = int((~np.isfinite(value)).sum())
         if bad:

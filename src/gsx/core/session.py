@@ -20,9 +20,9 @@ from gsx.core.backbone import Beginning
 from gsx.core.cache import cache_root
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
-from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.errors import ConfigError, InputError, TrainingError, nearest
 from gsx.core.evaluate import Evaluator, render_tiled
-from gsx.core.export import read_gaussians, splats_of, write_gaussians
+from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
 from gsx.core.guard import Guard
 from gsx.core.images import write_image
@@ -35,7 +35,7 @@ from gsx.core.progress import MetricsLog, Progress, read_curves
 from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
-from gsx.core.scene import Scene
+from gsx.core.scene import Scene, View
 from gsx.core.shapes import Float
 from gsx.core.trainer import train
 
@@ -107,13 +107,14 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
-    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, generator=generator)
+    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, raster=raster, generator=generator)
+    backbone = settings.backbone.component.factory(settings.backbone.options, beginning)
     return Run(
         config=settings.resolved,
         folder=folder,
         scene=scene,
-        backbone=settings.backbone.component.factory(settings.backbone.options, beginning),
-        raster=raster,
+        backbone=backbone,
+        raster=backbone.raster,
         training=settings.training,
         iterations=general.iterations,
         device=device,
@@ -167,10 +168,15 @@ def announce(run: Run, plugins: Plugins) -> None:
     for failure in plugins.failures:
         logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
     for name, part in run.backbone.plan().items():
-        logger.info("schedule %s: %s", name, ", ".join(f"{key} {value:.6g}" for key, value in part.items()))
+        logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in part.items()))
     logger.info(
         "seed %s, %d threads, %s; run folder %s", run.config["seed"], torch.get_num_threads(), run.device, run.folder
     )
+
+
+def in_words(value: float | list[float]) -> str:
+    """A number of the plan, or several."""
+    return " ".join(f"{v:.6g}" for v in value) or "none" if isinstance(value, list) else f"{value:.6g}"
 
 
 def load_scene(settings: Settings) -> Scene:
@@ -304,14 +310,34 @@ def zoom_line(factor: str, result: dict[str, Any]) -> str:
     )
 
 
-def export(run: Run, path: Path) -> None:
-    """Write the standard splat file, with the conventions a viewer must know in its comments."""
+def export(run: Run, path: Path, camera: Camera | None = None) -> None:
+    """Write the backbone's splat file, or what it draws for one camera as a standard one.
+
+    The comments hold the conventions that a viewer must know.
+    """
     comments = [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}",
-        f"screen dilation {run.raster.dilation} px^2, no opacity compensation, no 3D filter",
+        f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
+        *run.backbone.export_notes(),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
-    write_gaussians(path, run.backbone.explicit(), comments)
+    if camera is None:
+        write_columns(path, run.backbone.file(), comments)
+    else:
+        run.backbone.begin(max(1, run.step))
+        write_gaussians(path, run.backbone.explicit(camera), comments)
+
+
+def view_named(run: Run, name: str) -> View:
+    """A training or test view by name.
+
+    Raises:
+        InputError: there is none; the nearest name is given.
+    """
+    views = {view.name: view for view in [*run.scene.test, *run.scene.train]}
+    if name not in views:
+        raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{nearest(name, list(views))}")
+    return views[name]
 
 
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
@@ -336,12 +362,12 @@ def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: flo
     write_animation(path, (render_camera(run, camera, pixels) for camera in cameras), fps)
 
 
-def reimport_psnr(run: Run, settings: Settings, path: Path) -> str:
-    """PSNR between the model and its exported file, both rendered from up to five test views."""
+def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View]) -> str:
+    """PSNR between the model and its exported standard file, both rendered from up to five views."""
     gaussians, pixels = read_gaussians(path), settings.evaluation.tile_pixels
     figures = []
-    for view in run.scene.test[:5]:
+    for view in views[:5]:
         splats = splats_of(gaussians, view.camera.centre)
         again = render_tiled(splats, view.camera, run.raster, run.background.cpu(), pixels).image
         figures.append(psnr(again, render_camera(run, view.camera, pixels)))
-    return f"{min(figures):.1f} dB at worst over {len(figures)} test views (inf: identical)"
+    return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical)"

@@ -56,7 +56,13 @@ def backward(run: Run) -> Step:
     target = view.image().to(run.device)
     run.backbone.begin(number)
     splats = run.backbone.splats(view.camera)
-    rendering = rasterize(splats, view.camera, run.raster, background=background(run))
+    rendering = rasterize(
+        splats,
+        view.camera,
+        run.raster,
+        background=background(run),
+        absolute_gradient=run.backbone.absolute_gradient,
+    )
     loss = photometric(rendering.image, target, run.training.ssim_weight)
     extra = run.backbone.regulariser()
     if extra is not None:

@@ -2,8 +2,10 @@
 
 from gsx.core.rasterizer.batch import rasterize_batch
 from gsx.core.rasterizer.pieces import Mosaic, rasterize_pieces
+from gsx.core.rasterizer.projection import take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.visibility import touches
 
 __all__ = [
     "Mosaic",
@@ -13,4 +15,6 @@ __all__ = [
     "rasterize",
     "rasterize_batch",
     "rasterize_pieces",
+    "take_rows",
+    "touches",
 ]

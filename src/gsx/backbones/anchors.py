@@ -1,0 +1,465 @@
+"""Gaussians on anchors of a fixed grid (Scaffold-GS), at several levels of detail if asked for (Octree-GS).
+
+A backbone here is a representation (networks or explicit harmonics), with or without levels, with or without the Mip
+filters: each is a part that knows nothing of the others (docs/backbones.md).
+"""
+
+import logging
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from gsx.backbones.cells import pooled_max
+from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, Representation
+from gsx.backbones.growth import (
+    GrowthOptions,
+    Quirks,
+    clamp_scales,
+    eligible,
+    fresh_statistics,
+    grow_by_depth,
+    grow_by_level,
+    nodes_of,
+    observe,
+    prune,
+    reset_offsets,
+    resolved,
+)
+from gsx.backbones.heads import HeadOptions, Heads
+from gsx.backbones.levels import LevelOptions, Levels, derive, drawn, facts_of, initial_nodes, unlocked, warnings_of
+from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
+from gsx.core.backbone import Beginning, Gaussians
+from gsx.core.camera import Camera
+from gsx.core.density import (
+    ADAM_EPSILON,
+    Table,
+    adam_tensors,
+    finite_rows,
+    keep_rows,
+    restore_adam,
+    restored_table,
+    table_tensors,
+)
+from gsx.core.errors import InputError
+from gsx.core.neighbours import mean_square_distance
+from gsx.core.rasterizer import Rendering, touches
+from gsx.core.scene import PointCloud
+from gsx.core.schedule import log_linear
+from gsx.core.shapes import Float, Int
+from gsx.core.splats import Splats
+
+logger = logging.getLogger(__name__)
+
+LEAST_SQUARE_DISTANCE = 1e-7
+"""Lower bound of the squared neighbour distance that sets the initial lengths (spec 2.2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decay:
+    """A learning rate, log-linear over the published run."""
+
+    first: float
+    last: float
+
+    def at(self, step: int, steps: int) -> float:
+        """The rate of a step; 0 if it begins at 0."""
+        return log_linear(step, steps, self.first, self.last) if self.first > 0 else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralRates:
+    """Learning rates by parameter; `offsets` in units of the extent (spec 2.7)."""
+
+    offsets: Decay
+    features: Decay
+    log_scales: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadRates:
+    """Learning rates of the networks (spec 2.7)."""
+
+    opacity: Decay
+    covariance: Decay
+    colour: Decay
+    bank: Decay
+    appearance: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitRates:
+    """Learning rates by parameter; `offsets` in units of the extent (spec 4A)."""
+
+    offsets: Decay
+    log_scales: Decay
+    quats: Decay
+    opacity_logits: Decay
+    sh_constant: Decay
+    sh_rest: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorOptions:
+    """What all anchor backbones share; values in conf/backbone, with their sources."""
+
+    name: str
+    published_iterations: int
+    fidelity: str
+    """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
+    filter: str
+    max_primitives: int
+    """No anchor is added beyond this number."""
+    volume_weight: float
+    """Of the mean volume of the Gaussians drawn, in the loss (spec 1.3)."""
+    voxel: float
+    """Edge of the initial grid's cells without levels, world units; 0: from the points (spec 2.1)."""
+    growth: GrowthOptions
+    quirks: Quirks
+    mip: MipOptions
+    levels: LevelOptions | None
+
+    def __post_init__(self) -> None:
+        checked_filter(self.filter)
+        resolved(self.quirks, self.fidelity)
+        if self.voxel < 0:
+            raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralOptions(AnchorOptions):
+    """Anchors decoded by networks."""
+
+    offsets: int
+    """k: Gaussians per anchor."""
+    heads: HeadOptions
+    rates: NeuralRates
+    head_rates: HeadRates
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitOptions(AnchorOptions):
+    """Anchors of one explicit Gaussian each."""
+
+    rates: ExplicitRates
+    sh_degree: int
+    sh_every: int
+    """Published steps between SH degrees."""
+    initial_opacity: float
+
+
+def neural_anchors(options: NeuralOptions, beginning: Beginning) -> "Anchors":
+    """The backbones scaffold and octree_scaffold."""
+    heads = Heads(options.heads, options.offsets, len(beginning.scene.train), beginning.generator)
+    return Anchors(options, beginning, Neural(heads.to(beginning.device)), heads, options.head_rates)
+
+
+def explicit_anchors(options: ExplicitOptions, beginning: Beginning) -> "Anchors":
+    """The backbone octree_gs3d in its official form."""
+    logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
+    representation = Explicit(options.sh_degree, logit)
+    return Anchors(options, beginning, representation, None, None, (options.sh_degree, options.sh_every))
+
+
+def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:
+    """Median over points of the mean squared distance to three neighbours, or its root (spec 2.1)."""
+    ordered = mean_square_distance(points).sort().values
+    median = float(ordered[int(0.5 * len(ordered))].clamp_min(LEAST_SQUARE_DISTANCE))
+    return median if squared else math.sqrt(median)
+
+
+def voxel_nodes(points: Float[Tensor, "P 3"], voxel: float) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "P"]]:
+    """(grid nodes with a point next to them, node of each point) (spec 2.1)."""
+    cells, inverse = torch.unique(nodes_of(points, voxel), dim=0, return_inverse=True)
+    return (cells.double() * voxel).float(), inverse
+
+
+class Anchors:
+    """N anchors at fixed places, k Gaussians each."""
+
+    absolute_gradient = False
+    standard_file = False
+
+    def __init__(
+        self,
+        options: NeuralOptions | ExplicitOptions,
+        beginning: Beginning,
+        representation: Representation,
+        heads: Heads | None,
+        head_rates: HeadRates | None,
+        sh: tuple[int, int] = (0, 1),
+    ) -> None:
+        scene = beginning.scene
+        if len(scene.points) == 0:
+            raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
+        self.options, self.representation, self.heads, self.head_rates, self.sh = (
+            options,
+            representation,
+            heads,
+            head_rates,
+            sh,
+        )
+        self.quirks = resolved(options.quirks, options.fidelity)
+        self.extent, self.generator, self.device = scene.extent, beginning.generator, beginning.device
+        self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
+        self.cameras = [view.camera for view in scene.train]
+        self.views = {camera: number for number, camera in enumerate(self.cameras)}
+        self.schedule = beginning.schedule(options.published_iterations)
+        self.step = 0
+        self.last: tuple[Decoded, Drawn] | None = None
+        self.levels: Levels | None = None
+        self.voxel = options.voxel
+        self.table = self.initial_table(scene.points)
+        self.head_optimiser = self.initial_optimiser()
+        self.refresh_filter()
+
+    # -- the beginning -----------------------------------------------------------------------------------------
+
+    def initial_table(self, points: PointCloud) -> Table:
+        """Anchors on the grid nodes next to the points (spec 2.1 and 3.3)."""
+        positions, columns, owner, source = self.initial_anchors(points.positions.float())
+        colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
+        squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
+        rows = self.representation.rows(0.5 * squares.log(), colours)
+        columns |= fresh_statistics(len(positions), self.representation.offsets, self.device) | {"anchors": positions}
+        return Table(
+            {name: Parameter(value.to(self.device)) for name, value in rows.items()},
+            {name: value.to(self.device) for name, value in columns.items()},
+        )
+
+    def initial_anchors(
+        self, points: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "N 3"], dict[str, Tensor], Int[Tensor, "Q"], Int[Tensor, "Q"]]:
+        """(positions, columns of levels, anchor and point of each point-anchor pair)."""
+        if self.options.levels is None:
+            self.voxel = self.options.voxel or automatic_voxel(points, self.quirks.voxel == "squared")
+            positions, owner = voxel_nodes(points, self.voxel)
+            return positions, {}, owner, torch.arange(len(points))
+        until = self.schedule.step(self.options.levels.coarse_until)
+        self.levels = derive(points, self.cameras, self.options.levels, until)
+        positions, of, group = initial_nodes(points, self.levels)
+        for warning in warnings_of(self.levels, len(of)):
+            logger.warning("%s", warning)
+        source = torch.arange(len(points)).repeat(self.levels.count)
+        return positions, {"level": of, "bias": torch.zeros(len(of))}, group.flatten(), source
+
+    def initial_optimiser(self) -> torch.optim.Adam | None:
+        """Adam for the heads, a group each; None without heads."""
+        if self.heads is None:
+            return None
+        groups = [
+            {"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in self.heads.named_children()
+        ]
+        return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+    # -- one step, in the order the trainer calls --------------------------------------------------------------
+
+    def begin(self, step: int) -> None:
+        """Learning rates of this step (spec 2.7)."""
+        self.step, steps = step, self.schedule.step(self.options.published_iterations)
+        for name in self.table.parameters:
+            unit = self.extent if name == "offsets" else 1.0
+            self.table.set_rate(name, unit * getattr(self.options.rates, name).at(step, steps))
+        for group in self.head_optimiser.param_groups if self.head_optimiser else ():
+            group["lr"] = getattr(self.head_rates, group["name"]).at(step, steps)
+
+    def splats(self, camera: Camera) -> Splats:
+        """The Gaussians of the anchors that the camera sees at its distance."""
+        taking_part = self.drawn(camera)
+        decoded = self.representation.decode(self.table, taking_part, self.filters_of(taking_part.rows))
+        self.last = (decoded, taking_part)
+        return decoded.splats
+
+    def drawn(self, camera: Camera) -> Drawn:
+        """Anchors of the levels that the camera draws, of which those in view (spec 3.5, 2.5)."""
+        anchors = self.table["anchors"]
+        weights = torch.ones_like(anchors[:, 0])
+        rows = torch.arange(len(anchors), device=anchors.device)
+        if self.levels is not None:
+            mask, weights = drawn(self.levels, anchors, self.table["level"], self.table["bias"], camera, self.highest())
+            rows = rows[mask]
+        reach = self.table["log_scales"].detach()[rows, :3].exp()
+        seen = touches(anchors[rows], reach, self.representation.quats(self.table).detach()[rows], camera, self.raster)
+        rows = rows[seen]
+        degree, every = self.sh
+        degree = min(degree, self.step // max(1, self.schedule.step(every)))
+        return Drawn(rows=rows, weights=weights[rows], camera=camera, view=self.views.get(camera, -1), sh_degree=degree)
+
+    def highest(self) -> int:
+        """Highest level that takes part at this step (spec 3.6)."""
+        assert self.levels is not None
+        return min(self.levels.count - 1, unlocked(self.levels.switches, self.levels.first, self.step))
+
+    def regulariser(self) -> Float[Tensor, ""] | None:
+        """Mean volume of the Gaussians drawn; 0 for none (spec 1.3)."""
+        if self.last is None or not self.options.volume_weight:
+            return None
+        volumes = self.last[0].splats.scales.prod(1)
+        return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
+
+    def observe(self, rendering: Rendering, step: int) -> None:
+        """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
+        growth = self.options.growth
+        if self.last is None or not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
+            return
+        (decoded, taking_part), screen = self.last, rendering.screen
+        norms = screen.ndc_gradient(screen.shift)[screen.visible].norm(dim=1)
+        slots = decoded.slots[screen.ids[screen.visible]]
+        observe(self.table, taking_part.rows, decoded.opacities, slots, norms.to(decoded.opacities))
+
+    def adapt(self, step: int) -> dict[str, int]:
+        """Grow and prune when due (spec 2.6)."""
+        if self.growth_due(step):
+            done = self.adapt_now()
+            self.refresh_filter()
+            return done
+        return {}
+
+    def update(self) -> None:
+        """One Adam step of anchors and heads."""
+        self.table.optimiser.step()
+        if self.head_optimiser is not None:
+            self.head_optimiser.step()
+        self.discard()
+
+    def gradients(self) -> Iterable[tuple[str, Tensor]]:
+        """Gradients by parameter name."""
+        named = [*self.table.parameters.items(), *self.head_parameters()]
+        return ((name, p.grad) for name, p in named if p.grad is not None)
+
+    def head_parameters(self) -> list[tuple[str, Parameter]]:
+        """Names and values of the heads' parameters."""
+        return [] if self.heads is None else [(f"heads.{name}", p) for name, p in self.heads.named_parameters()]
+
+    def heal(self) -> int:
+        """Remove anchors with a value that is not finite; returns how many."""
+        kept = finite_rows(self.table)
+        keep_rows(self.table, kept)
+        return int((~kept).sum())
+
+    def discard(self) -> None:
+        """Forget the gradients and the picture they came from."""
+        self.last = None
+        self.table.optimiser.zero_grad(set_to_none=True)
+        if self.head_optimiser is not None:
+            self.head_optimiser.zero_grad(set_to_none=True)
+
+    # -- growing and pruning -----------------------------------------------------------------------------------
+
+    def growth_due(self, step: int) -> bool:
+        """After `start`, before `stop`, every interval."""
+        growth = self.options.growth
+        start, stop = self.schedule.step(growth.start), self.schedule.step(growth.stop)
+        return start < step < stop and step % self.schedule.interval(growth.every) == 0
+
+    def adapt_now(self) -> dict[str, int]:
+        """Grow, forget what was judged, prune, clamp: the order of the reference (spec 2.9, 2.10)."""
+        growth = self.options.growth
+        visits = growth.success * self.schedule.interval(growth.every)
+        enough, _ = eligible(self.table, visits / 2)
+        grown = self.grow(visits / 2) if len(self.table) < self.options.max_primitives else 0
+        reset_offsets(self.table, enough)
+        pruned = prune(self.table, growth, visits)
+        unit = math.log(self.extent) if self.quirks.clamp == "extent" else 0.0
+        clamp_scales(self.table, growth.largest_log_scale + unit)
+        return {"grown": grown, "pruned": pruned}
+
+    def grow(self, least: float) -> int:
+        """By depth without levels, by level with them; returns how many anchors grew."""
+        if self.levels is None:
+            stop = self.quirks.early_stop == "yes"
+            return grow_by_depth(
+                self.table, self.representation, self.options.growth, self.voxel, least, stop, self.generator
+            )
+        gate = self.quirks.gate == "open" or self.highest() == self.levels.count - 1
+        return grow_by_level(
+            self.table, self.representation, self.options.growth, self.levels, least, self.quirks, gate
+        )
+
+    def refresh_filter(self) -> None:
+        """Filter sizes of the anchors, which their Gaussians share; anchors stay where they are (spec 10.1)."""
+        if self.options.filter == "mip":
+            self.table.columns["filter"] = filter_sizes(self.table["anchors"], self.cameras, self.options.mip)
+
+    # -- what others need --------------------------------------------------------------------------------------
+
+    def size(self) -> tuple[int, int]:
+        """(anchors, bytes of parameters, positions, levels and heads)."""
+        stored = [*self.table.parameters.values(), self.table["anchors"], *(p for _, p in self.head_parameters())]
+        stored += [self.table[name] for name in ("level", "bias", "filter") if name in self.table.columns]
+        return len(self.table), sum(value.numel() * value.element_size() for value in stored)
+
+    def explicit(self, camera: Camera | None = None) -> Gaussians:
+        """The Gaussians drawn for a camera; without one those of all anchors, of explicit representations only."""
+        if camera is None and self.heads is not None:
+            raise InputError(
+                f"backbone {self.options.name} decodes its Gaussians for one camera at a time, so there are none that "
+                "hold for all: export those of a view, `gsx export RUN FILE.ply --view NAME`"
+            )
+        return self.representation.explicit(self.decoded(camera), self.table)
+
+    @torch.no_grad()
+    def decoded(self, camera: Camera | None) -> Decoded:
+        """What a camera draws, or all anchors of all levels as seen from anywhere."""
+        rows = torch.arange(len(self.table), device=self.device)
+        everything = Drawn(
+            rows=rows,
+            weights=torch.ones_like(self.table["anchors"][:, 0]),
+            camera=self.cameras[0],
+            view=-1,
+            sh_degree=self.sh[0],
+        )
+        taking_part = everything if camera is None else self.drawn(camera)
+        return self.representation.decode(self.table, taking_part, self.filters_of(taking_part.rows))
+
+    def filters_of(self, rows: Int[Tensor, "A"]) -> Float[Tensor, "A"] | None:
+        """Sizes of the 3D filter, None without one."""
+        return self.table["filter"][rows] if self.options.filter == "mip" else None
+
+    def file(self) -> dict[str, Tensor]:
+        """Columns of the published files of each form (spec 5.1): one row per anchor, raw values."""
+        columns = dict(zip("xyz", self.table["anchors"].unbind(1), strict=True))
+        if self.levels is not None:
+            columns |= {"level": self.table["level"].float(), "extra_level": self.table["bias"]}
+        return columns | self.representation.columns(self.table, self.levels)
+
+    def export_notes(self) -> list[str]:
+        """Whether the 3D filter is in the file."""
+        return ["3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"]
+
+    def plan(self) -> dict[str, Any]:
+        """The schedule in steps of this run, and what was derived from the scene."""
+        growth, steps = self.options.growth, self.schedule
+        plan: dict[str, Any] = {
+            "grow": {
+                "from": steps.step(growth.start),
+                "until": steps.step(growth.stop),
+                "every": steps.interval(growth.every),
+            },
+            "anchors": {"count": len(self.table)} | ({"voxel": self.voxel} if self.levels is None else {}),
+        }
+        if self.levels is not None:
+            plan["levels"] = facts_of(self.levels, self.table["level"])
+        return plan
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Parameters, columns, heads, and all Adam states."""
+        out = table_tensors(self.table)
+        for name, parameter in self.head_parameters():
+            assert self.head_optimiser is not None
+            out[name] = parameter.detach()
+            out |= adam_tensors(name, parameter, self.head_optimiser)
+        return out
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take back what `tensors` gave."""
+        self.table = restored_table(self.table, tensors, self.device)
+        for name, parameter in self.head_parameters():
+            assert self.head_optimiser is not None
+            with torch.no_grad():
+                parameter.copy_(tensors[name])
+            restore_adam(name, parameter, self.head_optimiser, tensors, self.device)

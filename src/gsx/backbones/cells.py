@@ -1,0 +1,55 @@
+"""Cells of a grid as rows of integers: which are new, and what falls into each (spec 1.7 and 2.9)."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsx.core.shapes import Float, Int
+
+LARGEST_KEY = 2**63 - 1
+
+
+def pooled_max(values: Float[Tensor, "M ..."], group: Int[Tensor, "M"], count: int) -> Float[Tensor, "U ..."]:
+    """Elementwise maximum of the rows of each group, `count` of them; -inf where a group has none.
+
+    Rows of group -1 are left out.
+    """
+    known = group >= 0
+    rows = values[known]
+    index = group[known].long().reshape(-1, *[1] * (rows.dim() - 1)).expand_as(rows)
+    out = values.new_full((count, *values.shape[1:]), -math.inf)
+    return out.scatter_reduce_(0, index, rows, "amax")
+
+
+def new_cells(candidates: Int[Tensor, "M 3"], taken: Int[Tensor, "T 3"]) -> tuple[Int[Tensor, "U 3"], Int[Tensor, "M"]]:
+    """(cells, group): every candidate cell that is not taken, once, in lexicographic order; and the row among those
+    of each candidate's cell, -1 where it is taken."""
+    if len(candidates) == 0:
+        return candidates, candidates.new_empty(0)
+    keys = cell_keys(torch.cat([candidates, taken]))
+    found, place = keys[: len(candidates)].unique(return_inverse=True)
+    fresh = ~torch.isin(found, keys[len(candidates) :])
+    number = torch.where(fresh, fresh.cumsum(0) - 1, -1)
+    cells = candidates.new_empty(len(found), 3)
+    cells[place] = candidates  # equal rows meet in one place
+    return cells[fresh], number[place]
+
+
+def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
+    """One integer per cell, equal for equal cells and ordered as the cells are, lexicographically."""
+    low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
+    _, height, depth = lengths = [last - first + 1 for first, last in zip(low, high, strict=True)]
+    if math.prod(lengths) > LARGEST_KEY:
+        return ranked_keys(cells)
+    x, y, z = (cells - cells.amin(0)).unbind(1)
+    return (x * height + y) * depth + z
+
+
+def ranked_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
+    """The same for cells however far apart: coordinates and pairs are ranked, so that no product exceeds M^2."""
+    keys = torch.zeros_like(cells[:, 0])
+    for coordinate in cells.unbind(1):
+        found, rank = coordinate.unique(return_inverse=True)
+        keys = (keys * len(found) + rank).unique(return_inverse=True)[1]
+    return keys

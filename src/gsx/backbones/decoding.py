@@ -1,0 +1,238 @@
+"""Two ways in which an anchor stands for Gaussians: networks (Scaffold-GS) and explicit harmonics (Octree-AnyGS)."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid, normalize
+
+from gsx.backbones.heads import Heads
+from gsx.backbones.levels import Levels
+from gsx.backbones.mip import logit_of_log, smoothed
+from gsx.core.backbone import Gaussians
+from gsx.core.camera import Camera
+from gsx.core.density import Table
+from gsx.core.rasterizer import take_rows
+from gsx.core.sh import colours_of, constant_from_colour
+from gsx.core.shapes import Float, Int
+from gsx.core.splats import Splats
+
+LARGEST_LOG_SCALE = 30.0
+"""Lengths are held below e^30 world units, so that their squares stay finite in float32."""
+INERT_LOGIT = math.log(0.1 / 0.9)
+"""Opacity of an anchor in published files; nothing uses it (spec 2.2)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Drawn:
+    """Anchors that take part in a picture."""
+
+    rows: Int[Tensor, "A"]
+    weights: Float[Tensor, "A"]
+    """Factor of their opacities: below 1 where a level fades in."""
+    camera: Camera
+    view: int
+    """Number of the training view, -1 for any other camera."""
+    sh_degree: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Decoded:
+    """The Gaussians of one picture and where they come from."""
+
+    splats: Splats
+    slots: Int[Tensor, "M"]
+    """Anchor row times k plus the number of the offset."""
+    opacities: Float[Tensor, "A k"]
+    """Opacity of every offset of the anchors drawn, without gradient; what is not drawn counts as 0."""
+
+
+class Representation(Protocol):
+    """What an anchor holds, and how it is decoded."""
+
+    offsets: int
+    """k: Gaussians per anchor."""
+    pooled: tuple[str, ...]
+    """Parameters that a new anchor takes from its parents, as their largest values."""
+
+    def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
+        """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
+        ...
+
+    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+        """The Gaussians of the anchors drawn, differentiable."""
+        ...
+
+    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+        """Rotations of the anchors as ellipsoids, for the pre-filter (spec 2.5)."""
+        ...
+
+    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+        """The Gaussians decoded, as a standard splat file holds them."""
+        ...
+
+    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+        """What follows positions and levels in the published file of this representation (spec 5.1)."""
+        ...
+
+
+def lengths(log_scales: Float[Tensor, "A 3"]) -> Float[Tensor, "A 3"]:
+    """exp, finite when squared."""
+    return log_scales.clamp(max=LARGEST_LOG_SCALE).exp()
+
+
+def identity_quats(values: Float[Tensor, "N *rest"]) -> Float[Tensor, "N 4"]:
+    """(1, 0, 0, 0) for every row of `values`."""
+    return values.new_tensor([1.0, 0, 0, 0]).expand(len(values), 4)
+
+
+def numbered(prefix: str, values: Float[Tensor, "N V"]) -> dict[str, Float[Tensor, "N"]]:
+    """Columns of a file, by number."""
+    return {f"{prefix}{i}": column.detach() for i, column in enumerate(values.unbind(1))}
+
+
+def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M B 3"]) -> Gaussians:
+    """Gaussians of a standard file that draw these splats."""
+    return Gaussians(
+        means=splats.means.detach(),
+        log_scales=splats.scales.detach().log(),
+        quats=normalize(splats.quats.detach(), dim=1),
+        opacity_logits=logit_of_log(splats.log_opacities.detach()),
+        sh_constant=constant.detach(),
+        sh_rest=rest,
+    )
+
+
+class Neural:
+    """Features decoded by networks into k Gaussians, of which those with positive opacity are drawn (spec 2.2-2.4)."""
+
+    pooled: tuple[str, ...] = ("features",)
+
+    def __init__(self, heads: Heads) -> None:
+        self.heads = heads
+        self.offsets = heads.offsets
+
+    def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
+        """Zero features and offsets."""
+        count = len(log_lengths)
+        return {
+            "offsets": log_lengths.new_zeros(count, self.offsets, 3),
+            "features": log_lengths.new_zeros(count, self.heads.options.features),
+            "log_scales": log_lengths[:, None].repeat(1, 6),
+        }
+
+    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+        """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (spec 2.4)."""
+        rows, k = drawn.rows, self.offsets
+        anchors = table["anchors"][rows]
+        raw, shapes, colours = self.heads(
+            take_rows(table["features"], rows),
+            anchors - drawn.camera.centre.to(anchors),
+            table["level"][rows, None].to(anchors) if "level" in table.columns else torch.zeros_like(anchors[:, :1]),
+            drawn.view,
+        )
+        opacities = raw * drawn.weights[:, None]
+        chosen = (opacities.detach() > 0).view(-1).nonzero()[:, 0]
+        owner = chosen // k
+        size = lengths(take_rows(table["log_scales"], rows)).index_select(0, owner)
+        shape = take_rows(shapes.reshape(-1, 7), chosen)
+        scales, log_opacities = size[:, 3:] * shape[:, :3].sigmoid(), take_rows(opacities.view(-1), chosen).log()
+        if filters is not None:
+            scales, log_opacities = smoothed(scales, log_opacities, filters[owner])
+        splats = Splats(
+            means=anchors[owner] + take_rows(take_rows(table["offsets"], rows).view(-1, 3), chosen) * size[:, :3],
+            scales=scales,
+            quats=shape[:, 3:],
+            log_opacities=log_opacities,
+            colours=take_rows(colours.reshape(-1, 3), chosen),
+        )
+        return Decoded(splats=splats, slots=rows[owner] * k + chosen % k, opacities=opacities.detach().clamp_min(0))
+
+    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+        """An anchor's own rotation never learns in the reference, so it is the identity (spec 2.2)."""
+        return identity_quats(table["anchors"])
+
+    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+        """Colours as the camera saw them, in the constant band."""
+        colours = constant_from_colour(decoded.splats.colours)
+        return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
+
+    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+        """79 floats a row with the position; what never learns has its initial value (spec 2.2)."""
+        zeros = torch.zeros_like(table["anchors"][:, 0])
+        if levels is None:
+            head = dict.fromkeys(("nx", "ny", "nz"), zeros)
+        else:
+            head = {"info": torch.cat([zeros.new_tensor([levels.cell, levels.farthest]), zeros])[: len(zeros)]}
+        return (
+            head
+            | numbered("f_offset_", table["offsets"].transpose(1, 2).flatten(1))
+            | numbered("f_anchor_feat_", table["features"])
+            | {"opacity": torch.full_like(zeros, INERT_LOGIT)}
+            | numbered("scale_", table["log_scales"])
+            | numbered("rot_", self.quats(table))
+        )
+
+
+class Explicit:
+    """One Gaussian per anchor with spherical harmonics of its own, all of them drawn (spec 4A)."""
+
+    offsets = 1
+    pooled: tuple[str, ...] = ("sh_constant", "sh_rest")
+
+    def __init__(self, sh_degree: int, initial_logit: float) -> None:
+        self.sh_degree, self.initial_logit = sh_degree, initial_logit
+
+    def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
+        """The colour in the constant band, opacity as configured, no offset."""
+        count = len(log_lengths)
+        return {
+            "offsets": log_lengths.new_zeros(count, 1, 3),
+            "log_scales": log_lengths[:, None].repeat(1, 6),
+            "quats": identity_quats(log_lengths).clone(),
+            "opacity_logits": torch.full_like(log_lengths, self.initial_logit),
+            "sh_constant": constant_from_colour(colours.to(log_lengths))[:, None],
+            "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
+        }
+
+    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+        """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
+        rows = drawn.rows
+        row = {name: take_rows(table[name], rows) for name in table.parameters}
+        size = lengths(row["log_scales"])
+        means = table["anchors"][rows] + row["offsets"][:, 0] * size[:, :3]
+        scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + drawn.weights.log()
+        opacities = log_opacities.detach().exp()[:, None]
+        if filters is not None:
+            scales, log_opacities = smoothed(scales, log_opacities, filters)
+        offsets = means - drawn.camera.centre.to(means)
+        splats = Splats(
+            means=means,
+            scales=scales,
+            quats=row["quats"],
+            log_opacities=log_opacities,
+            colours=colours_of(row["sh_constant"], row["sh_rest"], offsets, drawn.sh_degree),
+        )
+        return Decoded(splats=splats, slots=rows, opacities=opacities)
+
+    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+        """The Gaussian's own."""
+        return table["quats"]
+
+    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+        """All bands."""
+        rows = decoded.slots
+        return baked(decoded.splats, table["sh_constant"].detach()[rows, 0], table["sh_rest"].detach()[rows])
+
+    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+        """67 floats a row with position and level at degree 3; f_rest is channel-major."""
+        return (
+            numbered("f_offset_", table["offsets"].flatten(1))
+            | numbered("f_dc_", table["sh_constant"][:, 0])
+            | numbered("f_rest_", table["sh_rest"].transpose(1, 2).flatten(1))
+            | {"opacity": table["opacity_logits"]}
+            | numbered("scale_", table["log_scales"])
+            | numbered("rot_", table["quats"])
+        )

@@ -1,0 +1,383 @@
+"""How anchors come and go (Scaffold-GS, spec 2.8-2.10; Octree-GS, spec 3.8-3.9). Pure functions over a table.
+
+Growing looks at offsets: where an offset's Gaussian has a large screen gradient, the empty grid cell that it lies in
+gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells of the anchor's own level and the next.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.backbones.cells import new_cells, pooled_max
+from gsx.backbones.decoding import Representation
+from gsx.backbones.levels import Levels, kept, thresholds
+from gsx.core.density import Table, append_rows, keep_rows
+from gsx.core.shapes import Bool, Float, Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrowthOptions:
+    """Numbers of growing and pruning, in steps of the published run; values in conf/backbone, with their sources."""
+
+    observe_from: int
+    start: int
+    stop: int
+    every: int
+    success: float
+    """Fraction of an interval's steps in which an anchor must have been visited before it is judged; offsets: half."""
+    gradient: float
+    """Mean NDC gradient above which an offset grows an anchor."""
+    prune_opacity: float
+    """Anchors whose opacities sum to less than this per visit are removed."""
+    largest_log_scale: float
+    """While growing, log-scales of the Gaussians are held below this; see `Quirks.clamp`."""
+    depths: int
+    """Without levels: sizes of cells tried in turn."""
+    hierarchy: int
+    """Without levels: each size is this much smaller, its threshold half as many times larger."""
+    coarsest: int
+    """Without levels: voxels along the largest cell."""
+    update_ratio: float
+    """With levels: the threshold grows by fork ** this per level."""
+    bias_gradient: float
+    """With levels: anchors with this fraction of the threshold are drawn from a little farther."""
+    bias_step: float
+    """With levels: by how much, in levels."""
+    overlap: bool
+    """With levels: cells that hold an anchor may get another."""
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or not 0 < self.success <= 1:
+            raise ValueError("backbone.growth.every must be at least 1 and success above 0, at most 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quirks:
+    """Behaviour of the reference code that published numbers depend on; '' takes the value of `fidelity` (spec 10)."""
+
+    early_stop: str
+    """yes: if the coarsest cells grow nothing, finer ones are not tried (Scaffold-GS)."""
+    clamp: str
+    """world: log-scales are held below growth.largest_log_scale of world units; extent: of the extent."""
+    voxel: str
+    """squared: the automatic voxel is the median mean SQUARED neighbour distance (Scaffold-GS); distance: its root."""
+    gate: str
+    """open: promotion and bias from the first growth (a bug of Octree-GS); closed: once all levels are in training."""
+    bias: str
+    """all: bias also anchors of other levels, without limit (Octree-GS); own: of the level at hand, at most 1."""
+    finest: str
+    """bounded: the strongest gradients of the finest level grow nothing (Octree-GS); open: they do."""
+    promoted: str
+    """zeros: features of anchors promoted to the next level (Octree-GS); max: of their parents."""
+    duplicates: str
+    """next: promotion looks for a free cell among the next level's; own: its own, as in published tables (a bug)."""
+
+
+CHOICES = {
+    "early_stop": ("yes", "no"),
+    "clamp": ("world", "extent"),
+    "voxel": ("squared", "distance"),
+    "gate": ("open", "closed"),
+    "bias": ("all", "own"),
+    "finest": ("bounded", "open"),
+    "promoted": ("zeros", "max"),
+    "duplicates": ("next", "own"),
+}
+"""Values of each quirk, the reference's first."""
+SANE = {name: values[1] for name, values in CHOICES.items()} | {"duplicates": "next"}
+FIDELITIES = {"reference": {name: values[0] for name, values in CHOICES.items()}, "sane": SANE}
+
+
+def resolved(quirks: Quirks, fidelity: str) -> Quirks:
+    """Every switch that is '' as the fidelity has it.
+
+    Raises:
+        ValueError: a value is unknown; it and the known ones are named.
+    """
+    if fidelity not in FIDELITIES:
+        raise ValueError(f"backbone.fidelity is '{fidelity}'; choose {' or '.join(FIDELITIES)}")
+    values = {name: value or FIDELITIES[fidelity][name] for name, value in vars(quirks).items()}
+    for name, value in values.items():
+        if value not in CHOICES[name]:
+            raise ValueError(f"backbone.quirks.{name} is '{value}'; choose {' or '.join(CHOICES[name])}")
+    return Quirks(**values)
+
+
+# -- statistics ------------------------------------------------------------------------------------------------------
+
+
+def fresh_statistics(count: int, offsets: int, device: torch.device | str) -> dict[str, Tensor]:
+    """Columns of `count` anchors that nothing has been seen of."""
+    return {
+        "opacity_sum": torch.zeros(count, device=device),
+        "visits": torch.zeros(count, device=device),
+        "gradient_sum": torch.zeros(count, offsets, device=device),
+        "gradient_count": torch.zeros(count, offsets, device=device),
+    }
+
+
+@torch.no_grad()
+def observe(
+    table: Table,
+    rows: Int[Tensor, "A"],
+    opacities: Float[Tensor, "A k"],
+    slots: Int[Tensor, "M"],
+    gradients: Float[Tensor, "M"],
+) -> None:
+    """Count one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (spec 2.8).
+
+    `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets.
+    """
+    table["opacity_sum"][rows] += opacities.sum(1)
+    table["visits"][rows] += 1
+    table["gradient_sum"].view(-1).index_add_(0, slots, gradients)
+    table["gradient_count"].view(-1).index_add_(0, slots, torch.ones_like(gradients))
+
+
+def eligible(table: Table, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
+    """(offsets seen more than `least` times, their mean gradients; 0 for the others) (spec 2.9)."""
+    count = table["gradient_count"]
+    enough = count > least
+    return enough, torch.where(enough, table["gradient_sum"] / count.clamp_min(1), 0.0)
+
+
+# -- growing ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sprouts:
+    """New anchors of one cell size."""
+
+    positions: Float[Tensor, "U 3"]
+    size: float
+    """Of the cell, world units: the initial length of all six scales."""
+    parents: Int[Tensor, "P"]
+    """Anchor rows whose offsets lie in a new cell."""
+    group: Int[Tensor, "P"]
+    """Row of `positions` of each parent."""
+    inherit: bool
+    """Whether the largest values of the parents are taken over."""
+    level: int
+
+
+def offset_means(table: Table) -> Float[Tensor, "N k 3"]:
+    """Where every offset's Gaussian is, world units."""
+    reach = table["log_scales"].detach()[:, None, :3].exp()
+    return table["anchors"][:, None] + table["offsets"].detach() * reach
+
+
+def sprout(
+    table: Table,
+    candidates: Bool[Tensor, "N k"],
+    cells: Int[Tensor, "M 3"],
+    taken: Int[Tensor, "T 3"],
+    origin: float,
+    size: float,
+    *,
+    inherit: bool = True,
+    level: int = 0,
+) -> Sprouts:
+    """New anchors in the cells of the M candidates that none of the cells taken is."""
+    fresh, group = new_cells(cells, taken)
+    parents = candidates.nonzero()[:, 0]
+    inside = group >= 0
+    return Sprouts(
+        positions=(fresh.double() * size + origin).to(table["anchors"]),
+        size=size,
+        parents=parents[inside],
+        group=group[inside],
+        inherit=inherit,
+        level=level,
+    )
+
+
+def add_anchors(table: Table, sprouts: Sprouts, representation: Representation) -> int:
+    """Append the sprouts with fresh statistics; returns how many."""
+    count, like = len(sprouts.positions), table["anchors"]
+    if count == 0:
+        return 0
+    log_lengths = torch.full((count,), math.log(sprouts.size), dtype=like.dtype, device=like.device)
+    rows = representation.rows(log_lengths, torch.full_like(sprouts.positions, 0.5))
+    if sprouts.inherit:
+        rows |= {n: pooled_max(table[n].detach()[sprouts.parents], sprouts.group, count) for n in representation.pooled}
+    rows |= fresh_statistics(count, representation.offsets, like.device) | {"anchors": sprouts.positions}
+    rows |= {name: torch.zeros(count, device=like.device) for name in ("bias", "filter") if name in table.columns}
+    if "level" in table.columns:
+        rows["level"] = torch.full((count,), sprouts.level, dtype=torch.int16, device=like.device)
+    append_rows(table, rows)
+    return count
+
+
+def grow_by_depth(
+    table: Table,
+    representation: Representation,
+    options: GrowthOptions,
+    voxel: float,
+    least: float,
+    early_stop: bool,
+    generator: torch.Generator,
+) -> int:
+    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9); returns how many grew."""
+    enough, gradient = eligible(table, least)
+    means, grown = offset_means(table), 0
+    for depth in range(options.depths):
+        multiple = options.coarsest // options.hierarchy**depth
+        if multiple == 0:  # the reference divides by it (spec 2.9)
+            continue
+        chance = torch.rand(enough.shape, generator=generator).to(enough.device)
+        threshold = options.gradient * (options.hierarchy // 2) ** depth
+        candidates = enough & (gradient >= threshold) & (chance > 0.5 ** (depth + 1))
+        size = voxel * multiple
+        found = sprout(
+            table, candidates, nodes_of(means[candidates], size), nodes_of(table["anchors"], size), 0.0, size
+        )
+        grown += add_anchors(table, found, representation)
+        if early_stop and grown == 0:
+            break
+    return grown
+
+
+def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
+    """Nearest node of a grid through the world's origin, halves to even (spec 1.7)."""
+    return (positions.double() / size).round().long()
+
+
+def grow_by_level(
+    table: Table,
+    representation: Representation,
+    options: GrowthOptions,
+    levels: Levels,
+    least: float,
+    quirks: Quirks,
+    gate: bool,
+) -> int:
+    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (spec 3.8); how many grew.
+
+    `gate`: whether promotion and bias take place.
+    """
+    enough, gradient = eligible(table, least)
+    taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
+    means, of = offset_means(table), table["level"].clone()
+    mean_gradient = gradient.sum(1) / (enough.sum(1) + 1e-6)
+    grown = 0
+    for level in range(levels.count):
+        own = of == level
+        if not bool(own.any()):
+            continue
+        if gate:
+            bias_anchors(table, mean_gradient, own, options, taus[level], quirks)
+        for found in sprouts_of_level(
+            table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
+        ):
+            grown += add_anchors(table, found, representation)
+    return grown
+
+
+def bias_anchors(
+    table: Table,
+    gradient: Float[Tensor, "N"],
+    own: Bool[Tensor, "N"],
+    options: GrowthOptions,
+    threshold: float,
+    quirks: Quirks,
+) -> None:
+    """Let anchors with larger gradients be drawn from a little farther (spec 3.8, 1)."""
+    bias, count = table["bias"], len(gradient)
+    chosen = gradient >= options.bias_gradient * threshold
+    if quirks.bias == "own":
+        chosen = chosen & own
+    bias[:count] += options.bias_step * chosen
+    if quirks.bias == "own":
+        bias.clamp_max_(1.0)
+
+
+def sprouts_of_level(
+    table: Table,
+    enough: Bool[Tensor, "N k"],
+    gradient: Float[Tensor, "N k"],
+    means: Float[Tensor, "N k 3"],
+    level: int,
+    taus: tuple[float, ...],
+    levels: Levels,
+    options: GrowthOptions,
+    quirks: Quirks,
+    gate: bool,
+) -> Iterator[Sprouts]:
+    """Anchors on the same level, then promotions to the next (spec 3.8, 2 and 3)."""
+    last = level == levels.count - 1
+    below = gradient < taus[level + 1]
+    if last and quirks.finest == "open":
+        below = torch.ones_like(below)
+    yield weeded(
+        at_level(table, enough & (gradient >= taus[level]) & below, means, level, level, levels, options), levels
+    )
+    next_exists = options.overlap or bool((table["level"] == level + 1).any())
+    if gate and not last and next_exists:
+        compared = level if quirks.duplicates == "own" else level + 1
+        promoted = enough & (gradient >= taus[level + 1])
+        inherit = options.overlap or quirks.promoted == "max"
+        yield weeded(at_level(table, promoted, means, level + 1, compared, levels, options, inherit), levels)
+
+
+def at_level(
+    table: Table,
+    candidates: Bool[Tensor, "N k"],
+    means: Float[Tensor, "N k 3"],
+    level: int,
+    compared: int,
+    levels: Levels,
+    options: GrowthOptions,
+    inherit: bool = True,
+) -> Sprouts:
+    """Anchors in the cells of a level that no anchor of level `compared` holds; with overlap in all of them."""
+    occupied = table["anchors"][table["level"] == compared]
+    taken = levels.cells(occupied[:0] if options.overlap else occupied, level)
+    cells = levels.cells(means[candidates], level)
+    return sprout(table, candidates, cells, taken, levels.origin, levels.size(level), inherit=inherit, level=level)
+
+
+def weeded(sprouts: Sprouts, levels: Levels) -> Sprouts:
+    """Without those that too few cameras would draw (spec 3.4)."""
+    positions = sprouts.positions
+    of = torch.full((len(positions),), sprouts.level, dtype=torch.int16, device=positions.device)
+    keep = kept(levels, positions, of)
+    number = keep.cumsum(0) - 1
+    inside = keep[sprouts.group]
+    return Sprouts(
+        positions=positions[keep],
+        size=sprouts.size,
+        parents=sprouts.parents[inside],
+        group=number[sprouts.group[inside]],
+        inherit=sprouts.inherit,
+        level=sprouts.level,
+    )
+
+
+# -- after growing ---------------------------------------------------------------------------------------------------
+
+
+def reset_offsets(table: Table, enough: Bool[Tensor, "N k"]) -> None:
+    """Forget the gradients of the offsets that were judged; the others keep theirs over later intervals (spec 2.9)."""
+    for name in ("gradient_sum", "gradient_count"):
+        table[name][: len(enough)][enough] = 0
+
+
+def prune(table: Table, options: GrowthOptions, least: float) -> int:
+    """Remove anchors that were visited often and stayed faint; returns how many (spec 2.10)."""
+    ready = table["visits"] > least
+    doomed = ready & (table["opacity_sum"] < options.prune_opacity * table["visits"])
+    for name in ("opacity_sum", "visits"):
+        table[name][ready] = 0
+    if bool(doomed.all()):  # a cloud about to vanish keeps what it has
+        return 0
+    keep_rows(table, ~doomed)
+    return int(doomed.sum())
+
+
+def clamp_scales(table: Table, largest: float) -> None:
+    """Hold the log-scales of the Gaussians, not the reach of the offsets, below a limit (spec 2.10)."""
+    with torch.no_grad():
+        table["log_scales"][:, 3:].clamp_(max=largest)

@@ -1,0 +1,121 @@
+"""The small networks that turn an anchor, seen from a camera, into Gaussians (Scaffold-GS; spec 2.3, 2.4, 2.11)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gsx.core.shapes import Float
+
+LEAST_DISTANCE = 1e-8
+"""World units; a camera exactly at an anchor has no direction to it (spec 7, item 2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadOptions:
+    """Shape of the networks; values in conf/backbone, with their sources."""
+
+    features: int
+    """C: width of an anchor's feature and of the one hidden layer of every head."""
+    bank: bool
+    """Mix the feature with coarser copies of itself by view (spec 2.3, feature bank)."""
+    bank_distance: bool
+    """The bank sees the distance as well as the direction (Scaffold-GS yes, Octree-GS no)."""
+    opacity_distance: bool
+    covariance_distance: bool
+    colour_distance: bool
+    """Feed the distance between camera and anchor to a head."""
+    level: bool
+    """Feed an anchor's level to every head and to the bank (Octree-GS: add_level)."""
+    appearance: int
+    """Length of a training view's code, seen by the colour head; 0: none."""
+    appearance_code: int
+    """Code of any other camera: a training view's number; -1: the mean of all codes."""
+
+    def __post_init__(self) -> None:
+        if self.features < 4 or self.features % 4:
+            raise ValueError(f"backbone.heads.features is {self.features}; give a multiple of 4")
+        if self.appearance < 0:
+            raise ValueError(f"backbone.heads.appearance is {self.appearance}; give a length, or 0 for none")
+
+
+def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A layer with torch's default initial distribution, drawn from `generator`."""
+    layer, bound = nn.utils.skip_init(nn.Linear, inputs, outputs), 1 / math.sqrt(inputs)
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.uniform_(-bound, bound, generator=generator)
+    return layer
+
+
+def head(inputs: int, width: int, outputs: int, last: nn.Module, generator: torch.Generator) -> nn.Sequential:
+    """One hidden layer with ReLU."""
+    return nn.Sequential(
+        linear(inputs, width, generator), nn.ReLU(inplace=True), linear(width, outputs, generator), last
+    )
+
+
+def tiled(feature: Float[Tensor, "A C"], stride: int) -> Float[Tensor, "A C"]:
+    """Every `stride`-th value, the whole sub-vector repeated (not each value)."""
+    return feature[:, ::stride].repeat(1, stride)
+
+
+class Heads(nn.Module):
+    """Opacity, covariance and colour of k Gaussians per anchor."""
+
+    def __init__(self, options: HeadOptions, offsets: int, views: int, generator: torch.Generator) -> None:
+        super().__init__()
+        width, o = options.features, options
+        base = width + 3 + int(o.level)
+        self.options, self.offsets = options, offsets
+        self.opacity = head(base + int(o.opacity_distance), width, offsets, nn.Tanh(), generator)
+        self.covariance = head(base + int(o.covariance_distance), width, 7 * offsets, nn.Identity(), generator)
+        colour = base + int(o.colour_distance) + o.appearance
+        self.colour = head(colour, width, 3 * offsets, nn.Sigmoid(), generator)
+        if o.bank:
+            inputs = 3 + int(o.bank_distance) + int(o.level)
+            self.bank = head(inputs, width, 3, nn.Softmax(dim=1), generator)
+        if o.appearance:
+            self.appearance = nn.Embedding(
+                views, o.appearance, _weight=torch.randn(views, o.appearance, generator=generator)
+            )
+
+    def forward(
+        self,
+        feature: Float[Tensor, "A C"],
+        offset: Float[Tensor, "A 3"],
+        level: Float[Tensor, "A 1"],
+        view: int,
+    ) -> tuple[Float[Tensor, "A k"], Float[Tensor, "A k 7"], Float[Tensor, "A k 3"]]:
+        """(opacities in (-1, 1), raw scales and quaternions, colours in (0, 1)).
+
+        `offset` is anchor minus camera centre, world units; `view` the number of a training view, or -1.
+        """
+        o = self.options
+        distance = offset.norm(dim=1, keepdim=True)
+        direction = offset / distance.clamp_min(LEAST_DISTANCE)
+        extra = [level] if o.level else []
+        if o.bank:
+            feature = self.mixed(feature, [direction, *([distance] if o.bank_distance else []), *extra])
+
+        def seen(with_distance: bool, *more: Tensor) -> Tensor:
+            return torch.cat([feature, direction, *([distance] if with_distance else []), *extra, *more], 1)
+
+        code = [self.code(view).expand(len(feature), -1)] if o.appearance else []
+        return (
+            self.opacity(seen(o.opacity_distance)),
+            self.covariance(seen(o.covariance_distance)).view(-1, self.offsets, 7),
+            self.colour(seen(o.colour_distance, *code)).view(-1, self.offsets, 3),
+        )
+
+    def mixed(self, feature: Float[Tensor, "A C"], inputs: list[Tensor]) -> Float[Tensor, "A C"]:
+        """Features at three resolutions, weighted by view."""
+        weights = self.bank(torch.cat(inputs, 1))
+        parts = (tiled(feature, 4), tiled(feature, 2), feature)
+        return sum((weights[:, i : i + 1] * part for i, part in enumerate(parts)), start=torch.zeros_like(feature))
+
+    def code(self, view: int) -> Float[Tensor, "A"]:
+        """The appearance code of a training view, or the one chosen for all other cameras."""
+        number = view if view >= 0 else self.options.appearance_code
+        return self.appearance.weight[number] if number >= 0 else self.appearance.weight.mean(0)

@@ -1,0 +1,386 @@
+"""Levels of detail over any representation: which primitives a camera at a given distance sees (Octree-GS, spec 3).
+
+Level 0 is the coarsest; a camera at distance d draws every level up to log_f(D / (s d)): coarse levels always, finer
+ones are added. There are no pointers between levels, only nested grids with cells of v / f^L. Everything is a function
+of positions and levels and runs on the device of the positions; a backbone holds the level and the bias of each of its
+primitives and asks.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.backbones.cells import new_cells
+from gsx.core.camera import Camera
+from gsx.core.shapes import Bool, Float, Int
+
+MODES = ("round", "floor", "ceil", "progressive")
+EXTEND_RULES = ("reference", "sane")
+BELOW_ONE = 0.9999
+"""Largest fading weight and largest fraction of a level in progressive mode (spec 3.7); largest adaptive threshold."""
+LEAST_DISTANCE = 1e-8
+"""Distances are held above this fraction of the farthest: the logarithm of a camera at a primitive is finite."""
+MANY_LEVELS = 12
+NEAR_RATIO = 1e-3
+"""A nearest distance below this fraction of the farthest comes from points at cameras."""
+FEW_ANCHORS = 100
+MANY_ANCHORS = 5_000_000
+FLOAT_STEP = 2.0**-23
+"""Neighbouring float32 numbers differ by up to this fraction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelOptions:
+    """Options of the levels; values in conf/backbone, with their sources."""
+
+    fork: int
+    count: int
+    """Number of levels; -1: from the range of distances in the scene (spec 3.1)."""
+    first: int
+    """Highest level at the start; -1: half of them (spec 3.1)."""
+    base_layer: int
+    """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel` (spec 3.2)."""
+    voxel: float
+    """Cell of the middle level where base_layer is -1, scene units."""
+    distance_quantile: float
+    """Distances between this quantile and its mirror count, per camera and over cameras (spec 3.1)."""
+    extend: float
+    """The box is the points' range of coordinates times this (spec 3.2)."""
+    extend_rule: str
+    """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
+    box grows on both sides wherever it lies, to the same length (spec 3.2)."""
+    visible_threshold: float
+    """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
+    fraction (spec 3.4)."""
+    mode: str
+    """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (spec 3.7)."""
+    half_cell: bool
+    """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5)."""
+    coarse_until: int
+    """Published step at which all levels take part in training (spec 3.6); 0: from the start."""
+    coarse_factor: float
+    """Each interval between two levels is this much shorter than the one before (spec 3.6)."""
+
+    def __post_init__(self) -> None:
+        threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES)
+        self.demand("mode", self.mode in MODES, f"choose {', '.join(MODES)}")
+        self.demand("extend_rule", self.extend_rule in EXTEND_RULES, f"choose {rules}")
+        self.demand("fork", self.fork >= 2, "give at least 2")
+        self.demand("count", self.count == -1 or self.count >= 1, "give at least 1, or -1 to take it from the scene")
+        self.demand("first", self.first >= -1, "give a level from 0, or -1 for half of them")
+        self.demand("base_layer", self.base_layer >= -1, "give at least 0, or -1 to take it from voxel")
+        self.demand("voxel", self.voxel > 0, "give a length above 0")
+        self.demand("distance_quantile", 0.5 < self.distance_quantile <= 1, "give a value above 0.5, at most 1")
+        self.demand("extend", self.extend >= 1, "give at least 1")
+        self.demand("visible_threshold", threshold == -1 or 0 <= threshold < 1, "give -1, or from 0 to below 1")
+        self.demand("coarse_factor", self.coarse_factor >= 1, "give at least 1")
+
+    def demand(self, name: str, met: bool, advice: str) -> None:
+        """Refuse a value that does not meet a condition."""
+        if not met:
+            raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Viewpoints:
+    """Where the training cameras stand, and how coarsely each samples."""
+
+    centres: Float[Tensor, "V 3"]
+    """World, float32."""
+    coarseness: Float[Tensor, "V"]
+    """s: largest focal length over this camera's; a camera of half the focal length acts as if twice as far."""
+    focal: float
+    """The largest focal length, px."""
+
+
+def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
+    """The training cameras as levels of detail see them."""
+    focal = max(camera.fx for camera in cameras)
+    return Viewpoints(
+        centres=torch.stack([camera.centre.double() for camera in cameras]).float(),
+        coarseness=torch.tensor([focal / camera.fx for camera in cameras]),
+        focal=focal,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Levels:
+    """The levels of a scene, as numbers derived from it once."""
+
+    count: int
+    """K."""
+    fork: int
+    nearest: float
+    """Distance between cameras and points, low quantile; scene units, of the finest camera (spec 3.1)."""
+    farthest: float
+    """D: at this distance, seen by the finest camera, only level 0 is drawn."""
+    origin: float
+    """Each coordinate of node (0, 0, 0) of every grid."""
+    extent: float
+    """Length of the box around the points, scene units; 0 where all their coordinates are one number."""
+    base_layer: int
+    """Forks from the box to a cell of level 0."""
+    first: int
+    """Highest level in training at the start."""
+    switches: tuple[int, ...]
+    """Steps after which one more level takes part each (spec 3.6)."""
+    threshold: float
+    """Least fraction of cameras that must draw a primitive; see `LevelOptions.visible_threshold`."""
+    mode: str
+    half_cell: bool
+    views: Viewpoints
+
+    @property
+    def box(self) -> float:
+        """Length that is divided into cells, scene units: the extent, or D where that is 0."""
+        return self.extent or self.farthest
+
+    @property
+    def cell(self) -> float:
+        """Cell length v of level 0, scene units (spec 3.2)."""
+        return self.size(0)
+
+    def size(self, level: int) -> float:
+        """Cell length of one level, scene units."""
+        return self.box / float(self.fork) ** (self.base_layer + level)
+
+    def cell_of(self, levels: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
+        """Cell length of each primitive's level, scene units."""
+        return self.cell / float(self.fork) ** levels.float()
+
+    def cells(self, positions: Float[Tensor, "M 3"], level: int) -> Int[Tensor, "M 3"]:
+        """The nearest node of a level's grid, halves to even."""
+        return ((positions.double() - self.origin) / self.size(level)).round().long()
+
+    def nodes(self, cells: Int[Tensor, "M 3"], level: int) -> Float[Tensor, "M 3"]:
+        """World positions of nodes, float32."""
+        return (cells.double() * self.size(level) + self.origin).float()
+
+    def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
+        """L* = log_f(D / (s d)), finite everywhere (spec 3.5)."""
+        nearness = self.farthest / (coarseness * distances).clamp_min(LEAST_DISTANCE * self.farthest)
+        return nearness.log2() / math.log2(self.fork)
+
+
+# -- deriving levels from a scene ------------------------------------------------------------------------------------
+
+
+def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: LevelOptions, until: int) -> Levels:
+    """The levels of a scene from its points and training cameras (spec 3.1, 3.2, 3.4, 3.6).
+
+    `until`: step of this run at which all levels take part, `options.coarse_until` rescaled; 0: from the start.
+    """
+    points, views = points.unique(dim=0), viewpoints_of(cameras)
+    near, far = distance_range(points, views, options.distance_quantile)
+    count = level_count(near, far, options.fork) if options.count == -1 else options.count
+    first = min(count // 2 if options.first == -1 else options.first, count - 1)
+    origin, extent = box_of(points, options.extend, options.extend_rule)
+    farthest = far or 1.0
+    levels = Levels(
+        count=count,
+        fork=options.fork,
+        nearest=near,
+        farthest=farthest,
+        origin=origin,
+        extent=extent,
+        base_layer=base_layer(extent or farthest, count, options),
+        first=first,
+        switches=switch_points(count, first, until, options.coarse_factor),
+        threshold=max(0.0, options.visible_threshold),
+        mode=options.mode,
+        half_cell=options.half_cell,
+        views=views,
+    )
+    return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_seen(points, levels))
+
+
+def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
+    """Linearly interpolated quantile of any number of values (torch.quantile refuses more than 2^24)."""
+    place = fraction * (len(values) - 1)
+    low, high = (float(values.kthvalue(rank + 1).values) for rank in (math.floor(place), math.ceil(place)))
+    return low + (high - low) * (place - math.floor(place))
+
+
+def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
+    """(near, far) distances between cameras and points, in units of the finest camera (spec 3.1)."""
+    found = []
+    for centre, coarseness in zip(views.centres.to(points), views.coarseness.tolist(), strict=True):
+        distances = (points - centre).norm(dim=1)
+        found += [coarseness * quantile(distances, q) for q in (fraction, 1 - fraction)]
+    listed = torch.tensor(found, dtype=torch.float64)
+    return quantile(listed, 1 - fraction), quantile(listed, fraction)
+
+
+def level_count(near: float, far: float, fork: int) -> int:
+    """K: as many levels as the range of distances has forks (spec 3.1); 1 where every distance is 0."""
+    if far == 0:
+        return 1
+    return round(math.log(far / max(near, LEAST_DISTANCE * far), fork)) + 1
+
+
+def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[float, float]:
+    """(lowest coordinate, length) of the cube around the points, one range for all axes (spec 3.2)."""
+    low, high = float(points.min()), float(points.max())
+    start = extend * low if rule == "reference" else low - (extend - 1) / 2 * (high - low)
+    return start, extend * (high - low)
+
+
+def base_layer(box: float, count: int, options: LevelOptions) -> int:
+    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (spec 3.2)."""
+    if options.base_layer >= 0:
+        return options.base_layer
+    return round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
+
+
+def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
+    """The adaptive threshold: mean fraction of cameras that draw a node, over all nodes of all levels (spec 3.4).
+
+    Held below 1, where every camera draws every node, so that those are kept.
+    """
+    positions, of, _ = all_nodes(points, levels)
+    return min(float(seen_fraction(levels, positions, of).double().mean()), BELOW_ONE)
+
+
+# -- nodes -----------------------------------------------------------------------------------------------------------
+
+
+def all_nodes(
+    points: Float[Tensor, "P 3"], levels: Levels
+) -> tuple[Float[Tensor, "C 3"], Int[Tensor, "C"], Int[Tensor, "K P"]]:
+    """(positions, level, group) of the nodes nearest to the points on every level, coarse to fine (spec 3.3)."""
+    positions, of, group, total = [], [], [], 0
+    for level in range(levels.count):
+        cells, place = new_cells(levels.cells(points, level), torch.empty(0, 3, dtype=torch.long, device=points.device))
+        positions.append(levels.nodes(cells, level))
+        of.append(torch.full((len(cells),), level, dtype=torch.int16, device=points.device))
+        group.append(place + total)
+        total += len(cells)
+    return torch.cat(positions), torch.cat(of), torch.stack(group)
+
+
+def initial_nodes(
+    points: Float[Tensor, "P 3"], levels: Levels
+) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "N"], Int[Tensor, "K P"]]:
+    """(positions, level, group) of the nodes a scene starts from: those that enough cameras draw (spec 3.3, 3.4).
+
+    Level is int16. `group[L, p]` is the row of the node of point p on level L, -1 if it was left out, so that
+    `pooled_max(colours.repeat(K, 1), group.flatten(), N)` are the largest colours in each cell.
+    """
+    positions, of, group = all_nodes(points, levels)
+    chosen = kept(levels, positions, of)
+    number = torch.where(chosen, chosen.cumsum(0) - 1, -1)
+    return positions[chosen], of[chosen], number[group]
+
+
+# -- which levels a camera draws -------------------------------------------------------------------------------------
+
+
+def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int[Tensor, "M"], Float[Tensor, "M"]]:
+    """(highest level drawn, weight of its opacities) for each primitive (spec 3.5 and 3.7)."""
+    if mode == "progressive":
+        place = (ideal + 1).clamp(BELOW_ONE, highest + BELOW_ONE)
+        return place.floor().long(), place - place.floor()
+    rounded = {"round": torch.round, "floor": torch.floor, "ceil": torch.ceil}[mode](ideal)
+    return rounded.clamp(0, highest).long(), torch.ones_like(ideal)
+
+
+def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
+    """Fraction of the training cameras that would draw each primitive, by distance alone (spec 3.4)."""
+    views, counts = levels.views, torch.zeros_like(positions[:, 0])
+    for centre, coarseness in zip(views.centres.to(positions), views.coarseness.tolist(), strict=True):
+        ideal = levels.ideal((positions - centre).norm(dim=1), coarseness)
+        counts += of <= whole_level(ideal, levels.mode, levels.count - 1)[0]
+    return counts / len(views.centres)
+
+
+def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
+    """Primitives that enough training cameras draw (spec 3.4)."""
+    return seen_fraction(levels, positions, of) > levels.threshold
+
+
+def drawn(
+    levels: Levels,
+    positions: Float[Tensor, "N 3"],
+    of: Int[Tensor, "N"],
+    bias: Float[Tensor, "N"],
+    camera: Camera,
+    highest: int,
+) -> tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]:
+    """(mask, weight): primitives whose level the camera draws, and how much of their opacity (spec 3.5 and 3.7).
+
+    `bias` is added to the level each primitive asks for; `highest` is the finest level in use, K - 1 outside training.
+    Neither result carries gradients.
+    """
+    shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
+    distances = (positions.detach() + shift - camera.centre.to(positions)).norm(dim=1)
+    ideal = levels.ideal(distances, levels.views.focal / camera.fx)
+    top, weight = whole_level(ideal + bias.detach(), levels.mode, highest)
+    return of <= top, torch.where(of == top, weight, 1.0)
+
+
+# -- schedules over levels -------------------------------------------------------------------------------------------
+
+
+def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
+    """Steps at which the levels above `first` join, each interval shorter than the last (spec 3.6)."""
+    intervals = count - 1 - first
+    if intervals < 1 or until < 1:
+        return ()
+    lengths = [factor**-n for n in range(intervals)]
+    return tuple(int(until * sum(lengths[: n + 1]) / sum(lengths) + 0.5) for n in range(intervals))
+
+
+def unlocked(switches: Sequence[int], first: int, step: int) -> int:
+    """Highest level in training at a step: `first`, and one more after each switch point (spec 3.6)."""
+    return first + sum(switch < step for switch in switches)
+
+
+def thresholds(base: float, fork: int, update_ratio: float, count: int) -> tuple[float, ...]:
+    """Gradient at which a primitive of each level grows: tau_L = base f^(update_ratio L) (spec 3.8)."""
+    return tuple(base * fork ** (update_ratio * level) for level in range(count))
+
+
+# -- what to tell ----------------------------------------------------------------------------------------------------
+
+
+def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, Any]:
+    """The numbers of the levels, lengths in scene units, to be printed; with `of`, primitives per level too."""
+    facts = {
+        "levels": levels.count,
+        "nearest": levels.nearest,
+        "farthest": levels.farthest,
+        "box": levels.box,
+        "base_layer": levels.base_layer,
+        "voxel": levels.cell,
+        "finest_voxel": levels.size(levels.count - 1),
+        "first_level": levels.first,
+        "switch_points": list(levels.switches),
+        "threshold": levels.threshold,
+    }
+    if of is None:
+        return facts
+    return facts | {"anchors": of.long().bincount(minlength=levels.count).tolist()}
+
+
+def warnings_of(levels: Levels, anchors: int) -> list[str]:
+    """What is odd about the levels of a scene that starts with so many primitives, with the numbers that tell."""
+    finest, near, far = levels.size(levels.count - 1), levels.nearest, levels.farthest
+    step = FLOAT_STEP * max(abs(levels.origin), abs(levels.origin + levels.box))
+    found = {
+        f"{levels.count} levels are more than {MANY_LEVELS}, for distances from {near:.3g} to {far:.3g}: set "
+        "backbone.levels.count or lower backbone.levels.distance_quantile": levels.count > MANY_LEVELS,
+        f"the nearest points are {near:.3g} from a camera, the farthest {far:.3g}: points at cameras add levels; "
+        "lower backbone.levels.distance_quantile": near < NEAR_RATIO * far,
+        f"all points are in one place: cells divide the farthest distance {far:.3g} instead": levels.extent == 0,
+        f"cells of the finest level, {finest:.3g}, are below the precision of positions, {step:.3g}: lower "
+        "backbone.levels.count or backbone.levels.base_layer": finest < step,
+        f"{anchors} primitives to start from are fewer than {FEW_ANCHORS}: raise backbone.levels.base_layer, or give "
+        "more points": anchors < FEW_ANCHORS,
+        f"{anchors} primitives to start from are more than {MANY_ANCHORS}: lower backbone.levels.base_layer, or "
+        "raise backbone.levels.visible_threshold": anchors > MANY_ANCHORS,
+    }
+    return [warning for warning, true in found.items() if true]

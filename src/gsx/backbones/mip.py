@@ -1,0 +1,111 @@
+"""Mip-Splatting's filters for any backbone (Yu et al. 2024; spec 10.1-10.4).
+
+The 3D filter widens each Gaussian by what the finest training camera can resolve, at the same integrated opacity. The
+2D filter is a rule of the rasterizer: a dilation of `kernel` px^2 with compensated opacity.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.errors import InputError
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.shapes import Bool, Float
+
+FILTERS = ("none", "mip")
+LEAST_DEPTH = 1e-3
+"""Depths are held above this before anything is divided by them, scene units (spec 10.1)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MipOptions:
+    """Numbers of the filters; values in conf/backbone, with their sources."""
+
+    variance: float
+    """Of the 3D filter, px^2 at the finest camera."""
+    kernel: float
+    """Variance of the 2D filter, px^2 at every render resolution."""
+    margin: float
+    """Fraction of the raster beside it in which a camera still counts as seeing a point."""
+    near: float
+    """Points nearer than this count as not seen, scene units."""
+    every: int
+    """Published steps between updates of the 3D filter after density control, every event of which updates it too."""
+    stop: int
+    """Published step from which the 3D filter is frozen."""
+
+    def __post_init__(self) -> None:
+        if not (self.variance > 0 and self.kernel > 0):
+            raise ValueError(
+                f"backbone.mip.variance and kernel are {self.variance} and {self.kernel}; give positive numbers of "
+                "px^2, or do without the filters by backbone.filter=none"
+            )
+
+
+def checked_filter(name: str) -> None:
+    """Raise ValueError for a name that is no filter."""
+    if name not in FILTERS:
+        raise ValueError(f"backbone.filter is '{name}'; choose {' or '.join(FILTERS)}")
+
+
+def filtered_rules(raster: RasterSettings, name: str, options: MipOptions) -> RasterSettings:
+    """The rasterizer's rules with the 2D filter; without one they stay as they are."""
+    return replace(raster, dilation=options.kernel, compensate=True) if name == "mip" else raster
+
+
+def seen_depths(
+    points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
+) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+    """(depth z, whether the camera counts as seeing the point) (spec 10.1)."""
+    local = points @ camera.rotation.T.to(points) + camera.translation.to(points)
+    depth = local[:, 2].clamp_min(LEAST_DEPTH)
+    column = local[:, 0] / depth * camera.fx + camera.cx
+    row = local[:, 1] / depth * camera.fy + camera.cy
+    across = (column >= -options.margin * camera.width) & (column <= (1 + options.margin) * camera.width)
+    down = (row >= -options.margin * camera.height) & (row <= (1 + options.margin) * camera.height)
+    return depth, (local[:, 2] > options.near) & across & down
+
+
+@torch.no_grad()
+def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], options: MipOptions) -> Float[Tensor, "N"]:
+    """Standard deviation of the 3D filter at each point, world units: (least depth / largest focal) sqrt(variance).
+
+    Points that no camera sees get the largest depth of those that are seen (spec 10.1).
+
+    Raises:
+        InputError: no camera sees any point.
+    """
+    nearest = torch.full_like(points[:, 0], torch.inf)
+    for camera in cameras:
+        depth, seen = seen_depths(points, camera, options)
+        nearest = torch.where(seen, nearest.minimum(depth), nearest)
+    seen = torch.isfinite(nearest)
+    if len(points) and not bool(seen.any()):
+        raise InputError(
+            f"none of {len(points)} primitives is seen by any of {len(cameras)} training cameras, so "
+            "backbone.filter=mip knows no resolution: check that points and cameras belong together, or do without the "
+            "filters by backbone.filter=none"
+        )
+    farthest = nearest[seen].max() if len(points) else nearest.new_zeros(())
+    focal = max(camera.fx for camera in cameras)
+    return torch.where(seen, nearest, farthest) / focal * options.variance**0.5
+
+
+def smoothed(
+    scales: Float[Tensor, "N 3"], log_opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Scales and log-opacities after the 3D filter, differentiable in both (spec 10.3).
+
+    The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
+    """
+    wide = torch.hypot(scales, sizes[:, None])
+    return wide, log_opacities + (scales / wide).clamp_min(torch.finfo(scales.dtype).tiny).log().sum(1)
+
+
+def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """ln(o / (1 - o)) from ln o <= 0, accurate at both ends: logsigmoid backwards."""
+    below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).eps)
+    return below - torch.log(-torch.expm1(below))
