@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -49,6 +49,7 @@ class Decoded:
     """Opacity of every offset of the anchors drawn, without gradient; what is not drawn counts as 0."""
 
 
+@runtime_checkable
 class Representation(Protocol):
     """What an anchor holds, and how it is decoded."""
 
