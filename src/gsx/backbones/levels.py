@@ -190,7 +190,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         base_layer=base_layer(extent or farthest, count, options),
         first=first,
         switches=switch_points(count, first, until, options.coarse_factor),
-        threshold=max(0.0, options.visible_threshold),
+        threshold=options.visible_threshold,
         mode=options.mode,
         half_cell=options.half_cell,
         views=views,
