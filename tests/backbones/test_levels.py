@@ -411,8 +411,8 @@ def test_switch_points(count, switches):
 
 def test_all_levels_at_once_need_no_switch():
     assert derive(spread(9), cameras(), replace(PUBLISHED, count=8, first=7), 10000).switches == ()
-    levels = derive(spread(9), cameras(), replace(PUBLISHED, count=8), 0)
-    assert levels.switches == ()
+    levels = derive(spread(9), cameras(), replace(PUBLISHED, count=8, first=2), 0)
+    assert [unlocked(levels.switches, levels.first, step) for step in (0, 1, 100)] == [7, 7, 7]
 
 
 def test_the_first_level_is_one_there_is():

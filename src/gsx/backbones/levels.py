@@ -177,7 +177,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
     points, views = points.unique(dim=0), viewpoints_of(cameras)
     near, far = distance_range(points, views, options.distance_quantile)
     count = level_count(near, far, options.fork) if options.count == -1 else options.count
-    first = min(count // 2 if options.first == -1 else options.first, count - 1)
+    first = first_level(count, options.first, until)
     origin, extent = box_of(points, options.extend, options.extend_rule)
     farthest = far or 1.0
     levels = Levels(
@@ -227,6 +227,13 @@ def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[floa
     low, high = float(points.min()), float(points.max())
     start = extend * low if rule == "reference" else low - (extend - 1) / 2 * (high - low)
     return start, extend * (high - low)
+
+
+def first_level(count: int, given: int, until: int) -> int:
+    """Highest level at the start: given, or -1 for half of them (spec 3.1); all where none is to wait."""
+    if until < 1:
+        return count - 1
+    return min(count // 2 if given == -1 else given, count - 1)
 
 
 def base_layer(box: float, count: int, options: LevelOptions) -> int:
@@ -328,8 +335,6 @@ def drawn(
 def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
     """Steps at which the levels above `first` join, each interval shorter than the last (spec 3.6)."""
     intervals = count - 1 - first
-    if intervals < 1 or until < 1:
-        return ()
     lengths = [factor**-n for n in range(intervals)]
     return tuple(int(until * sum(lengths[: n + 1]) / sum(lengths) + 0.5) for n in range(intervals))
 
