@@ -16,7 +16,8 @@ GROUPS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
 
 @pytest.mark.parametrize(("group", "option"), GROUPS)
 def test_every_file_composes_and_fits_its_schema(group: str, option: str) -> None:
-    settings = compose([f"{group}={option}"], plugins())
+    needs = [f"backbone={'scaffold' if option.startswith('scaffold') else 'octree_scaffold'}"] * (group == "preset")
+    settings = compose([*needs, f"{group}={option}"], plugins())
     if group in ("scene", "backbone"):
         assert getattr(settings, group).component.name == option
 
