@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, verbs, errors with exit code 2, Ctrl-C."""
 
+import csv
 import json
 import logging
 import os
@@ -122,6 +123,21 @@ def test_multirun_makes_a_run_for_every_combination(tmp_path: Path) -> None:
     runs = list((tmp_path / "out").glob("*/*/*/evaluation.json"))
     assert len(runs) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "Hydra left files of its own"
+
+
+def test_a_multirun_ends_with_one_report_over_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out"
+    earlier = subprocess.run([*GSX, *OVERRIDES, "iterations=1", f"output={output}"], check=True, capture_output=True)
+    assert earlier.returncode == 0
+    sweep = ["-m", *OVERRIDES, "iterations=1", "backbone=gs3d,scaffold", f"output={output}"]
+    done = subprocess.run([*GSX, *sweep], check=True, capture_output=True, text=True)
+    report = Path(done.stdout.splitlines()[-1])
+    assert report.name == "report.html"
+    assert output / "sweeps" in report.parents
+    rows = list(csv.DictReader((report.parent / "report.csv").read_text().splitlines()))
+    assert [row["backbone"] for row in rows] == ["gs3d", "scaffold"]  # not the earlier run
+    assert all((report.parent / row["run"] / "config.yaml").is_file() for row in rows)
+    assert 'href="../../demo/' in report.read_text()
 
 
 def test_a_mistake_in_a_multirun_is_refused_before_it_starts(capsys: pytest.CaptureFixture[str]) -> None:

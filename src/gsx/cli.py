@@ -179,17 +179,23 @@ def verb_train(words: list[str]) -> int:
         return hand_to_hydra(words)
     from gsx.core.config import compose
 
-    return train(compose(words, loaded := plugins()), loaded)
+    return train(compose(words, loaded := plugins()), loaded, [])
 
 
 def hand_to_hydra(words: list[str]) -> int:
-    """Multirun, completion and information flags, by Hydra's own command line."""
+    """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     from gsx.core.config import check_overrides, hydra_main
 
     loaded = plugins()
     if {"-m", "--multirun"} & set(words):
         check_overrides([word for word in words if not word.startswith("-")], loaded)
-    return hydra_main(words, loaded, lambda settings: guarded(lambda: train(settings, loaded)))
+    folders: list[Path] = []
+    code, sweep = hydra_main(words, loaded, lambda settings: guarded(lambda: train(settings, loaded, folders)))
+    if sweep is not None and folders:
+        from gsx.core.report import write_overview
+
+        sys.stdout.write(f"{write_overview(sweep, folders)}\n")
+    return code
 
 
 def guarded(action: Callable[[], int]) -> int:
@@ -205,11 +211,12 @@ def guarded(action: Callable[[], int]) -> int:
     return code
 
 
-def train(settings: "Settings", loaded: "Plugins") -> int:
-    """Train one composed experiment in a new run folder."""
+def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
+    """Train one composed experiment in a new run folder, which is appended to `folders`."""
     from gsx.core.session import start
 
     run = start(settings, loaded)
+    folders.append(run.folder)
     return carry_out(run, settings, loaded)
 
 

@@ -297,19 +297,27 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:
         compose_raw([o.input_line for o in parsed if o.input_line and not o.is_sweep_override()])
 
 
-def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> int:
-    """Hydra's own command line on our configuration; returns the worst code of `task` over the experiments."""
+def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> tuple[int, Path | None]:
+    """Hydra's own command line on our configuration.
+
+    Returns the worst code of `task` over the experiments, and the folder of a multirun.
+    """
     import sys
 
     import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
     register_search_paths(plugins)
 
     @hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")
     def entry(config: DictConfig) -> None:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            swept.append(Path(HydraConfig.get().sweep.dir))
         codes.append(task(settings_from(config, plugins)))
 
     codes: list[int] = []
+    swept: list[Path] = []
     sys.argv = ["gsx", *arguments]
     entry()
-    return max(codes, default=0)
+    return max(codes, default=0), swept[-1] if swept else None

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,19 +27,19 @@ FIELDS = (
 """Columns of report.csv."""
 
 
-def write_overview(folder: Path) -> Path:
-    """Write report.html and report.csv over all runs below a folder.
+def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
+    """Write report.html and report.csv into a folder, over the runs chosen, or over all runs below it.
 
     Raises:
         InputError: there is no run below it.
     """
-    runs = [read_run(path) for path in runs_below(folder)]
+    runs = [read_run(path) for path in (runs_below(folder) if chosen is None else chosen)]
     if not runs:
         raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give the folder of some runs")
     rows = overview_rows(folder, runs)
     replace_file(folder / "report.csv", csv_of(rows).encode())
     context = {
-        "title": f"{len(rows)} runs below {folder.name or folder}",
+        "title": f"{len(rows)} runs {'below' if chosen is None else 'of'} {folder.name or folder}",
         "version": __version__,
         "rows": rows,
         "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
@@ -70,8 +71,8 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
     gains = {factor: gain for factor, gain in zoom.items() if gain is not None}
     report = run.folder / "report.html"
     return {
-        "run": run.folder.relative_to(folder).as_posix(),
-        "report": report.relative_to(folder).as_posix() if report.is_file() else "",
+        "run": place(run.folder, folder),
+        "report": place(report, folder) if report.is_file() else "",
         "state": state,
         "reason": reason,
         "scene": run.scene,
@@ -87,6 +88,11 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
         "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
         "protocol": run.protocol_hash,
     }
+
+
+def place(path: Path, folder: Path) -> str:
+    """A path as links in the folder have it."""
+    return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def differences(runs: Sequence[RunFiles]) -> list[str]:
