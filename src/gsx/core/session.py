@@ -1,11 +1,13 @@
 """One run from settings to report: build, train, evaluate, write. Also opens finished runs again."""
 
 import logging
+import math
 import os
 import platform
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -41,6 +43,8 @@ from gsx.core.trainer import train
 
 logger = logging.getLogger(__name__)
 
+HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
+"""If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
 
 
@@ -183,15 +187,16 @@ def load_scene(settings: Settings) -> Scene:
     """The scene, with views to evaluate on.
 
     Raises:
-        InputError: it cannot be loaded, or the split leaves no test views.
+        InputError: it cannot be loaded, the split leaves no test views, or cameras and points are all in one place.
     """
-    scene: Scene = settings.scene.component.factory(settings.scene.options)
+    loaded = settings.scene.component.factory(settings.scene.options)
+    scene = warned_of_units(measured(in_units(loaded, getattr(settings.scene.options, "unit", 1.0))))
     if not scene.test:
         raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
     if not scene.extent > 0:
         raise InputError(
-            f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, which gives no depth "
-            "and no scale: use photos from different places"
+            f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
+            "elsewhere, which gives no depth and no scale: use photos from different places"
         )
     return scene
 
@@ -234,6 +239,63 @@ def open_run(
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     return run, settings
+
+
+def in_units(scene: Scene, unit: float) -> Scene:
+    """The scene with positions of cameras and points multiplied by `unit`.
+
+    Raises:
+        ConfigError: `unit` is not a positive number.
+    """
+    if not 0 < unit < math.inf:
+        raise ConfigError(f"scene.unit is {unit}; give a positive number")
+    if unit == 1:
+        return scene
+    return replace(
+        scene,
+        train=[rescaled(view, unit) for view in scene.train],
+        test=[rescaled(view, unit) for view in scene.test],
+        points=replace(scene.points, positions=scene.points.positions * unit),
+        extent=scene.extent * unit,
+        notes=[*scene.notes, f"positions are multiplied by scene.unit={unit:g}"],
+    )
+
+
+def rescaled(view: View, unit: float) -> View:
+    """The view with its camera's position multiplied by `unit`."""
+    return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
+
+
+def measured(scene: Scene) -> Scene:
+    """The scene; one whose training cameras stand in one place takes its extent from the points' median distance."""
+    if scene.extent > 0 or len(scene.points) == 0:
+        return scene
+    distance = (scene.points.positions - scene.train[0].camera.centre.float()).norm(dim=1)
+    extent = 1.1 * float(distance.median())
+    note = f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance"
+    return replace(scene, extent=extent, notes=[*scene.notes, note])
+
+
+def hidden_share(scene: Scene) -> float:
+    """Share of the points in front of training cameras that their near planes hide."""
+    front = hidden = 0
+    for view in scene.train:
+        depth = view.camera.project(scene.points.positions)[1]
+        front += int((depth > 0).sum())
+        hidden += int(((depth > 0) & (depth <= view.camera.near)).sum())
+    return hidden / max(1, front)
+
+
+def warned_of_units(scene: Scene) -> Scene:
+    """The scene, with a note if its units are far from those that published constants expect."""
+    share = hidden_share(scene)
+    if share <= HIDDEN_SHARE and scene.extent <= LARGEST_EXTENT:
+        return scene
+    odd = f"the extent is {scene.extent:.3g} scene units, and near planes hide {share:.0%} of the points before cameras"
+    better = 10.0 ** -math.floor(math.log10(scene.extent)) if scene.extent > 0 else 1.0
+    return replace(
+        scene, notes=[*scene.notes, f"{odd}: published constants expect a few units, try scene.unit={better:g}"]
+    )
 
 
 def status(run: Run, state: str, reason: str = "") -> None:
@@ -316,7 +378,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
     The comments hold the conventions that a viewer must know.
     """
     comments = [
-        f"gsx {__version__}, step {run.step}, scene {run.scene.name}",
+        f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *run.backbone.export_notes(),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
@@ -326,6 +388,11 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
     else:
         run.backbone.begin(max(1, run.step))
         write_gaussians(path, run.backbone.explicit(camera), comments)
+
+
+def unit_of(run: Run) -> float:
+    """What the scene's positions were multiplied by."""
+    return float(run.config["scene"].get("unit", 1.0))
 
 
 def view_named(run: Run, name: str) -> View:

@@ -25,6 +25,9 @@ class SceneOptions:
     """display (as published): filter the stored values; linear: filter light, after undoing the sRGB curve."""
     principal_point: str = "exact"
     """exact | centred; centred ignores the measured principal point, as 3D-GS does (spec 2.1)."""
+    unit: float = 1.0
+    """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
+    0.2, least distances, limits of scales) expect scenes of a few units."""
     cache_gb: float = 2.0
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     split: str = "every:8"

@@ -168,6 +168,8 @@ def check(options: DemoOptions) -> None:
             f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "
             f"scene=colmap, photos, blender, transforms or bungee (gsx scenes {options.path} tells)."
         )
+    if options.unit != 1:
+        raise ConfigError(f"scene=demo knows its truth in its own units only, but scene.unit is {options.unit}.")
     least = {
         "width": 1, "height": 1, "train_views": 2, "test_views": 1, "points": 1, "samples": 1, "downscale": 1
     }  # fmt: skip
