@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, Representation
+from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, Representation, lengths
 from gsx.backbones.growth import (
     GrowthOptions,
     Quirks,
@@ -66,8 +66,14 @@ class Decay:
     first: float
     last: float
 
+    def __post_init__(self) -> None:
+        if not ((self.first > 0 and self.last > 0) or self.first == self.last == 0):
+            raise ValueError(
+                f"a learning rate goes from {self.first} to {self.last}; give two positive numbers, or 0 twice"
+            )
+
     def at(self, step: int, steps: int) -> float:
-        """The rate of a step; 0 if it begins at 0."""
+        """The rate of a step."""
         return log_linear(step, steps, self.first, self.last) if self.first > 0 else 0.0
 
 
@@ -140,6 +146,11 @@ class NeuralOptions(AnchorOptions):
     rates: NeuralRates
     head_rates: HeadRates
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.offsets < 1:
+            raise ValueError(f"backbone.offsets is {self.offsets}; give at least 1 Gaussian per anchor")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ExplicitOptions(AnchorOptions):
@@ -167,8 +178,8 @@ def explicit_anchors(options: ExplicitOptions, beginning: Beginning) -> "Anchors
 
 def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:
     """Median over points of the mean squared distance to three neighbours, or its root (spec 2.1)."""
-    ordered = mean_square_distance(points).sort().values
-    median = float(ordered[int(0.5 * len(ordered))].clamp_min(LEAST_SQUARE_DISTANCE))
+    squares = mean_square_distance(points)
+    median = float(squares.kthvalue(max(1, len(points) // 2)).values.clamp_min(LEAST_SQUARE_DISTANCE))
     return median if squared else math.sqrt(median)
 
 
@@ -282,7 +293,7 @@ class Anchors:
         if self.levels is not None:
             mask, weights = drawn(self.levels, anchors, self.table["level"], self.table["bias"], camera, self.highest())
             rows = rows[mask]
-        reach = self.table["log_scales"].detach()[rows, :3].exp()
+        reach = lengths(self.table["log_scales"].detach()[rows, :3])
         seen = touches(anchors[rows], reach, self.representation.quats(self.table).detach()[rows], camera, self.raster)
         rows = rows[seen]
         degree, every = self.sh
@@ -320,7 +331,11 @@ class Anchors:
         return {}
 
     def update(self) -> None:
-        """One Adam step of anchors and heads."""
+        """One Adam step of anchors and heads. Unused SH bands take part with zero gradients, as in 3D-GS."""
+        moved = self.table.parameters.values()
+        if any(parameter.grad is not None for parameter in moved):
+            for parameter in moved:
+                parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         self.table.optimiser.step()
         if self.head_optimiser is not None:
             self.head_optimiser.step()
@@ -361,24 +376,21 @@ class Anchors:
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
         enough, _ = eligible(self.table, visits / 2)
-        grown = self.grow(visits / 2) if len(self.table) < self.options.max_primitives else 0
+        grown = self.grow(visits / 2)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
-        unit = math.log(self.extent) if self.quirks.clamp == "extent" else 0.0
+        unit = math.log(self.extent) if self.quirks.clamp == "extent" and self.extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
         return {"grown": grown, "pruned": pruned}
 
     def grow(self, least: float) -> int:
         """By depth without levels, by level with them; returns how many anchors grew."""
+        shared, most = (self.table, self.representation, self.options.growth), self.options.max_primitives
         if self.levels is None:
             stop = self.quirks.early_stop == "yes"
-            return grow_by_depth(
-                self.table, self.representation, self.options.growth, self.voxel, least, stop, self.generator
-            )
+            return grow_by_depth(*shared, self.voxel, least, stop, self.generator, most)
         gate = self.quirks.gate == "open" or self.highest() == self.levels.count - 1
-        return grow_by_level(
-            self.table, self.representation, self.options.growth, self.levels, least, self.quirks, gate
-        )
+        return grow_by_level(*shared, self.levels, least, self.quirks, gate, most)
 
     def refresh_filter(self) -> None:
         """Filter sizes of the anchors, which their Gaussians share; anchors stay where they are (spec 10.1)."""
@@ -421,15 +433,28 @@ class Anchors:
         return self.table["filter"][rows] if self.options.filter == "mip" else None
 
     def file(self) -> dict[str, Tensor]:
-        """Columns of the published files of each form (spec 5.1): one row per anchor, raw values."""
+        """Columns of the published files of each form (spec 5.1): one row per anchor, raw values.
+
+        With a 3D filter its sizes follow, under the name that they have in files of Mip-Splatting.
+        """
         columns = dict(zip("xyz", self.table["anchors"].unbind(1), strict=True))
         if self.levels is not None:
             columns |= {"level": self.table["level"].float(), "extra_level": self.table["bias"]}
-        return columns | self.representation.columns(self.table, self.levels)
+        columns |= self.representation.columns(self.table, self.levels)
+        return columns | ({"filter_3D": self.table["filter"]} if "filter" in self.table.columns else {})
 
     def export_notes(self) -> list[str]:
-        """Whether the 3D filter is in the file."""
-        return ["3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"]
+        """Where the 3D filter is, and what chooses the levels at a distance (spec 5.1)."""
+        notes = ["no 3D filter"]
+        if self.options.filter == "mip":
+            notes = ["3D filter fused into scales and opacities of Gaussians; anchors have its size in filter_3D"]
+        if self.levels is not None:
+            found = self.levels
+            notes.append(
+                f"levels {found.count}, fork {found.fork}, standard_dist {found.farthest!r} at a focal length of "
+                f"{found.views.focal!r} px, init_pos {found.origin!r}, voxel_size {found.cell!r}"
+            )
+        return notes
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run, and what was derived from the scene."""

@@ -21,6 +21,8 @@ from gsx.core.splats import Splats
 
 LARGEST_LOG_SCALE = 30.0
 """Lengths are held below e^30 world units, so that their squares stay finite in float32."""
+LEAST = 1e-37
+"""A length (world units) or weight of 0 counts as this: its logarithm is finite."""
 INERT_LOGIT = math.log(0.1 / 0.9)
 """Opacity of an anchor in published files; nothing uses it (spec 2.2)."""
 
@@ -79,7 +81,7 @@ class Representation(Protocol):
         ...
 
 
-def lengths(log_scales: Float[Tensor, "A 3"]) -> Float[Tensor, "A 3"]:
+def lengths(log_scales: Float[Tensor, "A V"]) -> Float[Tensor, "A V"]:
     """exp, finite when squared."""
     return log_scales.clamp(max=LARGEST_LOG_SCALE).exp()
 
@@ -98,7 +100,7 @@ def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M
     """Gaussians of a standard file that draw these splats."""
     return Gaussians(
         means=splats.means.detach(),
-        log_scales=splats.scales.detach().log(),
+        log_scales=splats.scales.detach().clamp_min(LEAST).log(),
         quats=normalize(splats.quats.detach(), dim=1),
         opacity_logits=logit_of_log(splats.log_opacities.detach()),
         sh_constant=constant.detach(),
@@ -204,7 +206,8 @@ class Explicit:
         row = {name: take_rows(table[name], rows) for name in table.parameters}
         size = lengths(row["log_scales"])
         means = table["anchors"][rows] + row["offsets"][:, 0] * size[:, :3]
-        scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + drawn.weights.log()
+        weights = drawn.weights.clamp_min(LEAST)
+        scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + weights.log()
         opacities = log_opacities.detach().exp()[:, None]
         if filters is not None:
             scales, log_opacities = smoothed(scales, log_opacities, filters)

@@ -6,13 +6,13 @@ gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells 
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gsx.backbones.cells import new_cells, pooled_max
-from gsx.backbones.decoding import Representation
+from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.density import Table, append_rows, keep_rows
 from gsx.core.shapes import Bool, Float, Int
@@ -52,6 +52,8 @@ class GrowthOptions:
     def __post_init__(self) -> None:
         if self.every < 1 or not 0 < self.success <= 1:
             raise ValueError("backbone.growth.every must be at least 1 and success above 0, at most 1")
+        if self.hierarchy < 2:
+            raise ValueError(f"backbone.growth.hierarchy is {self.hierarchy}; give at least 2: cells get smaller by it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +69,8 @@ class Quirks:
     gate: str
     """open: promotion and bias from the first growth (a bug of Octree-GS); closed: once all levels are in training."""
     bias: str
-    """all: bias also anchors of other levels, without limit (Octree-GS); own: of the level at hand, at most 1."""
+    """all: bias also anchors of other levels, without limit (Octree-GS); level: of the level at hand, without limit
+    (Octree-AnyGS); own: of the level at hand, at most 1."""
     finest: str
     """bounded: the strongest gradients of the finest level grow nothing (Octree-GS); open: they do."""
     promoted: str
@@ -81,7 +84,7 @@ CHOICES = {
     "clamp": ("world", "extent"),
     "voxel": ("squared", "distance"),
     "gate": ("open", "closed"),
-    "bias": ("all", "own"),
+    "bias": ("all", "own", "level"),
     "finest": ("bounded", "open"),
     "promoted": ("zeros", "max"),
     "duplicates": ("next", "own"),
@@ -158,20 +161,43 @@ class Sprouts:
     """Anchor rows whose offsets lie in a new cell."""
     group: Int[Tensor, "P"]
     """Row of `positions` of each parent."""
+    strength: Float[Tensor, "U"]
+    """Largest mean gradient in the cell."""
     inherit: bool
     """Whether the largest values of the parents are taken over."""
     level: int
 
 
+def some(sprouts: Sprouts, keep: Bool[Tensor, "U"]) -> Sprouts:
+    """The marked ones, with their parents."""
+    number, inside = keep.cumsum(0) - 1, keep[sprouts.group]
+    return replace(
+        sprouts,
+        positions=sprouts.positions[keep],
+        parents=sprouts.parents[inside],
+        group=number[sprouts.group[inside]],
+        strength=sprouts.strength[keep],
+    )
+
+
+def strongest(sprouts: Sprouts, room: int) -> Sprouts:
+    """At most `room` of them, those with the largest gradients."""
+    if len(sprouts.positions) <= room:
+        return sprouts
+    chosen = sprouts.strength.argsort(descending=True, stable=True)[: max(0, room)]
+    return some(sprouts, torch.zeros_like(sprouts.strength, dtype=torch.bool).index_fill_(0, chosen, True))
+
+
 def offset_means(table: Table) -> Float[Tensor, "N k 3"]:
     """Where every offset's Gaussian is, world units."""
-    reach = table["log_scales"].detach()[:, None, :3].exp()
-    return table["anchors"][:, None] + table["offsets"].detach() * reach
+    reach = lengths(table["log_scales"].detach()[:, :3])
+    return table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
 
 
 def sprout(
     table: Table,
     candidates: Bool[Tensor, "N k"],
+    gradient: Float[Tensor, "N k"],
     cells: Int[Tensor, "M 3"],
     taken: Int[Tensor, "T 3"],
     origin: float,
@@ -189,13 +215,15 @@ def sprout(
         size=size,
         parents=parents[inside],
         group=group[inside],
+        strength=pooled_max(gradient[candidates], group, len(fresh)),
         inherit=inherit,
         level=level,
     )
 
 
-def add_anchors(table: Table, sprouts: Sprouts, representation: Representation) -> int:
-    """Append the sprouts with fresh statistics; returns how many."""
+def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, most: int) -> int:
+    """Append the sprouts with fresh statistics, up to a table of `most` anchors; returns how many."""
+    sprouts = strongest(sprouts, most - len(table))
     count, like = len(sprouts.positions), table["anchors"]
     if count == 0:
         return 0
@@ -219,6 +247,7 @@ def grow_by_depth(
     least: float,
     early_stop: bool,
     generator: torch.Generator,
+    most: int,
 ) -> int:
     """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9); returns how many grew."""
     enough, gradient = eligible(table, least)
@@ -231,10 +260,9 @@ def grow_by_depth(
         threshold = options.gradient * (options.hierarchy // 2) ** depth
         candidates = enough & (gradient >= threshold) & (chance > 0.5 ** (depth + 1))
         size = voxel * multiple
-        found = sprout(
-            table, candidates, nodes_of(means[candidates], size), nodes_of(table["anchors"], size), 0.0, size
-        )
-        grown += add_anchors(table, found, representation)
+        cells, taken = nodes_of(means[candidates], size), nodes_of(table["anchors"], size)
+        found = sprout(table, candidates, gradient, cells, taken, 0.0, size)
+        grown += add_anchors(table, found, representation, most)
         if early_stop and grown == 0:
             break
     return grown
@@ -253,6 +281,7 @@ def grow_by_level(
     least: float,
     quirks: Quirks,
     gate: bool,
+    most: int,
 ) -> int:
     """Octree-GS: cells of the own level, and of the next one for the strongest gradients (spec 3.8); how many grew.
 
@@ -272,7 +301,7 @@ def grow_by_level(
         for found in sprouts_of_level(
             table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
         ):
-            grown += add_anchors(table, found, representation)
+            grown += add_anchors(table, found, representation, most)
     return grown
 
 
@@ -287,7 +316,7 @@ def bias_anchors(
     """Let anchors with larger gradients be drawn from a little farther (spec 3.8, 1)."""
     bias, count = table["bias"], len(gradient)
     chosen = gradient >= options.bias_gradient * threshold
-    if quirks.bias == "own":
+    if quirks.bias != "all":
         chosen = chosen & own
     bias[:count] += options.bias_step * chosen
     if quirks.bias == "own":
@@ -311,20 +340,20 @@ def sprouts_of_level(
     below = gradient < taus[level + 1]
     if last and quirks.finest == "open":
         below = torch.ones_like(below)
-    yield weeded(
-        at_level(table, enough & (gradient >= taus[level]) & below, means, level, level, levels, options), levels
-    )
+    staying = enough & (gradient >= taus[level]) & below
+    yield weeded(at_level(table, staying, gradient, means, level, level, levels, options), levels)
     next_exists = options.overlap or bool((table["level"] == level + 1).any())
     if gate and not last and next_exists:
         compared = level if quirks.duplicates == "own" else level + 1
         promoted = enough & (gradient >= taus[level + 1])
         inherit = options.overlap or quirks.promoted == "max"
-        yield weeded(at_level(table, promoted, means, level + 1, compared, levels, options, inherit), levels)
+        yield weeded(at_level(table, promoted, gradient, means, level + 1, compared, levels, options, inherit), levels)
 
 
 def at_level(
     table: Table,
     candidates: Bool[Tensor, "N k"],
+    gradient: Float[Tensor, "N k"],
     means: Float[Tensor, "N k 3"],
     level: int,
     compared: int,
@@ -335,25 +364,15 @@ def at_level(
     """Anchors in the cells of a level that no anchor of level `compared` holds; with overlap in all of them."""
     occupied = table["anchors"][table["level"] == compared]
     taken = levels.cells(occupied[:0] if options.overlap else occupied, level)
-    cells = levels.cells(means[candidates], level)
-    return sprout(table, candidates, cells, taken, levels.origin, levels.size(level), inherit=inherit, level=level)
+    cells, size = levels.cells(means[candidates], level), levels.size(level)
+    return sprout(table, candidates, gradient, cells, taken, levels.origin, size, inherit=inherit, level=level)
 
 
 def weeded(sprouts: Sprouts, levels: Levels) -> Sprouts:
     """Without those that too few cameras would draw (spec 3.4)."""
     positions = sprouts.positions
     of = torch.full((len(positions),), sprouts.level, dtype=torch.int16, device=positions.device)
-    keep = kept(levels, positions, of)
-    number = keep.cumsum(0) - 1
-    inside = keep[sprouts.group]
-    return Sprouts(
-        positions=positions[keep],
-        size=sprouts.size,
-        parents=sprouts.parents[inside],
-        group=number[sprouts.group[inside]],
-        inherit=sprouts.inherit,
-        level=sprouts.level,
-    )
+    return some(sprouts, kept(levels, positions, of))
 
 
 # -- after growing ---------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 
 LEAST_DISTANCE = 1e-8
@@ -38,6 +39,8 @@ class HeadOptions:
             raise ValueError(f"backbone.heads.features is {self.features}; give a multiple of 4")
         if self.appearance < 0:
             raise ValueError(f"backbone.heads.appearance is {self.appearance}; give a length, or 0 for none")
+        if self.appearance_code < -1:
+            raise ValueError(f"backbone.heads.appearance_code is {self.appearance_code}; give a view's number or -1")
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
@@ -67,6 +70,10 @@ class Heads(nn.Module):
     def __init__(self, options: HeadOptions, offsets: int, views: int, generator: torch.Generator) -> None:
         super().__init__()
         width, o = options.features, options
+        if o.appearance and o.appearance_code >= views:
+            raise InputError(
+                f"backbone.heads.appearance_code is {o.appearance_code}; training views have numbers 0 to {views - 1}"
+            )
         base = width + 3 + int(o.level)
         self.options, self.offsets = options, offsets
         self.opacity = head(base + int(o.opacity_distance), width, offsets, nn.Tanh(), generator)
