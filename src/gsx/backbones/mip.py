@@ -18,6 +18,8 @@ from gsx.core.shapes import Bool, Float
 FILTERS = ("none", "mip")
 LEAST_DEPTH = 1e-3
 """Depths are held above this before anything is divided by them, scene units (spec 10.1)."""
+LEAST_SHARE = 1e-30
+"""Of a scale in what the 3D filter makes of it: nothing is seen of a primitive near it, and gradients stay finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,10 +104,10 @@ def smoothed(
     The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
     """
     wide = torch.hypot(scales, sizes[:, None])
-    return wide, log_opacities + (scales / wide).clamp_min(torch.finfo(scales.dtype).tiny).log().sum(1)
+    return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
 
 
 def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
     """ln(o / (1 - o)) from ln o <= 0, accurate at both ends: logsigmoid backwards."""
-    below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).eps)
+    below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).tiny)
     return below - torch.log(-torch.expm1(below))
