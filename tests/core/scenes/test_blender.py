@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,13 @@ import torch
 from omegaconf import OmegaConf
 from synthetic_colmap import shipped
 
+from gsx.cli import plugins
+from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import resize, write_image
 from gsx.core.ply import write_ply
-from gsx.core.scenes.blender import BlenderOptions, load
+from gsx.core.scenes.blender import BlenderOptions, box_averaged, load
+from gsx.core.session import execute, start
 
 FOV = 2 * math.atan(0.5)  # the focal length is the width
 # looks along +y from (0, -4, 0) with z up: right is +x, up is +z, back is -y
@@ -214,3 +218,104 @@ def test_options_that_make_no_sense_are_refused(folder: Path) -> None:
         load(options(folder, principal_point="centered"))
     with pytest.raises(ConfigError, match="give red, green and blue"):
         load(options(folder, background=[1.0]))
+
+
+def test_smaller_images_are_box_averages_of_straight_rgba(folder: Path) -> None:
+    scene = load(options(folder, scales=[1, 2, 5], background=[0.2, 0.4, 0.6]))
+    assert [view.name for view in scene.train][2:] == [f"train/r_{i} x1/{k}" for k in (2, 5) for i in range(2)]
+    for view, factor in zip(scene.train[2::2], (2, 5), strict=True):
+        width, height = 40 // factor, 30 // factor
+        rgba, mean = picture(0).tolist(), torch.zeros(4, height, width, dtype=torch.float64)
+        for channel, row, column in product(range(4), range(30), range(40)):
+            mean[channel, row // factor, column // factor] += rgba[channel][row][column] / factor**2
+        straight = (mean + 1e-9).floor() / 255
+        behind = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)[:, None, None]
+        expected = ((straight[:3] * straight[3:] + behind * (1 - straight[3:])) * 255).floor() / 255
+        torch.testing.assert_close(view.image(), expected.float(), atol=1e-7, rtol=0)
+        assert view.camera.size == (width, height)
+        assert (view.camera.fx, view.camera.cx) == pytest.approx((40 / factor, 20 / factor))
+    finer = scene.train[2].zoom(2)
+    assert finer is None  # the truth of a reduced view is the reduced image
+
+
+def test_three_averages_of_two_by_two_are_one_of_eight_by_eight() -> None:
+    image = picture(3, 32, 24)
+    halved = image.float() / 255
+    for _ in range(3):
+        halved = (halved[:, ::2, ::2] + halved[:, ::2, 1::2] + halved[:, 1::2, ::2] + halved[:, 1::2, 1::2]) / 4
+    assert torch.equal(box_averaged(image, 8), (halved * 255 + 1e-3).to(torch.uint8))
+
+
+def test_test_views_are_grouped_by_scale(folder: Path) -> None:
+    scene = load(options(folder, test_scales=[1, 2]))
+    assert [(view.name, view.group) for view in scene.test] == [("test/r_0", "x1"), ("test/r_0 x1/2", "x1/2")]
+    assert [view.group for view in scene.train] == ["", ""]
+    assert scene.provenance["test_scales"] == [1, 2]
+    assert [view.group for view in load(options(folder)).test] == [""]
+    assert "scales" not in load(options(folder)).provenance
+
+
+def test_a_scale_given_twice_is_trained_on_twice_and_moves_no_camera(folder: Path) -> None:
+    scene, plain = load(options(folder, scales=[1, 1, 2])), load(options(folder))
+    assert [view.camera.width for view in scene.train] == [40, 40, 40, 40, 20, 20]
+    assert scene.extent == pytest.approx(plain.extent)
+    assert len(scene.test) == 1
+
+
+def test_multiscale_blender_is_a_protocol() -> None:
+    multi, single = (
+        compose([f"protocol={name}", "scene.path=x"], plugins()).scene.options
+        for name in ("multiscale_train", "singlescale_train")
+    )
+    assert (multi.name, single.name) == ("blender", "blender")
+    assert (list(multi.scales), list(single.scales)) == ([1, 1, 2, 4, 8], [1])
+    assert list(multi.test_scales) == list(single.test_scales) == [1, 2, 4, 8]
+
+
+def test_zooming_in_on_photographs_is_a_protocol() -> None:
+    settings = compose(["protocol=zoom_in", "scene.path=x"], plugins())
+    assert (settings.scene.options.name, settings.scene.options.downscale) == ("colmap", 8)
+    assert list(settings.evaluation.zoom) == [1, 2, 4, 8]
+    other = compose(["protocol=zoom_in", "scene=transforms", "scene.path=x"], plugins()).scene.options
+    assert (other.name, other.downscale) == ("transforms", 8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"scales": [1, 4]}, InputError, r"r_0\.png' of 40 x 30 does not divide by 4"),
+        ({"test_scales": [1, 3]}, InputError, "does not divide by 3"),
+        ({"scales": [2], "downscale": 2}, ConfigError, r"scene\.downscale=1"),
+        ({"scales": [2], "max_width": 20}, ConfigError, r"scene\.max_width=0"),
+    ],
+)
+def test_scales_that_do_not_fit_the_images_are_refused(
+    folder: Path, changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        load(options(folder, **changes))
+
+
+@pytest.mark.parametrize("override", ["scene.scales=[]", "scene.scales=[0]", "scene.test_scales=[1,1]"])
+def test_impossible_scales_are_refused(override: str) -> None:
+    with pytest.raises(ConfigError, match=override.split("=")[0]):
+        compose(["scene=blender", override], plugins())
+
+
+def test_one_image_at_many_scales_is_still_one(folder: Path) -> None:
+    write(folder, "train", [FRONT])
+    with pytest.raises(InputError, match="at least 2 images"):
+        load(options(folder, scales=[1, 2, 5]))
+
+
+def test_figures_by_scale_are_in_the_evaluation(folder: Path, tmp_path: Path) -> None:
+    write(folder, "train", [FRONT, SIDE, FRONT])
+    words = ["scene=blender", f"scene.path={folder}", "scene.random_points=50", "scene.scales=[1,1,2]", "device=cpu"]
+    words += ["scene.test_scales=[1,2]", "iterations=2", f"folder={tmp_path / 'run'}", "backbone=mip_splatting"]
+    settings = compose(words, plugins())
+    execute(start(settings, plugins()), settings, plugins())
+    evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert list(evaluation["groups"]) == ["x1", "x1/2"]
+    by_scale = [evaluation["groups"][name]["psnr"] for name in ("x1", "x1/2")]
+    assert evaluation["psnr"] == pytest.approx(sum(by_scale) / 2)
+    assert "<td>x1/2</td>" in (tmp_path / "run" / "report.html").read_text()

@@ -1,16 +1,18 @@
 """NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (spec 1.5, 2.2, 8.1)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.images import image_size
-from gsx.core.scene import PointCloud, Scene, extent_of
+from gsx.core.images import PhotoSource, image_size
+from gsx.core.scene import PointCloud, Scene, View, extent_of
 from gsx.core.scenes.options import SceneOptions
 from gsx.core.scenes.points import random_points, read_points
 from gsx.core.scenes.posed import (
@@ -23,6 +25,7 @@ from gsx.core.scenes.posed import (
     refuse_too_few,
     views_of,
 )
+from gsx.core.shapes import UInt8
 
 POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and conversions put a real one
 
@@ -38,14 +41,26 @@ class BlenderOptions(SceneOptions):
     """Random points are uniform in the cube [-points_bound, points_bound]^3, scene units."""
     seed: int
     """Of the random points."""
+    scales: list[int] = field(default_factory=lambda: [1])
+    """Factors by which training images are reduced, each a set of views; a factor given twice is trained on twice."""
+    test_scales: list[int] = field(default_factory=lambda: [1])
+    """The same of test images."""
+
+    def __post_init__(self) -> None:
+        for name in ("scales", "test_scales"):
+            factors = getattr(self, name)
+            if not factors or min(factors) < 1:
+                raise ValueError(f"scene.{name} is {list(factors)}; give whole factors of reduction, 1 or more")
+        if len(set(self.test_scales)) < len(self.test_scales):
+            raise ValueError(f"scene.test_scales is {list(self.test_scales)}; give each factor once")
 
 
 def load(options: BlenderOptions) -> Scene:
     """Loads a NeRF-synthetic scene; views keep the order of the files.
 
     Raises:
-        ConfigError: `split` is not `json`.
-        InputError: a file is missing or damaged, or there are fewer than two training images.
+        ConfigError: `split` is not `json`, or images are reduced by both `downscale` or `max_width` and `scales`.
+        InputError: a file is missing or damaged, there are fewer than two training images, or a scale divides no image.
     """
     if options.split != "json":
         raise ConfigError(f"scene.split is '{options.split}', but transforms_*.json hold the split: use json.")
@@ -56,6 +71,9 @@ def load(options: BlenderOptions) -> Scene:
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
     train, test = views[: len(train_shots)], views[len(train_shots) :]
     refuse_too_few(train, train_file)
+    grouped = list(options.test_scales) != [1]
+    train = [reduced(view, factor) for factor in options.scales for view in train]
+    test = [reduced(view, factor, grouped) for factor in options.test_scales for view in test]
     points, points_note = _points(options, folder)
     return Scene(
         name=folder.resolve().name,
@@ -65,8 +83,50 @@ def load(options: BlenderOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         extent=extent_of([view.camera for view in train]),
         notes=[*train_notes, *test_notes, *_test_note(test_file), points_note],
-        provenance=provenance(options, len(views), test_file=test_file.name, points=options.points),
+        provenance=provenance(
+            options, len(views), test_file=test_file.name, points=options.points, **_scales_named(options)
+        ),
     )
+
+
+def reduced(view: View, factor: int, grouped: bool = False) -> View:
+    """The view of an image `factor` times smaller, box-averaged before it is composited (spec 10.7).
+
+    Raises:
+        ConfigError: the view is reduced already.
+        InputError: `factor` does not divide the image.
+    """
+    name, source = "x1" if factor == 1 else f"x1/{factor}", view.source
+    group = name if grouped else ""
+    if factor == 1:
+        return replace(view, group=group)
+    assert isinstance(source, PhotoSource)
+    width, height = source.whole.size
+    if view.camera.size != source.whole.size:
+        raise ConfigError("scene.scales and test_scales reduce whole images: use scene.downscale=1 scene.max_width=0")
+    if width % factor or height % factor:
+        raise InputError(
+            f"Image '{source.path}' of {width} x {height} does not divide by {factor}: leave that scale out."
+        )
+    size = width // factor, height // factor
+    smaller = replace(source, whole=source.whole.resize(*size), remap=partial(box_averaged, factor=factor))
+    return View(f"{view.name} {name}", view.camera.resize(*size), smaller, group)
+
+
+def box_averaged(image: UInt8[Tensor, "C H W"], factor: int) -> UInt8[Tensor, "C height width"]:
+    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (spec 10.7).
+
+    Three 2 x 2 averages of floats in a row are one over 8 x 8; here it is exact.
+    """
+    channels, height, width = image.shape
+    blocks = image.reshape(channels, height // factor, factor, width // factor, factor)
+    return (blocks.sum((2, 4)) // factor**2).to(torch.uint8)
+
+
+def _scales_named(options: BlenderOptions) -> dict[str, Any]:
+    """For the provenance; nothing for whole images alone, so that their protocol keeps its hash."""
+    scales = {"scales": list(options.scales), "test_scales": list(options.test_scales)}
+    return {} if scales == {"scales": [1], "test_scales": [1]} else scales
 
 
 def read_shots(file: Path) -> tuple[list[Shot], list[str]]:
