@@ -120,6 +120,12 @@ def test_points_near_a_camera_or_behind_it_are_not_seen_by_it() -> None:
     torch.testing.assert_close(filter_sizes(points, [axis_camera()], OPTIONS), expected)
 
 
+def test_depths_are_held_above_a_thousandth() -> None:
+    points = torch.tensor([[0.0, 0, 5e-4]])
+    sizes = filter_sizes(points, [axis_camera()], replace(OPTIONS, near=0.0))
+    assert sizes.item() == pytest.approx(0.001 * UNIT / 100)
+
+
 def test_the_largest_focal_counts_even_of_a_camera_that_sees_nothing() -> None:
     cameras = [axis_camera(), axis_camera(400.0, cx=-1e6), axis_camera(200.0, fy=9000.0, cy=-1e6)]  # only fx counts
     sizes = filter_sizes(torch.tensor([[0.0, 0, 2.0]]), cameras, OPTIONS)
