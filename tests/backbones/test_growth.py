@@ -12,6 +12,7 @@ from test_decoding import table_of
 from test_heads import SMALL, heads_of
 from torch.nn import Parameter
 
+from gsx.backbones import growth
 from gsx.backbones.decoding import Explicit, Neural
 from gsx.backbones.growth import (
     CHOICES,
@@ -22,6 +23,7 @@ from gsx.backbones.growth import (
     fresh_statistics,
     grow_by_depth,
     grow_by_level,
+    nodes_of,
     observe,
     prune,
     reset_offsets,
@@ -115,12 +117,14 @@ def test_growth_at_the_first_depth_opens_the_others() -> None:
 
 
 @pytest.mark.usefixtures("keep_all")
-def test_a_coarsest_cell_of_four_voxels_has_two_depths() -> None:
-    table, neural = cloud([[0.0, 0, 0]], [[[4.0, 0.0, 0.0], [2.0, 0.0, 0.0]]], [[1.0, 1.0]])
+def test_a_coarsest_cell_of_four_voxels_has_two_depths(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = []
+    monkeypatch.setattr(growth, "nodes_of", lambda places, size: sizes.append(size) or nodes_of(places, size))
+    table, neural = cloud([[0.0, 0, 0]], [[[4.0, 0.0, 0.0], [2.0, 0.25, 0.0]]], [[1.0, 1.0]])
     deepen(table, neural, early=False, coarsest=4)
-    # 4 / 4 = 1 and 2 / 4 = 0.5, which rounds to the even 0; then 4 (taken) and 2 in cells of one voxel; never 0
+    # 4 / 4 = 1 and 2 / 4 = 0.5, which rounds to the even 0; then 4 (taken) and 2 in cells of one voxel; never 0 voxels
     assert grown(table, 1) == [(4.0, 0.0, 0.0), (2.0, 0.0, 0.0)]
-    assert torch.isfinite(table["log_scales"]).all()
+    assert set(sizes) == {4.0, 1.0}
 
 
 @pytest.mark.usefixtures("keep_all")
