@@ -103,7 +103,7 @@ def measured_in(scene: Scene, unit: float) -> Scene:
 @pytest.mark.parametrize("unit", [2.0**-10, 2.0**13])  # powers of two: nothing is rounded on the way
 @pytest.mark.parametrize("name", BACKBONES)
 def test_units_make_no_difference_once_they_are_named(name: str, unit: float) -> None:
-    scene = small_scene(spread(200), extent=2.0)
+    scene = small_scene(spread(40), extent=2.0)
     other = in_units(measured_in(scene, unit), 1 / unit)
     pictures = []
     for given in (scene, other):
