@@ -55,7 +55,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["scene=[demo"], "override cannot be read"),
         (["nonsense"], "override cannot be read"),
         (["eval.ssim=inira"], "eval.ssim is 'inira'; choose from inria"),
-        (["eval.zoom=[0]"], "give factors of 1 or more"),
+        (["eval.zoom=[0]"], "give positive factors"),
         (["eval.tile_pixels=-4"], "eval.tile_pixels is -4"),
         (["training.log_every=0"], "training.log_every is 0"),
         (["training.checkpoints_kept=0"], "training.checkpoints_kept is 0"),

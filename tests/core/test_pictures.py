@@ -27,6 +27,7 @@ from gsx.core.pictures import (
     file_names,
     most_detailed,
     reduced,
+    resized_window,
     spread,
     write_pictures,
 )
@@ -156,7 +157,7 @@ OPTIONS = EvalOptions(
 )
 
 
-def figures(run: Run, *, zoom: tuple[int, ...] = (1, 2, 4), psnrs: list[float] | None = None) -> dict[str, Any]:
+def figures(run: Run, *, zoom: tuple[float, ...] = (1, 2, 4), psnrs: list[float] | None = None) -> dict[str, Any]:
     """The parts of evaluation.json that pictures are made from."""
     known = psnrs or [20.0 + i for i in range(len(run.scene.test))]
     views = [
@@ -217,6 +218,21 @@ def test_zoomed_crops_are_crops_of_the_whole_zoomed_pictures(run: Run) -> None:
         for kind, image in whole.items():
             slack = 0.51 / 255 if kind == "enlarged" else 0
             assert (stored(run, entry["files"][kind]) - window.cut(image)).abs().max() <= slack
+
+
+def test_crops_seen_from_afar_and_at_odd_zooms(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    write_pictures(run, OPTIONS, figures(run, zoom=(0.25, 1, 1.5)))
+    entries = read_index(run)["zoom"]
+    assert [entry["factor"] for entry in entries] == [0.25, 1.5] * 3
+    for entry in entries:
+        view = next(view for view in run.scene.test if view.name == entry["view"])
+        zoomed = view.zoom(entry["factor"])
+        assert zoomed is not None
+        window, pair = Window(*entry["window"]), (stored(run, entry["files"][kind]) for kind in ("truth", "enlarged"))
+        resized = bicubic(quantise(render_view(run, view, 1 << 20).image), *zoomed.camera.size)
+        for image, whole in zip(pair, (zoomed.image(), resized), strict=True):
+            assert (image - window.cut(whole)).abs().max() <= 0.51 / 255
 
 
 def test_crops_carry_the_psnr_of_what_is_shown(run: Run) -> None:
@@ -322,6 +338,13 @@ def test_an_enlarged_window_is_the_window_of_the_enlarged(factor: int, window: W
     picture = torch.rand(3, 32, 40, generator=torch.Generator().manual_seed(3))
     whole = bicubic(picture, 40 * factor, 32 * factor)
     assert torch.allclose(enlarged_window(picture, factor, window), window.cut(whole), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(80, 64), (60, 48), (20, 16), (10, 8)])
+def test_a_resized_window_is_the_window_of_the_resized(size: tuple[int, int]) -> None:
+    picture = torch.rand(3, 32, 40, generator=torch.Generator().manual_seed(3))
+    window, whole = Window(3, 2, 7, 5), bicubic(picture, *size)
+    assert torch.allclose(resized_window(picture, size, size[0] / 40, window), window.cut(whole), atol=1e-5)
 
 
 def test_a_view_through_a_window_sees_its_part_of_the_truth() -> None:

@@ -1,11 +1,12 @@
 """Evaluation on held-out views: image quality, zoomed views against true finer pixels, size and speed.
 
-Beside each zoomed figure stands the naive competitor, the x1 render enlarged by bicubic interpolation: a zoomed render
+Beside each zoomed figure stands the naive competitor, the x1 render resized by bicubic interpolation: a zoomed render
 that loses to it adds artefacts, not detail.
 """
 
 import hashlib
 import json
+import math
 import resource
 import statistics
 import sys
@@ -34,7 +35,7 @@ LEAST_TILE_PIXELS = 16 * 16
 class EvalOptions:
     """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
 
-    zoom: list[int]
+    zoom: list[float]
     quantise: bool
     ssim: str
     tile_pixels: int
@@ -43,8 +44,8 @@ class EvalOptions:
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
-        if not self.zoom or min(self.zoom) < 1:
-            raise ValueError(f"eval.zoom is {list(self.zoom)}; give factors of 1 or more")
+        if not self.zoom or not all(0 < factor < math.inf for factor in self.zoom):
+            raise ValueError(f"eval.zoom is {list(self.zoom)}; give positive factors, for example [1,2,4]")
         if self.tile_pixels < LEAST_TILE_PIXELS:
             raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
 
@@ -140,7 +141,7 @@ class Evaluator:
             "visible": tiled.visible,
         }
 
-    def zoomed(self, view: View, factor: int) -> dict[str, float] | None:
+    def zoomed(self, view: View, factor: float) -> dict[str, float] | None:
         """Figures of one view at `factor` times the resolution, or None where there is no truth."""
         finer = view.zoom(factor)
         if finer is None:
@@ -156,11 +157,11 @@ class Evaluator:
             "enlarged_ssim": ssim(enlarged, truth, kind),
         }
 
-    def zoom(self, factor: int) -> dict[str, Any]:
+    def zoom(self, factor: float) -> dict[str, Any]:
         """Mean figures at one zoom, with the verdict; or a reason why there are none."""
         figures = [f for view in self.run.scene.test if (f := self.zoomed(view, factor)) is not None]
         if not figures:
-            return {"unavailable": f"the images hold no truth at x{factor}: train on a larger scene.downscale"}
+            return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
         means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
         gain = means["psnr"] - means["enlarged_psnr"]
         return means | {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
@@ -183,7 +184,7 @@ class Evaluator:
             "train_seconds": run.seconds,
             "peak_memory_mb": max([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
             "groups": {name: {key: mean([v[key] for v in vs]) for key in figures} for name, vs in by_group.items()},
-            "zoom": {str(factor): self.zoom(factor) for factor in self.options.zoom},
+            "zoom": {f"{factor:g}": self.zoom(factor) for factor in self.options.zoom},
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
         }
 

@@ -43,7 +43,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "version": __version__,
         "rows": rows,
         "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
-        "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=int),
+        "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
         "mixed": mixed_protocols(rows),
         "comparisons": comparisons(rows),
         "any_lpips": any(is_number(row["lpips"]) for row in rows),

@@ -73,7 +73,8 @@ def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -
     roles = {worst: "worst", best: "best"} if best != worst else {}
     shown = spread(len(figures), SHOWN, {best, worst})
     names = file_names([figures[i]["name"] for i in shown])
-    factors = [int(key) for key, entry in evaluation["zoom"].items() if int(key) > 1 and "unavailable" not in entry]
+    zooms = {float(key): entry for key, entry in evaluation["zoom"].items()}
+    factors = [factor for factor, entry in zooms.items() if factor != 1 and "unavailable" not in entry]
     views, crops = [], []
     for i, name in zip(shown, names, strict=True):
         view, drawn = run.scene.test[i], Draw(run, options, folder, name)
@@ -108,8 +109,8 @@ class Draw:
         files = {kind: self.save(f"{self.name}.{kind}", reduced(image)) for kind, image in images.items()}
         return {"size": list(view.camera.size), "files": files}
 
-    def crop(self, view: View, picture: Float[Tensor, "3 H W"], factor: int) -> dict[str, Any] | None:
-        """The window with most detail at `factor` times the resolution: truth, render and the x1 render enlarged.
+    def crop(self, view: View, picture: Float[Tensor, "3 H W"], factor: float) -> dict[str, Any] | None:
+        """The window with most detail at `factor` times the resolution: truth, render and the x1 render resized.
 
         Returns its entry in the index, or None where there is no truth.
         """
@@ -121,9 +122,9 @@ class Draw:
         images = {
             "truth": window.cut(whole),
             "render": self.render(cropped(finer, window)),
-            "enlarged": self.measured(enlarged_window(picture, factor, window)),
+            "enlarged": self.measured(resized_window(picture, finer.camera.size, factor, window)),
         }
-        files = {kind: self.save(f"{self.name}.x{factor}.{kind}", image, True) for kind, image in images.items()}
+        files = {kind: self.save(f"{self.name}.x{factor:g}.{kind}", image, True) for kind, image in images.items()}
         return {
             "view": view.name,
             "factor": factor,
@@ -229,6 +230,15 @@ def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
 def cropped(view: View, window: Window) -> View:
     """The view through a window of its raster."""
     return replace(view, camera=view.camera.crop(window.left, window.top, window.width, window.height))
+
+
+def resized_window(
+    picture: Float[Tensor, "3 H W"], size: tuple[int, int], factor: float, window: Window
+) -> Float[Tensor, "3 h w"]:
+    """A window of the picture resized to (width, height) `size` by `metrics.bicubic`; `factor` says how many times."""
+    if factor != round(factor):
+        return window.cut(bicubic(picture, *size))
+    return enlarged_window(picture, round(factor), window)
 
 
 def enlarged_window(picture: Float[Tensor, "3 H W"], factor: int, window: Window) -> Float[Tensor, "3 h w"]:

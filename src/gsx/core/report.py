@@ -126,7 +126,7 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
 def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
     """Figures and verdict of each zoom."""
     rows = []
-    for factor, entry in sorted(part(evaluation, "zoom").items(), key=lambda item: int(item[0])):
+    for factor, entry in sorted(part(evaluation, "zoom").items(), key=lambda item: float(item[0])):
         gain = None if factor == "1" else gain_of(entry)
         rows.append(
             {
@@ -150,13 +150,16 @@ def zoom_sentence(factor: str, entry: dict[str, Any]) -> str:
         return "The training resolution: what the other rows fall from."
     if gain is None:
         return "The figures are incomplete."
+    resizing = "enlarging" if float(factor) > 1 else "reducing"
     if abs(gain) < HARDLY:
         side = "closer to" if gain > 0 else "further from"
-        text = f"Hardly a difference: {abs(gain):.2f} dB {side} the truth than enlarging the ×1 render."
+        text = f"Hardly a difference: {abs(gain):.2f} dB {side} the truth than {resizing} the ×1 render."
     elif gain > 0:
-        text = f"Real detail: {gain:.2f} dB closer to the truth than enlarging the ×1 render."
+        what = "Real detail" if float(factor) > 1 else "True from afar"
+        text = f"{what}: {gain:.2f} dB closer to the truth than {resizing} the ×1 render."
     else:
-        text = f"Artefacts, not detail: {-gain:.2f} dB further from the truth than simply enlarging the ×1 render."
+        what = "Artefacts, not detail" if float(factor) > 1 else "Wrong from afar"
+        text = f"{what}: {-gain:.2f} dB further from the truth than simply {resizing} the ×1 render."
     if ssim_gain is not None and (ssim_gain > 0) != (gain > 0):
         text += " SSIM says the opposite: look at the crops."
     return text
@@ -164,15 +167,15 @@ def zoom_sentence(factor: str, entry: dict[str, Any]) -> str:
 
 def zoom_chart(evaluation: dict[str, Any]) -> str:
     """PSNR of zoomed and enlarged renders over the zoom; empty with fewer than two zooms."""
-    known = [(int(row["factor"]), row["entry"]) for row in zoom_rows(evaluation) if is_number(row["entry"].get("psnr"))]
+    known = [(float(row["factor"]), row["entry"]) for row in zoom_rows(evaluation) if is_number(row["entry"].get("psnr"))]
     render = [entry["psnr"] for _, entry in known]
-    enlarged = [entry.get("enlarged_psnr") if factor > 1 else entry["psnr"] for factor, entry in known]
+    enlarged = [entry.get("enlarged_psnr") if factor != 1 else entry["psnr"] for factor, entry in known]
     if len(known) < 2 or not all(is_number(value) for value in enlarged):
         return ""
-    zooms = [float(factor) for factor, _ in known]
+    zooms = [factor for factor, _ in known]
     both = [
         Series(name="zoomed render", x=zooms, y=render, dots=True),
-        Series(name="enlarged ×1 render", x=zooms, y=enlarged, kind="test", dots=True),
+        Series(name="resized ×1 render", x=zooms, y=enlarged, kind="test", dots=True),
     ]
     return line_chart(both, x_label="zoom, times the training resolution", x_ticks=zooms)
 
@@ -264,11 +267,11 @@ def marks_of(lines: Sequence[dict[str, Any]], at: Callable[[dict[str, Any]], flo
 # -- pictures, views, schedule -------------------------------------------------------------------------------------
 
 
-def crops_by_factor(run: RunFiles) -> dict[int, list[dict[str, Any]]]:
+def crops_by_factor(run: RunFiles) -> dict[str, list[dict[str, Any]]]:
     """Zoomed crops with their pictures, by rising zoom."""
     crops = [with_images(run, entry) for entry in run.pictures.get("zoom", [])]
     factors = sorted({crop["factor"] for crop in crops})
-    return {factor: [crop for crop in crops if crop["factor"] == factor] for factor in factors}
+    return {f"{factor:g}": [crop for crop in crops if crop["factor"] == factor] for factor in factors}
 
 
 def with_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:

@@ -147,7 +147,7 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
-    """Zoomed render minus enlarged x1 render; positive: the zoomed render is closer to the truth."""
+    """Zoomed render minus resized x1 render; positive: the zoomed render is closer to the truth."""
     render, enlarged = entry.get(figure), entry.get(f"enlarged_{figure}")
     return render - enlarged if is_number(render) and is_number(enlarged) else None
 

@@ -366,9 +366,10 @@ def zoom_line(factor: str, result: dict[str, Any]) -> str:
         return f"zoom x{factor}: n/a, {result['unavailable']}"
     if factor == "1":
         return f"zoom x1: {result['psnr']:.2f} dB"
+    resized = "enlarged" if float(factor) > 1 else "reduced"
     verdict = "wins against" if result["beats_enlarged"] else "loses to"
     return (
-        f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the enlarged x1 render ({result['enlarged_psnr']:.2f} dB)"
+        f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the {resized} x1 render ({result['enlarged_psnr']:.2f} dB)"
     )
 
 
