@@ -69,9 +69,9 @@ def load_average() -> float:
     return round(os.getloadavg()[0], 2)
 
 
-def shown_command(arguments: Sequence[str]) -> str:
+def shown_command(arguments: Sequence[str], script: str = "benchmarks/rasterizer.py") -> str:
     """The command line with files by their names: folders are this machine's own."""
-    return " ".join(["python benchmarks/rasterizer.py", *map(without_folders, arguments)])
+    return " ".join([f"python {script}", *map(without_folders, arguments)])
 
 
 def without_folders(word: str) -> str:

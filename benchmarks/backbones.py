@@ -1,0 +1,142 @@
+"""Train every backbone on the same photos and measure what zooming shows: the table of docs/backbones.md.
+
+    python benchmarks/backbones.py SCENES [--only lego] [--backbones gs3d,scaffold] [--iterations 3000]
+
+SCENES holds the folders `fox` (COLMAP) and `lego` (NeRF-synthetic). Each run is a process of its own, by the command line;
+those found finished below --runs are not trained again. Takes one to two hours on two cores.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx.core.files import read_json
+from measuring.machine import BUSY, commit, describe_machine, load_average, shown_command
+from measuring.results import Section, text_table, write_results
+
+BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d")
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A scene with what is asked of it."""
+
+    scene: tuple[str, ...]
+    zooms: tuple[str, ...]
+    presets: dict[str, str]
+    """Overrides that a dataset's published scripts give to a backbone."""
+
+
+SUBJECTS = {
+    "fox": Subject(scene=("scene=colmap", "scene.downscale=4"), zooms=("1", "2", "4", "0.25"), presets={}),
+    "lego": Subject(
+        scene=("scene=blender", "scene.downscale=4"),
+        zooms=("1", "2", "4", "0.25"),
+        presets={"scaffold": "preset=scaffold_blender"},
+    ),
+}
+
+
+def arguments(words: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, help="the folder with fox and lego")
+    parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
+    parser.add_argument("--backbones", default=",".join(BACKBONES), help="backbones, by commas")
+    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--runs", type=Path, default=Path("outputs/backbones"), help="where the runs are kept")
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
+    return parser.parse_args(words)
+
+
+def overrides(name: str, backbone: str, given: argparse.Namespace, folder: Path) -> list[str]:
+    """What the run is given after `gsx`."""
+    subject = SUBJECTS[name]
+    preset = [subject.presets[backbone]] if backbone in subject.presets else []
+    return [
+        *subject.scene,
+        f"scene.path={given.scenes / name}",
+        f"backbone={backbone}",
+        *preset,
+        f"iterations={given.iterations}",
+        f"eval.zoom=[{','.join(subject.zooms)}]",
+        f"folder={folder}",
+    ]
+
+
+def trained(name: str, backbone: str, given: argparse.Namespace) -> dict[str, Any]:
+    """evaluation.json of a run, trained unless that was done before."""
+    folder = given.runs / f"{name}_{given.iterations}_{backbone}"
+    result = folder / "evaluation.json"
+    if not result.is_file():
+        subprocess.run([sys.executable, "-m", "gsx", *overrides(name, backbone, given, folder)], check=True)
+    return read_json(result)
+
+
+def row(backbone: str, evaluation: dict[str, Any]) -> dict[str, Any]:
+    """A run's line of the table."""
+    zooms = {factor: entry for factor, entry in evaluation["zoom"].items() if factor != "1"}
+    return {
+        "backbone": backbone,
+        "psnr": f"{evaluation['psnr']:.2f}",
+        "ssim": f"{evaluation['ssim']:.4f}",
+        **{f"x{factor}": shown(entry) for factor, entry in zooms.items()},
+        **{f"x{factor} ssim": f"{entry['ssim']:.4f}" for factor, entry in zooms.items()},
+        "primitives": evaluation["primitives"],
+        "visible": round(evaluation["visible_primitives"]),
+        "mb": f"{evaluation['megabytes']:.1f}",
+        "seconds": round(evaluation["train_seconds"]),
+        "fps": f"{evaluation['render_fps']:.1f}",
+        "peak_mb": round(evaluation["peak_memory_mb"]),
+    }
+
+
+def shown(entry: dict[str, Any]) -> str:
+    """PSNR of the zoomed render, and of the x1 render resized."""
+    return f"{entry['psnr']:.2f} ({entry['enlarged_psnr']:.2f})"
+
+
+def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], **facts: Any) -> Section:
+    """The table of one scene."""
+    zooms = [factor for factor in SUBJECTS[name].zooms if factor != "1"]
+    columns = [
+        ["backbone", "backbone"],
+        ["psnr", "PSNR x1"],
+        *[[f"x{factor}", f"x{factor} (x1 resized)"] for factor in zooms],
+        ["ssim", "SSIM x1"],
+        *[[f"x{factor} ssim", f"SSIM x{factor}"] for factor in zooms],
+        *[["primitives", "primitives"], ["visible", "drawn"], ["mb", "MB"], ["seconds", "training s"]],
+        *[["fps", "renders/s"], ["peak_mb", "peak MB"]],
+    ]
+    options = " ".join([*SUBJECTS[name].scene, *SUBJECTS[name].presets.values()])
+    note = f"`gsx {options}`, {given.iterations} iterations. In brackets: what the x1 render gives when it is resized."
+    facts = {"date": time.strftime("%Y-%m-%d %H:%M"), "commit": commit()} | facts
+    return {"title": f"Backbones on {name}", "columns": columns, "rows": rows, "notes": [note], **facts}
+
+
+def main(words: Sequence[str]) -> None:
+    """Train, and write the table after every run."""
+    given = arguments(words)
+    machine, load = describe_machine(torch.device("cpu")), load_average()
+    if load > BUSY:
+        print(f"the load is {load:.2f}: seconds will not be those of an idle machine", file=sys.stderr)
+    command = shown_command(words, "benchmarks/backbones.py")
+    for name in given.only.split(","):
+        rows: list[dict[str, Any]] = []
+        for backbone in given.backbones.split(","):
+            rows.append(row(backbone, trained(name, backbone, given)))
+            table = section(name, given, rows, load=load, command=command)
+            write_results(given.to, "backbones_cpu", machine, {f"{name}_{given.iterations}": table})
+        print(text_table(table))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
