@@ -2,8 +2,8 @@
 
     python benchmarks/backbones.py SCENES [--only lego] [--backbones gs3d,scaffold] [--iterations 3000]
 
-SCENES holds the folders `fox` (COLMAP) and `lego` (NeRF-synthetic). Each run is a process of its own, by the command line;
-those found finished below --runs are not trained again. Takes one to two hours on two cores.
+SCENES holds the folders `fox` (COLMAP) and `lego` (NeRF-synthetic). Each run is a process of its own, by the command
+line; those found finished below --runs are not trained again. Takes one to two hours on two cores.
 """
 
 import argparse
@@ -31,16 +31,20 @@ class Subject:
 
     scene: tuple[str, ...]
     zooms: tuple[str, ...]
-    presets: dict[str, str]
-    """Overrides that a dataset's published scripts give to a backbone."""
+    changes: dict[str, tuple[str, ...]]
+    """Overrides for a backbone: what scripts for that dataset set."""
 
 
 SUBJECTS = {
-    "fox": Subject(scene=("scene=colmap", "scene.downscale=4"), zooms=("1", "2", "4", "0.25"), presets={}),
+    "fox": Subject(scene=("scene=colmap", "scene.downscale=4"), zooms=("1", "2", "4", "0.25"), changes={}),
     "lego": Subject(
         scene=("scene=blender", "scene.downscale=4"),
         zooms=("1", "2", "4", "0.25"),
-        presets={"scaffold": "preset=scaffold_blender"},
+        changes={
+            "scaffold": ("preset=scaffold_blender",),
+            "octree_scaffold": ("scene.random_points=10000",),
+            "octree_gs3d": ("scene.random_points=10000",),
+        },
     ),
 }
 
@@ -60,12 +64,11 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
 def overrides(name: str, backbone: str, given: argparse.Namespace, folder: Path) -> list[str]:
     """What the run is given after `gsx`."""
     subject = SUBJECTS[name]
-    preset = [subject.presets[backbone]] if backbone in subject.presets else []
     return [
         *subject.scene,
         f"scene.path={given.scenes / name}",
         f"backbone={backbone}",
-        *preset,
+        *subject.changes.get(backbone, ()),
         f"iterations={given.iterations}",
         f"eval.zoom=[{','.join(subject.zooms)}]",
         f"folder={folder}",
@@ -116,8 +119,10 @@ def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], **
         *[["primitives", "primitives"], ["visible", "drawn"], ["mb", "MB"], ["seconds", "training s"]],
         *[["fps", "renders/s"], ["peak_mb", "peak MB"]],
     ]
-    options = " ".join([*SUBJECTS[name].scene, *SUBJECTS[name].presets.values()])
-    note = f"`gsx {options}`, {given.iterations} iterations. In brackets: what the x1 render gives when it is resized."
+    subject = SUBJECTS[name]
+    changes = "; ".join(f"{backbone}: `{' '.join(words)}`" for backbone, words in subject.changes.items())
+    note = f"`gsx {' '.join(subject.scene)}`, {given.iterations} iterations{'; ' * bool(changes)}{changes}."
+    note += " In brackets: what the x1 render gives when it is resized."
     facts = {"date": time.strftime("%Y-%m-%d %H:%M"), "commit": commit()} | facts
     return {"title": f"Backbones on {name}", "columns": columns, "rows": rows, "notes": [note], **facts}
 

@@ -6,8 +6,9 @@ from gsx.core.plugins import Registry, hookimpl
 @hookimpl
 def gsx_register(registry: Registry) -> None:
     """Scenes and backbones of gsx itself."""
-    from gsx.backbones.anchors import ExplicitOptions, NeuralOptions, explicit_anchors, neural_anchors
+    from gsx.backbones.anchors import NeuralOptions, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
+    from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
     from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
@@ -20,4 +21,4 @@ def gsx_register(registry: Registry) -> None:
     registry.add("backbone", "mip_splatting", GS3D, GS3DOptions)
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
-    registry.add("backbone", "octree_gs3d", explicit_anchors, ExplicitOptions)
+    registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)

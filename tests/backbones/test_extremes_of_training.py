@@ -15,13 +15,20 @@ from gsx.core.rasterizer import rasterize
 from gsx.core.scene import Scene, View
 from gsx.core.session import in_units, measured, warned_of_units
 
-BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d")
+BACKBONES = {
+    "gs3d": (),
+    "mip_splatting": (),
+    "scaffold": (),
+    "octree_scaffold": (),
+    "octree_gs3d": (),
+    "octree_gs3d, clone_split": ("backbone.densification=clone_split",),
+}
 STEPS = 30
 """Of a run that grows and prunes several times in them."""
 
 
-def built(name: str, scene: Scene, *overrides: str) -> Backbone:
-    settings = compose([f"backbone={name}", *overrides], plugins())
+def built(name: str, scene: Scene) -> Backbone:
+    settings = compose([f"backbone={name.split(',')[0]}", *BACKBONES[name]], plugins())
     beginning = Beginning(
         scene=scene,
         iterations=STEPS,

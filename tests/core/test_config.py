@@ -12,14 +12,27 @@ from gsx.core.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
+NEEDS = {
+    ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
+    ("preset", "octree"): ("backbone=octree_scaffold",),
+    ("preset", "clone"): ("backbone=octree_gs3d",),
+}
+"""What the settings of a dataset are for."""
 
 
 @pytest.mark.parametrize(("group", "option"), GROUPS)
 def test_every_file_composes_and_fits_its_schema(group: str, option: str) -> None:
-    needs = [f"backbone={'scaffold' if option.startswith('scaffold') else 'octree_scaffold'}"] * (group == "preset")
-    settings = compose([*needs, f"{group}={option}"], plugins())
+    settings = compose([*NEEDS.get((group, option.split("_")[0]), ()), f"{group}={option}"], plugins())
     if group in ("scene", "backbone"):
         assert getattr(settings, group).component.name == option
+
+
+def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
+    given = ["scene=blender", "backbone=scaffold", "preset=scaffold_blender"]
+    settings = compose(given, plugins())
+    assert settings.scene.options.random_points == 10000
+    assert settings.backbone.options.growth.coarsest == 4
+    assert compose([*given, "scene.random_points=7"], plugins()).scene.options.random_points == 7
 
 
 def test_published_values_of_gs3d() -> None:

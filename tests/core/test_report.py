@@ -180,7 +180,10 @@ def test_zoom_verdicts_say_what_they_mean(page: Page) -> None:
 def test_zooming_out_is_told_in_its_own_words(tmp_path: Path) -> None:
     result = evaluation(zoom={"0.25": zoom_entry(20.0, 26.0), "0.5": zoom_entry(26.5, 26.0), "2": zoom_entry(25, 24)})
     text = Page(write_report(make_run(tmp_path / "run", result=result))).text("zoom")
-    assert "×0.25 20.00 26.00 −6.00 +0.1000 loss Wrong from afar: 6.00 dB further from the truth than simply reducing" in text
+    assert (
+        "×0.25 20.00 26.00 −6.00 +0.1000 loss Wrong from afar: 6.00 dB further from the truth than simply reducing"
+        in text
+    )
     assert "×0.5 26.50 26.00 +0.50 +0.1000 win True from afar: 0.50 dB closer to the truth than reducing" in text
     assert text.index("×0.25") < text.index("×0.5") < text.index("×2")
 

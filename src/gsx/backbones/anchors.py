@@ -31,7 +31,17 @@ from gsx.backbones.growth import (
     resolved,
 )
 from gsx.backbones.heads import HeadOptions, Heads
-from gsx.backbones.levels import LevelOptions, Levels, derive, drawn, facts_of, initial_nodes, unlocked, warnings_of
+from gsx.backbones.levels import (
+    LevelOptions,
+    Levels,
+    derive,
+    drawn,
+    facts_of,
+    initial_nodes,
+    note_of,
+    unlocked,
+    warnings_of,
+)
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
 from gsx.core.backbone import Beginning, Gaussians
 from gsx.core.camera import Camera
@@ -170,7 +180,7 @@ def neural_anchors(options: NeuralOptions, beginning: Beginning) -> "Anchors":
 
 
 def explicit_anchors(options: ExplicitOptions, beginning: Beginning) -> "Anchors":
-    """The backbone octree_gs3d in its official form."""
+    """The backbone octree_gs3d as reported: anchors of one Gaussian."""
     logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
     representation = Explicit(options.sh_degree, logit)
     return Anchors(options, beginning, representation, None, None, (options.sh_degree, options.sh_every))
@@ -449,11 +459,7 @@ class Anchors:
         if self.options.filter == "mip":
             notes = ["3D filter fused into scales and opacities of Gaussians; anchors have its size in filter_3D"]
         if self.levels is not None:
-            found = self.levels
-            notes.append(
-                f"levels {found.count}, fork {found.fork}, standard_dist {found.farthest!r} at a focal length of "
-                f"{found.views.focal!r} px, init_pos {found.origin!r}, voxel_size {found.cell!r}"
-            )
+            notes.append(note_of(self.levels))
         return notes
 
     def plan(self) -> dict[str, Any]:

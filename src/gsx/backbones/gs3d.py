@@ -1,5 +1,6 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (spec 1, 5-7)."""
 
+import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +11,18 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import logsigmoid, normalize
 
+from gsx.backbones.clone_split import (
+    LevelDensityOptions,
+    bias_levels,
+    clones,
+    judged,
+    small_children,
+    stacked,
+    starting_points,
+)
+from gsx.backbones.levels import LevelOptions, Levels, derive, drawn, facts_of, note_of, unlocked, warnings_of
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
+from gsx.backbones.sampling import sampled_means
 from gsx.core.backbone import Beginning, Gaussians
 from gsx.core.camera import Camera
 from gsx.core.density import (
@@ -26,16 +38,19 @@ from gsx.core.density import (
 from gsx.core.errors import InputError
 from gsx.core.export import columns_of
 from gsx.core.neighbours import mean_square_distance
-from gsx.core.quaternions import rotation_matrices
-from gsx.core.rasterizer import Rendering
+from gsx.core.rasterizer import Rendering, take_rows
 from gsx.core.scene import PointCloud
 from gsx.core.schedule import log_linear
 from gsx.core.sh import colours_of, constant_from_colour
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Bool, Float, Int
 from gsx.core.splats import Splats
+
+logger = logging.getLogger(__name__)
 
 LARGEST_LOG_SCALE = 30.0
 """Scales are held below e^30 world units, so that their squares stay finite in float32 (DESIGN: clamp log-scales)."""
+LEAST_WEIGHT = 1e-37
+"""A level that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
 LEAST_SQUARE_DISTANCE = 1e-7
 """Lower bound of the squared neighbour distance that sets the initial scale (spec 1.4)."""
 
@@ -95,6 +110,9 @@ class GS3DOptions:
     rates: Rates
     density: Density
     mip: MipOptions
+    levels: LevelOptions | None = None
+    """Levels of detail (Octree-GS), with density control across them; None: every camera draws everything."""
+    level_density: LevelDensityOptions | None = None
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
@@ -106,6 +124,10 @@ class GS3DOptions:
             raise ValueError("backbone.published_iterations and backbone.max_primitives must be at least 1")
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
+        if (self.levels is None) != (self.level_density is None):
+            raise ValueError(
+                "backbone.levels and backbone.level_density belong together: give both, or take backbone=gs3d for none"
+            )
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
@@ -124,12 +146,12 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
 
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
     """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (spec 7, split)."""
-    noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
-    offset = rotation_matrices(rows["quats"]) @ (noise * rows["log_scales"].exp())[:, :, None]
-    return rows | {
-        "means": rows["means"] + offset[:, :, 0],
-        "log_scales": rows["log_scales"] - math.log(shrink),
-    }
+    return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
+
+
+def without_normals(columns: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The columns of a splat file but nx, ny, nz."""
+    return {name: column for name, column in columns.items() if name not in ("nx", "ny", "nz")}
 
 
 def quantile(values: Float[Tensor, "N"], fraction: float) -> Float[Tensor, ""]:
@@ -139,10 +161,20 @@ def quantile(values: Float[Tensor, "N"], fraction: float) -> Float[Tensor, ""]:
     return torch.lerp(ordered[math.floor(place)], ordered[math.ceil(place)], place % 1)
 
 
-class GS3D:
-    """Explicit Gaussians, N rows in every parameter."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shown:
+    """What a camera draws of N Gaussians."""
 
-    standard_file = True
+    values: dict[str, Tensor]
+    """Parameters and columns, M rows."""
+    rows: Int[Tensor, "M"] | None = None
+    """Rows of the table; None: all of them."""
+    weights: Float[Tensor, "M"] | None = None
+    """Factors of the opacities; None: 1."""
+
+
+class GS3D:
+    """Explicit Gaussians, N rows in every parameter; at several levels of detail if asked for (spec 4B)."""
 
     def __init__(self, options: GS3DOptions, beginning: Beginning) -> None:
         scene = beginning.scene
@@ -157,16 +189,39 @@ class GS3D:
         self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
         self.absolute_gradient = options.density.absolute
         self.cameras = [view.camera for view in scene.train]
-        raw = initial_parameters(scene.points, options.sh_degree, options.initial_opacity)
-        self.table = Table({name: Parameter(value.to(beginning.device)) for name, value in raw.items()})
+        self.step = 0
+        self.last: tuple[Shown, Float[Tensor, "M 3"]] | None = None
+        self.levels = self.derived_levels(scene.points)
+        self.standard_file = self.levels is None
+        self.table = self.initial_table(scene.points, beginning.device)
         self.statistics = Statistics.zeros(len(self.table), beginning.device, options.density.absolute)
         self.refresh_filter()
+
+    def derived_levels(self, points: PointCloud) -> Levels | None:
+        """The levels of the scene, None if there are to be none."""
+        options = self.options.levels
+        if options is None:
+            return None
+        return derive(points.positions.float(), self.cameras, options, self.schedule.step(options.coarse_until))
+
+    def initial_table(self, points: PointCloud, device: torch.device) -> Table:
+        """One Gaussian per point, or per node of the levels."""
+        columns: dict[str, Tensor] = {}
+        if self.levels is not None:
+            points, columns = starting_points(points, self.levels)
+            for warning in warnings_of(self.levels, len(points)):
+                logger.warning("%s", warning)
+        raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
+        return Table(
+            {name: Parameter(value.to(device)) for name, value in raw.items()},
+            {name: value.to(device) for name, value in columns.items()},
+        )
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def begin(self, step: int) -> None:
         """Learning rates and SH degree of this step (spec 6 and 1.3)."""
-        rates = self.options.rates
+        self.step, rates = step, self.options.rates
         steps = self.schedule.step(self.options.published_iterations)
         self.table.set_rate("means", self.extent * log_linear(step, steps, rates.means_first, rates.means_last))
         for name in ("sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats"):
@@ -174,40 +229,68 @@ class GS3D:
         self.active_degree = min(self.options.sh_degree, step // max(1, self.schedule.step(self.options.sh_every)))
 
     def splats(self, camera: Camera) -> Splats:
-        """All Gaussians with their colours as seen from the camera."""
-        table = self.table
-        offsets = table["means"] - camera.centre.to(table["means"])
-        scales, log_opacities = self.extents()
+        """The Gaussians that the camera draws, with their colours as seen from there."""
+        shown = self.shown(camera)
+        values = shown.values
+        offsets = values["means"] - camera.centre.to(values["means"])
+        scales, log_opacities = self.extents(shown)
+        self.last = (shown, scales)
         return Splats(
-            means=table["means"],
+            means=values["means"],
             scales=scales,
-            quats=table["quats"],
+            quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(table["sh_constant"], table["sh_rest"], offsets, self.active_degree),
+            colours=colours_of(values["sh_constant"], values["sh_rest"], offsets, self.active_degree),
         )
 
-    def extents(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    def everything(self) -> Shown:
+        """All Gaussians."""
+        return Shown(values={**self.table.parameters, **self.table.columns})
+
+    def shown(self, camera: Camera) -> Shown:
+        """All Gaussians, or those of the levels that the camera draws (spec 3.5)."""
+        if self.levels is None:
+            return self.everything()
+        means, level, bias = (self.table[name] for name in ("means", "level", "bias"))
+        mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.highest())
+        rows = mask.nonzero()[:, 0]
+        values = {name: take_rows(parameter, rows) for name, parameter in self.table.parameters.items()}
+        values |= {name: column[rows] for name, column in self.table.columns.items()}
+        return Shown(values=values, rows=rows, weights=weights[rows])
+
+    def highest(self) -> int:
+        """Highest level that takes part at this step (spec 3.6)."""
+        assert self.levels is not None
+        return min(self.levels.count - 1, unlocked(self.levels.switches, self.levels.first, self.step))
+
+    def extents(self, shown: Shown) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
         """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
-        scales = self.table["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
-        log_opacities = logsigmoid(self.table["opacity_logits"])
+        scales = shown.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
+        log_opacities = logsigmoid(shown.values["opacity_logits"])
+        if shown.weights is not None:
+            log_opacities = log_opacities + shown.weights.clamp_min(LEAST_WEIGHT).log()
         if self.options.filter == "none":
             return scales, log_opacities
-        return smoothed(scales, log_opacities, self.table["filter"])
+        return smoothed(scales, log_opacities, shown.values["filter"])
 
     def regulariser(self) -> Float[Tensor, ""] | None:
-        """3D-GS has none (spec 5)."""
-        return None
+        """3D-GS has none (spec 5); across levels the mean volume of what was drawn, 0 for nothing (spec 4B)."""
+        control = self.options.level_density
+        if control is None or self.last is None or not control.volume_weight:
+            return None
+        volumes = self.last[1].prod(1)
+        return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
     def observe(self, rendering: Rendering, step: int) -> None:
         """Screen gradients count until density control ends (spec 7, cadence)."""
         if step < self.schedule.step(self.options.density.stop):
-            self.statistics.add(rendering.screen)
+            self.statistics.add(rendering.screen, self.last[0].rows if self.last else None)
 
     def adapt(self, step: int) -> dict[str, int]:
         """Clone, split, prune and reset when due."""
         done: dict[str, int] = {}
         if self.density_due(step):
-            done |= self.densify(step)
+            done |= self.densify(step) if self.levels is None else self.densify_levels(step, self.levels)
         if done or self.filter_due(step):
             self.refresh_filter()
         if self.reset_due(step):
@@ -235,7 +318,8 @@ class GS3D:
         return int((~kept).sum())
 
     def discard(self) -> None:
-        """Forget the gradients."""
+        """Forget the gradients and the picture they came from."""
+        self.last = None
         self.table.optimiser.zero_grad(set_to_none=True)
 
     # -- density control ---------------------------------------------------------------------------------------
@@ -252,7 +336,12 @@ class GS3D:
         return self.schedule.interval(density.reset_every, density.reset_passes)
 
     def reset_due(self, step: int) -> bool:
-        """Every reset interval while density control runs, and once early on a white background."""
+        """Every reset interval while density control runs, and once early on a white background.
+
+        Never across levels: the published schedule does not reach one (spec 4B).
+        """
+        if self.levels is not None:
+            return False
         density = self.options.density
         regular = step % self.reset_interval() == 0 and step < self.schedule.step(density.stop)
         return regular or (self.white and step == max(1, self.schedule.step(density.white_reset)))
@@ -268,6 +357,35 @@ class GS3D:
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
         return {"cloned": int(cloned.sum()), "split": int(split.sum()), "pruned": pruned}
+
+    def densify_levels(self, step: int, levels: Levels) -> dict[str, int]:
+        """Copies of small Gaussians on their level, children of large ones a level finer, then prune (spec 4B)."""
+        density, control = self.options.density, self.options.level_density
+        assert control is not None
+        gradient, level = self.statistics.mean_gradient(), self.table["level"]
+        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
+        verdict = judged(
+            gradient,
+            raw["log_scales"].exp(),
+            level,
+            levels,
+            control,
+            threshold=density.gradient,
+            large=density.split_extent * self.extent,
+        )
+        chosen = self.within_cap(gradient, verdict.cloned | verdict.split)
+        ready = not control.gate or self.highest() == levels.count - 1
+        split = verdict.split & chosen & ready
+        added = [
+            clones(raw, verdict.cloned & chosen, levels),
+            small_children(raw, split, levels, control.shrink, self.generator),
+        ]
+        bias_levels(self.table, verdict.biased, control.bias_step)
+        append_rows(self.table, stacked(added))
+        pruned = self.prune(step)
+        self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
+        cloned, children_made = (len(part["means"]) for part in added)
+        return {"cloned": cloned, "split": children_made, "pruned": pruned}
 
     def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (spec 10.5).
@@ -314,7 +432,7 @@ class GS3D:
     def reset_opacities(self) -> None:
         """o <- min(o, reset_opacity), moments zeroed (spec 7); with a 3D filter o is what is drawn (spec 10.5)."""
         highest, logits = self.options.density.reset_opacity, self.table["opacity_logits"].detach()
-        excess = (self.extents()[1].detach() - math.log(highest)).clamp_min(0)
+        excess = (self.extents(self.everything())[1].detach() - math.log(highest)).clamp_min(0)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
         reset_column(self.table, "opacity_logits", lowered)
 
@@ -338,38 +456,53 @@ class GS3D:
     # -- what others need --------------------------------------------------------------------------------------
 
     def size(self) -> tuple[int, int]:
-        """(primitives, bytes of their parameters)."""
-        return len(self.table), sum(p.numel() * p.element_size() for p in self.table.parameters.values())
+        """(primitives, bytes of their parameters and levels)."""
+        stored: list[Tensor] = [*self.table.parameters.values()]
+        stored += [self.table[name] for name in ("level", "bias") if name in self.table.columns]
+        return len(self.table), sum(value.numel() * value.element_size() for value in stored)
 
     def explicit(self, camera: Camera | None = None) -> Gaussians:
-        """The parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9)."""
-        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()}
-        if self.options.filter == "mip":
-            scales, log_opacities = self.extents()
+        """The parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9).
+
+        With levels those that the camera draws; without a camera those of all levels.
+        """
+        shown = self.everything() if camera is None else self.shown(camera)
+        raw = {name: shown.values[name].detach() for name in self.table.parameters}
+        if self.options.filter == "mip" or shown.weights is not None:
+            scales, log_opacities = self.extents(shown)
             raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
         raw["sh_constant"] = raw["sh_constant"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)
         return Gaussians(**raw)
 
     def file(self) -> dict[str, Tensor]:
-        """The standard 62 properties (spec 8.3)."""
-        return columns_of(self.explicit())
+        """The standard 62 properties (spec 8.3); levels stand where normals would be (spec 5.1)."""
+        columns = columns_of(self.explicit())
+        if self.levels is None:
+            return columns
+        info = torch.zeros_like(columns["nx"])
+        info[:1] = self.levels.farthest
+        levels = {"level": self.table["level"].float(), "extra_level": self.table["bias"], "info": info}
+        return {axis: columns.pop(axis) for axis in "xyz"} | levels | without_normals(columns)
 
     def export_notes(self) -> list[str]:
-        """Whether the 3D filter is in the file."""
-        return ["3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"]
+        """Whether the 3D filter is in the file, and what chooses the levels at a distance."""
+        filtered = "3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"
+        return [filtered] + ([] if self.levels is None else [note_of(self.levels)])
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""
         density, steps = self.options.density, self.schedule
+        resets = {"every": self.reset_interval(), "until": steps.step(density.stop)} | (
+            {"white_background": max(1, steps.step(density.white_reset))} if self.white else {}
+        )
         return {
             "densify": {
                 "from": steps.step(density.start),
                 "until": steps.step(density.stop),
                 "every": steps.interval(density.every),
             },
-            "opacity_reset": {"every": self.reset_interval(), "until": steps.step(density.stop)}
-            | ({"white_background": max(1, steps.step(density.white_reset))} if self.white else {}),
+            **({"opacity_reset": resets} if self.levels is None else {}),
             "prune_huge": {"from": self.reset_interval()},
             "sh_degree": {
                 "every": max(1, steps.step(self.options.sh_every)),
@@ -380,6 +513,7 @@ class GS3D:
                 "to": self.options.rates.means_last * self.extent,
                 "over": steps.step(self.options.published_iterations),
             },
+            **({} if self.levels is None else {"levels": facts_of(self.levels, self.table["level"])}),
         }
 
     def tensors(self) -> dict[str, Tensor]:

@@ -371,6 +371,14 @@ def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, An
     return facts | {"anchors": of.long().bincount(minlength=levels.count).tolist()}
 
 
+def note_of(levels: Levels) -> str:
+    """A file's comment: what a viewer must know to choose levels at a distance (spec 5.1)."""
+    return (
+        f"levels {levels.count}, fork {levels.fork}, standard_dist {levels.farthest!r} at a focal length of "
+        f"{levels.views.focal!r} px, init_pos {levels.origin!r}, voxel_size {levels.cell!r}"
+    )
+
+
 def warnings_of(levels: Levels, anchors: int) -> list[str]:
     """What is odd about the levels of a scene that starts with so many primitives, with the numbers that tell."""
     finest, near, far = levels.size(levels.count - 1), levels.nearest, levels.farthest

@@ -145,10 +145,14 @@ class Statistics:
         sums, seen = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
         return Statistics(sums, seen, torch.zeros_like(sums) if absolute else None)
 
-    def add(self, screen: ScreenStatistics) -> None:
-        """Count one render in after its backward pass: a norm per view, visible primitives only (spec 4)."""
+    def add(self, screen: ScreenStatistics, drawn: Int[Tensor, "M"] | None = None) -> None:
+        """Count one render in after its backward pass: a norm per view, visible primitives only (spec 4).
+
+        `drawn`: rows of the splats that were rendered; None: splat n is row n.
+        """
         visible = screen.visible
-        rows = screen.ids[visible]
+        ids = screen.ids[visible]
+        rows = ids if drawn is None else drawn[ids]
         self.gradient.index_add_(0, rows, screen.ndc_gradient(screen.shift)[visible].norm(dim=1).to(self.gradient))
         self.count[rows] += 1
         if self.absolute is not None and screen.probe is not None:

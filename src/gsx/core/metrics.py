@@ -55,6 +55,6 @@ def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"])
 
 
 def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:
-    """Resized by Keys' cubic interpolation, antialiased and clamped to [0, 1]: the naive competitor of a zoomed render."""
+    """Resized by Keys' cubic interpolation, antialiased, clamped to [0, 1]: the naive competitor of a zoomed render."""
     larger = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)
     return larger[0].clamp(0, 1)

@@ -166,8 +166,10 @@ def zoom_sentence(factor: str, entry: dict[str, Any]) -> str:
 
 
 def zoom_chart(evaluation: dict[str, Any]) -> str:
-    """PSNR of zoomed and enlarged renders over the zoom; empty with fewer than two zooms."""
-    known = [(float(row["factor"]), row["entry"]) for row in zoom_rows(evaluation) if is_number(row["entry"].get("psnr"))]
+    """PSNR of zoomed and resized renders over the zoom; empty with fewer than two zooms."""
+    known = [
+        (float(row["factor"]), row["entry"]) for row in zoom_rows(evaluation) if is_number(row["entry"].get("psnr"))
+    ]
     render = [entry["psnr"] for _, entry in known]
     enlarged = [entry.get("enlarged_psnr") if factor != 1 else entry["psnr"] for factor, entry in known]
     if len(known) < 2 or not all(is_number(value) for value in enlarged):

@@ -1,0 +1,14 @@
+"""Places drawn from Gaussians."""
+
+import torch
+from torch import Tensor
+
+from gsx.core.quaternions import rotation_matrices
+from gsx.core.shapes import Float
+
+
+def sampled_means(rows: dict[str, Tensor], generator: torch.Generator) -> Float[Tensor, "M 3"]:
+    """One place from each Gaussian, given by raw `means`, `quats` and `log_scales`."""
+    noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
+    offset = rotation_matrices(rows["quats"]) @ (noise * rows["log_scales"].exp())[:, :, None]
+    return rows["means"] + offset[:, :, 0]

@@ -1,0 +1,435 @@
+"""Octree-GS on free Gaussians: clone and split across levels, by hand and against loops (spec 4B)."""
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from small_scene import small_scene, spread
+from tiny import tiny_run
+from torch import Tensor
+
+from gsx.backbones.clone_split import (
+    LevelDensityOptions,
+    clones,
+    judged,
+    relative_sizes,
+    small_children,
+    starting_points,
+)
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.levels import Levels, initial_nodes, seen_fraction
+from gsx.backbones.octree_gs3d import OctreeGS3DOptions
+from gsx.cli import plugins
+from gsx.core.backbone import Backbone, Beginning
+from gsx.core.camera import Camera, look_at
+from gsx.core.config import compose
+from gsx.core.errors import ConfigError
+from gsx.core.export import splats_of, write_columns
+from gsx.core.ply import read_ply
+from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
+from gsx.core.scene import Scene
+from gsx.core.session import execute, open_run
+
+WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
+CONTROL = LevelDensityOptions(
+    update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, gate=False, volume_weight=0.01
+)
+
+
+@cache
+def options_of(*overrides: str) -> OctreeGS3DOptions:
+    return compose([*WORDS, *(f"backbone.{override}" for override in overrides)], plugins()).backbone.options
+
+
+def seen_from(distance: float) -> Camera:
+    return look_at([0.0, -distance, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=24, height=16)
+
+
+def deep_scene(colours: Tensor | None = None, background: float = 0.0) -> Scene:
+    """Cameras 8, 4, 2 and 1 units away, so that there is something to see on three levels."""
+    scene = small_scene(spread(60), colours, background=background)
+    views = [replace(view, camera=seen_from(8.0 / 2**n)) for n, view in enumerate(scene.train)]
+    return replace(scene, train=views)
+
+
+def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 40000) -> GS3D:
+    """Three levels of free Gaussians at step 0 of the published run; D is 8."""
+    options = options_of("levels.count=3", "levels.base_layer=3", "levels.visible_threshold=0", *overrides)
+    beginning = Beginning(
+        scene=scene or deep_scene(),
+        iterations=iterations,
+        device=torch.device("cpu"),
+        raster=RasterSettings(),
+        generator=torch.Generator().manual_seed(0),
+    )
+    backbone = GS3D(options.clone_split, beginning)
+    assert backbone.levels is not None
+    backbone.levels = replace(backbone.levels, farthest=8.0)
+    return backbone
+
+
+def levels_of(backbone: GS3D) -> Levels:
+    assert backbone.levels is not None
+    return backbone.levels
+
+
+def render(backbone: GS3D, camera: Camera) -> Rendering:
+    """A picture with its backward pass."""
+    rendering = rasterize(backbone.splats(camera), camera, backbone.raster, background=torch.zeros(3))
+    rendering.image.square().sum().backward()
+    return rendering
+
+
+def stir(backbone: GS3D) -> None:
+    """Other values than those of the beginning, so that Gaussians differ; biases too."""
+    generator = torch.Generator().manual_seed(11)
+    with torch.no_grad():
+        for name, parameter in backbone.table.parameters.items():
+            noise = torch.empty_like(parameter).normal_(generator=generator)
+            parameter.copy_(noise * 0.3 - 2 if name == "log_scales" else parameter + 0.5 * noise)
+    backbone.table["bias"].uniform_(0, 0.4, generator=generator)
+
+
+# -- the beginning -----------------------------------------------------------------------------------------------------
+
+
+def test_gaussians_start_half_a_cell_beyond_the_nodes_with_the_largest_colours_of_their_cells() -> None:
+    colours = torch.randint(0, 256, (60, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    scene = deep_scene(colours)
+    levels = levels_of(small_octree(scene=scene))
+    cloud, columns = starting_points(scene.points, levels)
+    nodes, of, group = initial_nodes(scene.points.positions, levels)
+    assert torch.equal(columns["level"], of)
+    assert not columns["bias"].any()
+    half = torch.tensor([levels.size(level) / 2 for level in of.tolist()])
+    torch.testing.assert_close(cloud.positions, nodes + half[:, None])
+    for row in range(len(nodes)):
+        owners = (group[of[row]] == row).nonzero()[:, 0]
+        assert torch.equal(cloud.colours[row], colours[owners].amax(0)), row
+
+
+def test_they_are_backbones_that_tell_their_size() -> None:
+    backbone = small_octree()
+    assert isinstance(backbone, Backbone)
+    count, size = backbone.size()
+    assert count == len(backbone.table)
+    assert size == count * (4 * (59 + 1) + 2)  # 59 floats of 3D-GS, a bias, and 16 bits of level
+
+
+# -- the verdict -------------------------------------------------------------------------------------------------------
+
+
+def test_sizes_are_relative_to_level_0() -> None:
+    scales = torch.tensor([[1.0, 2, 3], [3, 4, 5], [1, 1, 1], [0.5, 0.5, 0.5]])
+    of = torch.tensor([0, 0, 1, 3], dtype=torch.int16)
+    torch.testing.assert_close(relative_sizes(scales, of, 4), torch.tensor([1, 1 / 3, 1, 0.5 / 3]))  # level 2 is empty
+
+
+def test_without_level_0_every_level_counts_as_it_is() -> None:
+    of = torch.tensor([1, 2], dtype=torch.int16)
+    assert relative_sizes(torch.ones(2, 3), of, 3).tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("level", "gradient", "scale", "wanted"), [
+    (0, 2.0e-4, 0.009, "cloned"),
+    (0, 1.99e-4, 0.009, ""),
+    (0, 2.0e-4, 0.011, "split"),
+    (0, 3.0e-4, 0.011, "split biased"),
+    (0, 3.0e-4, 0.009, "cloned biased"),
+    (1, 2.29e-4, 0.004, ""),             # 2e-4 x 2^0.2 = 2.2974e-4
+    (1, 2.30e-4, 0.004, "cloned"),
+    (1, 2.30e-4, 0.006, "split"),        # level 1 is half as large: so is what counts as large
+    (1, 3.45e-4, 0.004, "cloned biased"),
+    (0, 0.0, 0.02, ""),
+])  # fmt: skip
+def test_verdicts_by_hand(level: int, gradient: float, scale: float, wanted: str) -> None:
+    """The first Gaussian is judged; the others make level 0 of mean scale 1, level 1 of mean scale 1/2."""
+    levels = levels_of(small_octree())
+    of = torch.tensor([level, *[0] * 200, *[1] * 200], dtype=torch.int16)
+    scales = torch.cat([torch.full((1, 3), 1e-3), torch.ones(200, 3), torch.full((200, 3), 0.5)])
+    scales[0, 1] = scale
+    gradients = torch.zeros(401)
+    gradients[0] = gradient
+    found = judged(gradients, scales, of, levels, CONTROL, threshold=2e-4, large=0.01)
+    assert [name for name in ("cloned", "split", "biased") if getattr(found, name)[0]] == wanted.split()
+    assert not any(bool(getattr(found, name)[1:].any()) for name in ("cloned", "split", "biased"))
+
+
+# -- new Gaussians -----------------------------------------------------------------------------------------------------
+
+
+def raw_of(backbone: GS3D) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in backbone.everything().values.items()}
+
+
+def test_clones_are_copies_on_their_level_without_bias() -> None:
+    backbone = small_octree()
+    stir(backbone)
+    raw = raw_of(backbone)
+    cloned = torch.arange(len(backbone.table)) % 7 == 3
+    new = clones(raw, cloned, levels_of(backbone))
+    for name, value in new.items():
+        assert torch.equal(value, torch.zeros_like(value) if name == "bias" else raw[name][cloned]), name
+
+
+def test_a_child_is_smaller_a_level_finer_and_drawn_from_its_parent() -> None:
+    """Parents stretched along their first axis, which their rotation turns to y: children lie on that line."""
+    backbone = small_octree()
+    raw = raw_of(backbone)
+    raw["log_scales"][:] = torch.tensor([math.log(0.1), -30.0, -30.0])
+    raw["quats"][:] = torch.tensor([math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)])
+    split = torch.ones(len(backbone.table), dtype=torch.bool)
+    new = small_children(raw, split, levels_of(backbone), 0.6, torch.Generator().manual_seed(0))
+    offsets = new["means"] - raw["means"]
+    assert offsets[:, [0, 2]].abs().max() < 1e-6
+    assert 0.07 < float(offsets[:, 1].std()) < 0.13
+    torch.testing.assert_close(new["log_scales"], raw["log_scales"] + math.log(0.6))
+    assert torch.equal(new["level"], (raw["level"] + 1).clamp(max=2))
+    for name in ("sh_constant", "sh_rest", "opacity_logits", "quats"):
+        assert torch.equal(new[name], raw[name]), name
+
+
+def test_what_too_few_cameras_would_draw_is_not_made() -> None:
+    """Half of the cameras stand at D/2 and farther, so hardly any child of level 2 is drawn by more than half."""
+    backbone = small_octree()
+    levels = replace(levels_of(backbone), threshold=0.5)
+    raw = raw_of(backbone)
+    split = torch.ones(len(backbone.table), dtype=torch.bool)
+    new = small_children(raw, split, levels, 0.6, torch.Generator().manual_seed(0))
+    children = small_children(raw, split, replace(levels, threshold=-1.0), 0.6, torch.Generator().manual_seed(0))
+    seen = seen_fraction(levels, children["means"], children["level"]) > 0.5
+    assert 0 < len(new["means"]) < len(seen)
+    assert torch.equal(new["means"], children["means"][seen])
+
+
+# -- density events ----------------------------------------------------------------------------------------------------
+
+
+def due(*overrides: str, step: int = 1600, scene: Scene | None = None) -> GS3D:
+    """A backbone at a density event: 0, 1 are to be cloned, 2, 3 split, of 3 the gradient is large."""
+    backbone = small_octree(*overrides, scene=scene)
+    with torch.no_grad():
+        backbone.table["log_scales"].fill_(math.log(1e-3))
+        backbone.table["log_scales"][4:] = math.log(0.1)
+        backbone.table["log_scales"][2:4] = math.log(0.02)
+    backbone.begin(step)
+    render(backbone, seen_from(1.0))
+    backbone.update()
+    backbone.statistics.gradient.zero_()
+    backbone.statistics.count.fill_(2)
+    backbone.statistics.gradient[:4] = torch.tensor([4.4e-4, 4.4e-4, 4.4e-4, 6.4e-4])
+    return backbone
+
+
+def test_an_event_by_hand() -> None:
+    """What is large on level 0 is above 0.01 x the extent, which is 1: Gaussians 2 and 3."""
+    backbone = due()
+    before = raw_of(backbone)
+    assert before["level"][:4].tolist() == [0, 0, 0, 0]
+    done = backbone.adapt(1600)
+    assert done == {"cloned": 2, "split": 2, "pruned": 0}
+    after, count = raw_of(backbone), len(before["means"])
+    for name, value in before.items():
+        if name != "bias":
+            assert torch.equal(after[name][:count], value), name
+            if name not in ("means", "log_scales", "level"):
+                assert torch.equal(after[name][count:], value[[0, 1, 2, 3]]), name
+    torch.testing.assert_close(after["bias"], torch.tensor([0.01 * (row == 3) for row in range(count + 4)]))
+    assert after["level"][count:].tolist() == [0, 0, 1, 1]
+    assert torch.equal(after["means"][count : count + 2], before["means"][:2])
+    assert len(backbone.statistics.gradient) == count + 4
+    assert not backbone.statistics.gradient.any()
+    for parameter in backbone.table.parameters.values():
+        moment = backbone.table.optimiser.state[parameter]["exp_avg"]
+        assert moment[:count].any()
+        assert not moment[count:].any()
+
+
+@pytest.mark.parametrize(("step", "happens"), [(1500, False), (1600, True), (24900, True), (25000, False)])
+def test_events_come_every_hundred_steps_of_their_window(step: int, happens: bool) -> None:
+    assert bool(due(step=step).adapt(step)) == happens
+
+
+@pytest.mark.parametrize(("gate", "step", "split"), [
+    (False, 1600, 2), (True, 1600, 0), (True, 10000, 0), (True, 10100, 2),
+])  # fmt: skip
+def test_the_gate_keeps_splits_until_all_levels_train(gate: bool, step: int, split: int) -> None:
+    done = due(f"clone_split.level_density.gate={gate}", step=step).adapt(step)
+    assert (done["cloned"], done["split"]) == (2, split)
+
+
+def test_the_cap_is_never_passed() -> None:
+    count = len(small_octree().table)
+    done = due(f"max_primitives={count + 1}").adapt(1600)
+    assert done == {"cloned": 0, "split": 1, "pruned": 0}  # the largest gradient comes first
+
+
+@pytest.mark.parametrize(("step", "pruned"), [(3000, 1), (3100, 3)])
+def test_faint_gaussians_go_at_once_and_huge_ones_after_step_3000(step: int, pruned: int) -> None:
+    backbone = due(step=step)
+    backbone.statistics.gradient.zero_()
+    with torch.no_grad():
+        backbone.table["opacity_logits"][10] = -6.0
+        backbone.table["log_scales"][11:13, 1] = math.log(0.11)
+    assert backbone.adapt(step) == {"cloned": 0, "split": 0, "pruned": pruned}
+
+
+def test_opacities_are_never_reset() -> None:
+    white = small_octree(scene=deep_scene(background=1.0))
+    assert not any(white.reset_due(step) for step in range(1, 40001))
+    assert "opacity_reset" not in white.plan()
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def test_levels_join_as_the_camera_comes_near() -> None:
+    """D = 8, plain distance: round(log2(8 / d)) for each Gaussian, at the end of training."""
+    backbone = small_octree()
+    backbone.begin(40000)
+    for distance in (30.0, 8.0, 4.0, 1.6):
+        camera = seen_from(distance)
+        means, of = backbone.table["means"].detach(), backbone.table["level"].tolist()
+        reach = [math.log2(8 / math.dist(mean, (0.0, -distance, 0.0))) for mean in means.tolist()]
+        wanted = [row for row, level in enumerate(of) if level <= min(2, max(0, round(reach[row])))]
+        splats = backbone.splats(camera)
+        assert torch.equal(splats.means, means[wanted])
+        assert len(splats.scales) == len(splats.colours) == len(splats.log_opacities) == len(wanted)
+
+
+def test_gradients_count_for_the_rows_that_were_drawn() -> None:
+    """From afar level 0 alone is drawn; its rows lie anywhere in the table once levels are mixed."""
+    backbone = small_octree()
+    backbone.table["level"].copy_(torch.arange(len(backbone.table)) % 3)
+    backbone.begin(1)
+    rendering = render(backbone, seen_from(30.0))
+    backbone.observe(rendering, 1)
+    coarse = backbone.table["level"] == 0
+    assert backbone.statistics.count[coarse].sum() > 10
+    assert not backbone.statistics.count[~coarse].any()
+    assert not backbone.statistics.gradient[~coarse].any()
+    grad = backbone.table["means"].grad
+    assert grad is not None
+    assert not grad[~coarse].any()
+    assert grad[coarse].any()
+
+
+def test_fading_levels_are_fainter() -> None:
+    backbone = small_octree("levels.mode=progressive")
+    backbone.begin(40000)
+    camera = seen_from(3.0)
+    shown = backbone.shown(camera)
+    assert shown.rows is not None
+    assert shown.weights is not None
+    assert 0 < float(shown.weights.min()) < 0.9
+    opacities = backbone.splats(camera).log_opacities.detach().exp()
+    torch.testing.assert_close(
+        opacities, shown.weights * backbone.table["opacity_logits"].detach()[shown.rows].sigmoid()
+    )
+
+
+def test_the_volume_of_what_is_drawn_is_held_small() -> None:
+    backbone = small_octree()
+    backbone.begin(40000)
+    splats = backbone.splats(seen_from(30.0))
+    extra = backbone.regulariser()
+    assert extra is not None
+    assert extra.item() == pytest.approx(0.01 * float(splats.scales.detach().prod(1).mean()))
+    extra.backward()
+    grad = backbone.table["log_scales"].grad
+    assert grad is not None
+    assert bool((grad[backbone.table["level"] == 0] > 0).all())
+    assert not grad[backbone.table["level"] > 0].any()
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [(), ("filter=mip",)])
+def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path) -> None:
+    backbone = small_octree(*words)
+    stir(backbone)
+    write_columns(tmp_path / "levels.ply", backbone.file(), backbone.export_notes())
+    data = (tmp_path / "levels.ply").read_bytes()
+    assert len(data) - data.index(b"end_header\n") - len(b"end_header\n") == 248 * len(backbone.table)
+    columns = {name: torch.from_numpy(column) for name, column in read_ply(tmp_path / "levels.ply").items()}
+    assert list(columns)[:6] == ["x", "y", "z", "level", "extra_level", "info"]
+    assert list(columns)[6:9] == ["f_dc_0", "f_dc_1", "f_dc_2"]
+    assert list(columns)[-8:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert torch.equal(columns["level"], backbone.table["level"].float())
+    assert torch.equal(columns["extra_level"], backbone.table["bias"])
+    assert columns["info"].tolist() == [8.0] + [0.0] * (len(backbone.table) - 1)
+    assert "standard_dist 8.0" in backbone.export_notes()[1]
+    scales, log_opacities = backbone.extents(backbone.everything())
+    torch.testing.assert_close(columns["scale_1"].exp(), scales[:, 1].detach())
+    torch.testing.assert_close(columns["opacity"].sigmoid(), log_opacities.detach().exp())
+
+
+@pytest.mark.parametrize("mode", ["round", "progressive"])
+def test_a_view_as_a_standard_file_draws_the_same_picture(mode: str) -> None:
+    backbone = small_octree(f"levels.mode={mode}")
+    stir(backbone)
+    backbone.begin(40000)
+    camera = seen_from(6.0)
+    gaussians = backbone.explicit(camera)
+    assert len(gaussians.means) < len(backbone.table)
+    with torch.no_grad():
+        ours = rasterize(backbone.splats(camera), camera, backbone.raster).image
+        theirs = rasterize(splats_of(gaussians, camera.centre.float()), camera, backbone.raster).image
+    assert float((ours - theirs).abs().max()) < 2e-6
+    assert len(backbone.explicit().means) == len(backbone.table)
+
+
+# -- options and runs --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("words", "complaint"), [
+    (("densification=split",), "choose anchors or clone_split"),
+    (("levels=null",), "take backbone=gs3d for none"),
+    (("clone_split.level_density=null",), "belong together"),
+])  # fmt: skip
+def test_options_are_checked(words: tuple[str, ...], complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        options_of(*words)
+
+
+def test_shared_options_reach_the_second_form() -> None:
+    given = options_of("filter=mip", "max_primitives=77", "levels.count=5", "growth.update_ratio=0.5").clone_split
+    assert (given.filter, given.max_primitives) == ("mip", 77)
+    assert given.levels is not None
+    assert given.level_density is not None
+    assert (given.levels.count, given.level_density.update_ratio) == (5, 0.5)
+
+
+RUN = (
+    *WORDS,
+    "iterations=14",
+    "training.checkpoint_every=50",
+    "backbone.levels.count=3",
+    "backbone.levels.base_layer=4",
+    "backbone.clone_split.density.every=400",
+    "backbone.clone_split.density.gradient=1e-6",
+)
+
+
+def final_tensors(folder: Path) -> dict[str, Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def test_runs_grow_and_resume_bit_for_bit(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "whole", RUN)
+    lines = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs growth"
+    tiny_run(tmp_path / "parts", RUN, stop_after=7)
+    run, settings = open_run(tmp_path / "parts", plugins(), ())
+    execute(run, settings, plugins())
+    whole, parts = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "parts")
+    assert whole.keys() == parts.keys()
+    assert {"columns.level", "columns.bias", "statistics.gradient"} <= whole.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert len(read_ply(tmp_path / "whole" / "point_cloud.ply")["level"]) == len(whole["columns.level"])
