@@ -16,6 +16,7 @@ from gsx.backbones.levels import (
     LevelOptions,
     Levels,
     box_of,
+    checked_end,
     derive,
     distance_range,
     drawn,
@@ -525,3 +526,10 @@ def test_facts_count_primitives_of_every_level():
 def test_options_are_checked(name, value):
     with pytest.raises(ValueError, match=rf"backbone\.levels\.{name} is .*{value}"):
         replace(PUBLISHED, **{name: value})
+
+
+def test_levels_that_would_never_train_are_refused():
+    checked_end(None, 30000)
+    checked_end(replace(PUBLISHED, coarse_until=30000), 30000)
+    with pytest.raises(ValueError, match="coarse_until is 30001, beyond the 30000 steps"):
+        checked_end(replace(PUBLISHED, coarse_until=30001), 30000)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.density import Statistics, Table, append_rows, keep_rows, reset_column
+from gsx.core.density import Statistics, Table, append_rows, keep_rows, reset_column, restored_table, table_tensors
+from gsx.core.errors import CheckpointError
 from gsx.core.rasterizer import ScreenStatistics
 
 SHAPES = {"flat": (), "rows": (3,), "blocks": (2, 2)}
@@ -269,3 +270,11 @@ def test_a_view_without_gradient_still_counts() -> None:
     statistics.add(unused)
     assert statistics.count.tolist() == [0, 1]
     assert statistics.mean_gradient().tolist() == [0.0, 0.0]
+
+
+def test_a_column_the_run_did_not_have_is_named() -> None:
+    table = Table({name: Parameter(value) for name, value in rows_of([1, 2]).items()})
+    saved = table_tensors(table)
+    table.columns["filter"] = torch.zeros(2)
+    with pytest.raises(CheckpointError, match="holds no filter: it was trained with other options"):
+        restored_table(table, saved, torch.device("cpu"))

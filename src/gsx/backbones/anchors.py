@@ -34,6 +34,7 @@ from gsx.backbones.heads import HeadOptions, Heads
 from gsx.backbones.levels import (
     LevelOptions,
     Levels,
+    checked_end,
     derive,
     drawn,
     facts_of,
@@ -141,6 +142,7 @@ class AnchorOptions:
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
+        checked_end(self.levels, self.published_iterations)
         resolved(self.quirks, self.fidelity)
         if self.voxel < 0:
             raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")

@@ -20,7 +20,18 @@ from gsx.backbones.clone_split import (
     stacked,
     starting_points,
 )
-from gsx.backbones.levels import LevelOptions, Levels, derive, drawn, facts_of, note_of, unlocked, warnings_of
+from gsx.backbones.levels import (
+    LevelOptions,
+    Levels,
+    checked_end,
+    derive,
+    drawn,
+    facts_of,
+    note_of,
+    quantile,
+    unlocked,
+    warnings_of,
+)
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
 from gsx.core.backbone import Beginning, Gaussians
@@ -124,6 +135,7 @@ class GS3DOptions:
             raise ValueError("backbone.published_iterations and backbone.max_primitives must be at least 1")
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
+        checked_end(self.levels, self.published_iterations)
         if (self.levels is None) != (self.level_density is None):
             raise ValueError(
                 "backbone.levels and backbone.level_density belong together: give both, or take backbone=gs3d for none"
@@ -152,13 +164,6 @@ def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator)
 def without_normals(columns: dict[str, Tensor]) -> dict[str, Tensor]:
     """The columns of a splat file but nx, ny, nz."""
     return {name: column for name, column in columns.items() if name not in ("nx", "ny", "nz")}
-
-
-def quantile(values: Float[Tensor, "N"], fraction: float) -> Float[Tensor, ""]:
-    """With linear interpolation, of any number of values: torch.quantile refuses more than 2^24 (spec 13, MIP #55)."""
-    place = fraction * (len(values) - 1)
-    ordered = values.sort().values
-    return torch.lerp(ordered[math.floor(place)], ordered[math.ceil(place)], place % 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -85,6 +85,15 @@ class LevelOptions:
             raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
 
 
+def checked_end(options: LevelOptions | None, published: int) -> None:
+    """Refuse a schedule that ends with levels that never took part in training."""
+    if options is not None and options.coarse_until > published:
+        raise ValueError(
+            f"backbone.levels.coarse_until is {options.coarse_until}, beyond the {published} steps of the published "
+            "run (backbone.published_iterations): the finest levels would never train; give a step of that run"
+        )
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Viewpoints:
     """Where the training cameras stand, and how coarsely each samples."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.core.errors import CheckpointError
 from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.shapes import Bool, Float, Int
 
@@ -118,7 +119,18 @@ def table_tensors(table: Table) -> dict[str, Tensor]:
 
 
 def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device) -> Table:
-    """The table that `table_tensors` saw, with the parameters and columns of `like`."""
+    """The table that `table_tensors` saw, with the parameters and columns of `like`.
+
+    Raises:
+        CheckpointError: one of them was not saved: the run had other options.
+    """
+    wanted = [*(f"parameters.{name}" for name in like.parameters), *(f"columns.{name}" for name in like.columns)]
+    missing = [name.partition(".")[2] for name in wanted if name not in tensors]
+    if missing:
+        raise CheckpointError(
+            f"the checkpoint holds no {' and no '.join(missing)}: it was trained with other options of the backbone; "
+            "go on with those, or train anew"
+        )
     table = Table(
         {name: Parameter(tensors[f"parameters.{name}"].to(device)) for name in like.parameters},
         {name: tensors[f"columns.{name}"].to(device) for name in like.columns},
