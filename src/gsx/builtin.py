@@ -5,11 +5,15 @@ from gsx.core.plugins import Registry, hookimpl
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    """Scenes and backbones of gsx itself."""
+    """Scenes, backbones, augmenters and regenerators of gsx itself."""
+    from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
     from gsx.backbones.anchors import NeuralOptions, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
     from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
+    from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
+    from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
     registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions)
@@ -22,3 +26,11 @@ def gsx_register(registry: Registry) -> None:
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)
+    registry.add("augmenter", "upscale", PseudoDetails, PseudoOptions)
+    registry.add("augmenter", "bootstrap", PseudoDetails, PseudoOptions)
+    registry.add("augmenter", "bootstrap_original", PseudoDetails, PseudoOptions)
+    registry.add("regenerator", "lanczos", Resampled, PlainOptions)
+    registry.add("regenerator", "oracle", Oracle, PlainOptions)
+    registry.add("regenerator", "identity", Unchanged, PlainOptions)
+    registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)
+    registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)

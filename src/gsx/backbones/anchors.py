@@ -362,6 +362,10 @@ class Anchors:
         """Names and values of the heads' parameters."""
         return [] if self.heads is None else [(f"heads.{name}", p) for name, p in self.heads.named_parameters()]
 
+    def shared(self) -> Iterable[Tensor]:
+        """The colour network, if there is one."""
+        return () if self.heads is None else self.heads.colour.parameters()
+
     def heal(self) -> int:
         """Remove anchors with a value that is not finite; returns how many."""
         kept = finite_rows(self.table)

@@ -315,6 +315,10 @@ class GS3D:
         """Gradients by parameter name."""
         return ((name, p.grad) for name, p in self.table.parameters.items() if p.grad is not None)
 
+    def shared(self) -> Iterable[Tensor]:
+        """Every Gaussian has a colour of its own."""
+        return ()
+
     def heal(self) -> int:
         """Remove rows with a value that is not finite, with their statistics; returns how many."""
         kept = finite_rows(self.table)

@@ -99,6 +99,10 @@ class Backbone(Protocol):
         """Clear the gradients without moving anything."""
         ...
 
+    def shared(self) -> Iterable[Tensor]:
+        """Parameters of colour that all primitives share (a colour network); pseudo views may leave them alone."""
+        ...
+
     def size(self) -> tuple[int, int]:
         """(primitives, bytes of the parameters needed to render)."""
         ...

@@ -54,6 +54,10 @@ class Settings:
     raster: RasterSettings
     scene: Chosen
     backbone: Chosen
+    augmenters: dict[str, Chosen]
+    """By name, in the order of the command line."""
+    regenerators: dict[str, Chosen]
+    """By role: upscale, restore. Only those that an augmenter asks for are built."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
 
@@ -190,6 +194,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = dict(raw)
+    augmenters, regenerators = (named_nodes(values.pop(kind, None), kind) for kind in ("augmenter", "regenerator"))
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
     return Settings(
@@ -199,18 +204,29 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
         scene=chosen("scene", parts["scene"], plugins),
         backbone=chosen("backbone", parts["backbone"], plugins),
+        augmenters={name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()},
+        regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
         resolved=raw,  # type: ignore[arg-type]
     )
 
 
-def chosen(kind: str, node: Any, plugins: Plugins) -> Chosen:
-    """The component a node names, and its options."""
+def named_nodes(values: Any, kind: str) -> dict[str, Any]:
+    """Nodes below a group that may hold several; none where it is empty, or missing from an older run."""
+    if isinstance(values, dict):
+        return values
+    if values:
+        raise ConfigError(f"{kind} is {values!r}; choose with {kind}=[NAME,...] when training")
+    return {}
+
+
+def chosen(kind: str, node: Any, plugins: Plugins, inner: str = "") -> Chosen:
+    """The component a node names, and its options; `inner` is its key where a group holds several."""
     if not isinstance(node, dict):
         raise ConfigError(
             f"{kind} is {node!r}, which is no group of options: choose one with {kind}=NAME when training"
         )
     component = plugins.registry.find(kind, str(node.get("name", "")))
-    return Chosen(component=component, options=typed(component.options, node, kind))
+    return Chosen(component=component, options=typed(component.options, node, f"{kind}.{inner}" if inner else kind))
 
 
 def typed(schema: type, values: Any, path: str) -> Any:

@@ -130,6 +130,7 @@ class MetricsLog:
             "primitives": run.backbone.size()[0],
             "pairs": step.rendering.pairs,
             "memory_mb": round(peak_memory_mb(run.device), 1),
+            **({"terms": step.terms} if step.terms else {}),
             **step.changes,
         }
         return line | ({"skipped": step.skipped} if step.skipped else {})

@@ -1,5 +1,6 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from gsx.core.backbone import Backbone
 from gsx.core.metrics import psnr
+from gsx.core.pseudo import Augmenter
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.scene import Scene, View
 from gsx.core.shapes import Float
@@ -63,6 +65,7 @@ class Run:
     device: torch.device
     generator: torch.Generator
     sampler: Sampler
+    augmenters: Sequence[Augmenter] = ()
     step: int = 0
     """Steps done."""
     seconds: float = 0.0
@@ -94,6 +97,8 @@ class Step:
     loss: Float[Tensor, ""]
     changes: dict[str, int] = field(default_factory=dict)
     """What density control did."""
+    terms: dict[str, float] = field(default_factory=dict)
+    """Parts of the loss by name, as they enter it, where there is more than the backbone's own."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 

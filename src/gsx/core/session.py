@@ -34,7 +34,9 @@ from gsx.core.orbit import orbit_cameras, write_animation
 from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.progress import MetricsLog, Progress, read_curves
+from gsx.core.pseudo import Augmenter, Setting
 from gsx.core.rasterizer.prepare import decide, warm
+from gsx.core.regenerator import Regenerator
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.scene import Scene, View
@@ -124,7 +126,39 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         device=device,
         generator=generator,
         sampler=Sampler(len(scene.train), generator),
+        augmenters=build_augmenters(settings, scene),
     )
+
+
+def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
+    """The augmenters of a run, in order; they share regenerators by role."""
+    built: dict[str, Regenerator] = {}
+
+    def regenerator(role: str) -> Regenerator:
+        if role not in settings.regenerators:
+            raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
+        if role not in built:
+            chosen = settings.regenerators[role]
+            built[role] = chosen.component.factory(chosen.options)
+        return built[role]
+
+    out = []
+    for name, chosen in settings.augmenters.items():
+        setting = Setting(
+            name=name,
+            scene=scene,
+            iterations=settings.general.iterations,
+            seed=settings.general.seed,
+            regenerator=regenerator,
+        )
+        out.append(chosen.component.factory(chosen.options, setting))
+    return out
+
+
+def plan_of(run: Run) -> dict[str, Any]:
+    """The rescaled schedules of the backbone and of the augmenters."""
+    names = run.config.get("augmenter") or {}
+    return run.backbone.plan() | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}
 
 
 def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
@@ -142,7 +176,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         else platform.processor() or "cpu",
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
-        "plan": run.backbone.plan(),
+        "plan": plan_of(run),
         "scene": {
             "train_views": len(run.scene.train),
             "test_views": len(run.scene.test),
@@ -171,7 +205,7 @@ def announce(run: Run, plugins: Plugins) -> None:
         logger.info("note: %s", note)
     for failure in plugins.failures:
         logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
-    for name, part in run.backbone.plan().items():
+    for name, part in plan_of(run).items():
         logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in part.items()))
     logger.info(
         "seed %s, %d threads, %s; run folder %s", run.config["seed"], torch.get_num_threads(), run.device, run.folder

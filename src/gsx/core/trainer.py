@@ -1,6 +1,7 @@
 """The training loop. Density control, learning rates and the like live in backbones; everything else listens."""
 
 import logging
+import math
 import time
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from gsx.core.losses import photometric
 from gsx.core.plugins import Plugins
+from gsx.core.pseudo import Term, pseudo_loss
 from gsx.core.rasterizer import rasterize
 from gsx.core.run import Run, Step
 from gsx.core.shapes import Float
@@ -50,11 +52,18 @@ def healed(run: Run, step: Step) -> str:
 
 
 def backward(run: Run) -> Step:
-    """Render the next view and send the loss back."""
-    number = run.step + 1
-    view = run.scene.train[run.sampler.next()]
+    """Render the next view, and the pseudo views that go with it, and send the loss back (spec 1.3).
+
+    Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
+    gathered from them is forgotten before anything else adds to it.
+    """
+    number, picked = run.step + 1, run.sampler.next()
+    view = run.scene.train[picked]
     target = view.image().to(run.device)
+    terms = [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
     run.backbone.begin(number)
+    parts = {term.name: add_term(run, term, number) for term in sorted(terms, key=lambda term: term.shared)}
+    own = 1 - sum(term.taken for term in terms)
     splats = run.backbone.splats(view.camera)
     rendering = rasterize(
         splats,
@@ -67,8 +76,33 @@ def backward(run: Run) -> Step:
     extra = run.backbone.regulariser()
     if extra is not None:
         loss = loss + extra
+    loss = loss if own == 1 else own * loss
     loss.backward()
-    return Step(number=number, view=view, target=target, rendering=rendering, loss=loss.detach())
+    named = {"own": float(loss.detach())} | parts if parts else {}
+    whole = loss.detach() + sum(parts.values())
+    return Step(number=number, view=view, target=target, rendering=rendering, loss=whole, terms=named)
+
+
+def add_term(run: Run, term: Term, number: int) -> float:
+    """Send an augmenter's term back; returns its value."""
+    total = 0.0
+    for view, weight in term.parts:
+        rendering = rasterize(
+            run.backbone.splats(view.camera),
+            view.camera,
+            run.raster,
+            background=run.background,
+            absolute_gradient=run.backbone.absolute_gradient,
+        )
+        loss = weight * pseudo_loss(rendering.image, view)
+        loss.backward()
+        total += float(loss.detach())
+        if term.observed and math.isfinite(total):
+            run.backbone.observe(rendering, number)
+    if not term.shared:
+        for parameter in run.backbone.shared():
+            parameter.grad = None
+    return total
 
 
 def background(run: Run) -> Float[Tensor, "3"]:

@@ -1,0 +1,1 @@
+"""Augmenters: what makes pseudo views."""

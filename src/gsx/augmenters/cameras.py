@@ -1,0 +1,98 @@
+"""Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random (spec 1.5)."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.shapes import Float
+
+WINDOWS = ("center", "random", "grid", "error")
+NOISES = ("uniform", "normal")
+KEPT = ("t", "center")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A part of a raster, px."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def grown(self, margin: int, width: int, height: int) -> "Window":
+        """With up to `margin` more on each side, as far as a raster of that size reaches."""
+        left, top = max(0, self.left - margin), max(0, self.top - margin)
+        right, bottom = min(width, self.left + self.width + margin), min(height, self.top + self.height + margin)
+        return Window(left=left, top=top, width=right - left, height=bottom - top)
+
+    def of(self, camera: Camera) -> Camera:
+        """The camera through this window."""
+        return camera.crop(self.left, self.top, self.width, self.height)
+
+    def cut(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        """The part of an image inside the window."""
+        return image[:, self.top : self.top + self.height, self.left : self.left + self.width]
+
+
+def window_size(width: int, height: int, narrow: float, scale: int) -> tuple[int, int]:
+    """(width, height) of the window that is seen `scale` times as finely on `narrow` times the raster, px."""
+    return max(1, round(width * narrow / scale)), max(1, round(height * narrow / scale))
+
+
+def centred_window(width: int, height: int, size: tuple[int, int]) -> Window:
+    """In the middle; half a pixel up and left of it where that is between pixels."""
+    return Window(left=(width - size[0]) // 2, top=(height - size[1]) // 2, width=size[0], height=size[1])
+
+
+def random_window(width: int, height: int, size: tuple[int, int], generator: torch.Generator) -> Window:
+    """Anywhere on the raster, all places alike."""
+    left, top = (int(torch.randint(whole - part + 1, (), generator=generator)) for whole, part in
+                 ((width, size[0]), (height, size[1])))  # fmt: skip
+    return Window(left=left, top=top, width=size[0], height=size[1])
+
+
+def grid_window(width: int, height: int, size: tuple[int, int], turn: int) -> Window:
+    """The `turn`-th of the windows that cover the raster in rows, from the start again after the last."""
+    across, down = -(-width // size[0]), -(-height // size[1])
+    row, column = divmod(turn % (across * down), across)
+    left = round(column * (width - size[0]) / max(1, across - 1))
+    top = round(row * (height - size[1]) / max(1, down - 1))
+    return Window(left=left, top=top, width=size[0], height=size[1])
+
+
+def worst_window(error: Float[Tensor, "H W"], size: tuple[int, int]) -> Window:
+    """Where the mean error is largest."""
+    means = torch.nn.functional.avg_pool2d(error[None, None], (size[1], size[0]), stride=1)[0, 0]
+    top, left = divmod(int(means.argmax()), means.shape[1])
+    return Window(left=left, top=top, width=size[0], height=size[1])
+
+
+def polar(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The rotation nearest to a matrix: U diag(1, 1, det U V^T) V^T of its singular value decomposition."""
+    left, _, right = torch.linalg.svd(matrix)
+    signs = torch.tensor([1.0, 1.0, float(torch.linalg.det(left @ right))], dtype=matrix.dtype)
+    return left @ torch.diag(signs) @ right
+
+
+def noise(shape: tuple[int, ...], kind: str, scale: float, generator: torch.Generator) -> Float[Tensor, "*shape"]:
+    """Independent numbers, uniform in [-scale, scale] or normal with that standard deviation; float64."""
+    if kind == "normal":
+        return scale * torch.randn(shape, generator=generator, dtype=torch.float64)
+    return scale * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)
+
+
+def moved(camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], kept: str = "t") -> Camera:
+    """The camera with noise added to its pose, R' = polar(R + e_R), t' = t + e_t (spec 1.5).
+
+    With `kept` = t the centre swings around the world's origin with the rotation; with center it stays, but for e_t.
+    """
+    turned = polar(camera.rotation.double() + rotation)
+    held = camera.translation.double() if kept == "t" else -turned @ camera.centre.double()
+    return replace(
+        camera,
+        rotation=turned.to(camera.rotation),
+        translation=(held + translation).to(camera.translation),
+    )

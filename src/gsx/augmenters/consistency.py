@@ -1,0 +1,73 @@
+"""Pictures whose box average is a given one, exactly (spec 5.3): the paper's interpolation flexibility, guaranteed."""
+
+import torch
+from torch import Tensor
+
+from gsx.core.images import to_uint8
+from gsx.core.regenerator import box_average
+from gsx.core.shapes import Float, Int, UInt8
+
+ROUNDS = 5
+"""Of projection and clamping; each halves what clamping undid."""
+
+
+def projected(image: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"], factor: int) -> Float[Tensor, "3 H W"]:
+    """The nearest picture with that box average, clamped to [0, 1]: D D^T = I / a^2, so errors are spread evenly."""
+    for _ in range(ROUNDS):
+        missing = low - box_average(image, factor)
+        image = (image + missing.repeat_interleave(factor, 1).repeat_interleave(factor, 2)).clamp(0, 1)
+    return image
+
+
+def exactly_consistent(
+    image: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int
+) -> UInt8[Tensor, "3 H W"]:
+    """8-bit picture near `image` whose box average, rounded to 8 bits, is `low` in every pixel."""
+    near = projected(image.float(), low.float() / 255, factor)
+    return repaired(near, low, factor)
+
+
+def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> UInt8[Tensor, "3 H W"]:
+    """Rounded such that a^2 (low - 1/2) <= sum of each block < a^2 (low + 1/2), at the least cost.
+
+    Values are moved by one level at a time, those first that rounding had moved the other way the most.
+    """
+    values = blocks(to_uint8(near).long(), factor)
+    wanted = blocks(near * 255, factor)
+    area = factor * factor
+    lowest = -(-(2 * low.long() - 1) * area // 2).flatten()
+    highest = ((2 * low.long() + 1) * area - 1).div(2, rounding_mode="floor").flatten()
+    while True:
+        sums = values.sum(1)
+        step = (sums < lowest).long() - (sums > highest).long()
+        if not bool(step.any()):
+            return unblocked(values, low.shape, factor).to(torch.uint8)
+        values = values + moves(values, wanted, step)
+
+
+def moves(values: Int[Tensor, "B a"], wanted: Float[Tensor, "B a"], step: Int[Tensor, "B"]) -> Int[Tensor, "B a"]:
+    """One level more or less in the value of each block for which that costs least, within 0..255."""
+    gain = (wanted - values) * step[:, None]
+    allowed = ((values + step[:, None]) >= 0) & ((values + step[:, None]) <= 255)
+    chosen = torch.where(allowed, gain, -torch.inf).argmax(1)
+    return torch.zeros_like(values).scatter_(1, chosen[:, None], step[:, None])
+
+
+def blocks(image: Tensor, factor: int) -> Tensor:
+    """[3 h w, a^2]: the pixels of each block."""
+    parts = image.unfold(1, factor, factor).unfold(2, factor, factor)
+    return parts.reshape(-1, factor * factor)
+
+
+def unblocked(values: Int[Tensor, "B a"], shape: torch.Size, factor: int) -> Int[Tensor, "3 H W"]:
+    """The image that `blocks` took apart; `shape` is that of the box average."""
+    channels, height, width = shape
+    parts = values.view(channels, height, width, factor, factor).permute(0, 1, 3, 2, 4)
+    return parts.reshape(channels, height * factor, width * factor)
+
+
+def consistent_share(image: UInt8[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> float:
+    """Share of the pixels of `low` that the image's box average gives back in 8 bits, all channels."""
+    sums = blocks(image.long(), factor).sum(1).view(low.shape)
+    back = ((2 * sums + factor * factor) // (2 * factor * factor)).to(torch.uint8)
+    return float((back == low).all(0).float().mean())

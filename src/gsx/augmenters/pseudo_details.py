@@ -1,0 +1,483 @@
+"""Pseudo details from training views: zoomed in and redrawn (upscale), moved aside and redrawn (bootstrap).
+
+Both are one procedure (spec 1.1-1.7): take windows of training cameras, some of them moved at random; zoom in; have a
+regenerator redraw what is cut from the photograph or rendered there; compare with that for a while.
+"""
+
+import hashlib
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.augmenters.cameras import (
+    KEPT,
+    NOISES,
+    WINDOWS,
+    Window,
+    centred_window,
+    grid_window,
+    moved,
+    noise,
+    random_window,
+    window_size,
+    worst_window,
+)
+from gsx.augmenters.consistency import exactly_consistent
+from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
+from gsx.core.camera import Camera
+from gsx.core.errors import InputError, TrainingError
+from gsx.core.evaluate import render_tiled
+from gsx.core.images import to_uint8, write_image
+from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
+from gsx.core.regenerator import Material, Request, colour_matched, complaint
+from gsx.core.run import Run
+from gsx.core.schedule import Schedule
+from gsx.core.shapes import Float
+
+logger = logging.getLogger(__name__)
+
+TILE_PIXELS = 1 << 20
+"""Pictures are rendered in pieces of this many pixels."""
+BATCH = 64
+"""Pictures redrawn between two lines of progress."""
+MOST_DROPPED = 0.5
+"""An event that loses more than this share of its pictures is an error (spec 6.4)."""
+SHOWN = 3
+"""Pictures of an event that are kept to be looked at."""
+ZOOMS = ("intrinsics", "none")
+MODES = ("auto", "hybrid", "direct")
+SOURCES = ("photo", "render")
+REDUCTIONS = ("all", "per_scale")
+FROZEN = ("none", "half", "active")
+SEEDS = ("fixed", "per_view")
+PROJECTIONS = ("none", "exact")
+CHOICES = {
+    "window": WINDOWS,
+    "noise": NOISES,
+    "kept": KEPT,
+    "zoom": ZOOMS,
+    "mode": MODES,
+    "base_source": SOURCES,
+    "reduce": REDUCTIONS,
+    "weight_split": SPLITS,
+    "freeze_shared": FROZEN,
+    "seeds": SEEDS,
+    "project": PROJECTIONS,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PseudoOptions:
+    """Options; values in conf/augmenter, with their sources. Row numbers are those of the specification, 1.10."""
+
+    name: str
+    role: str
+    """Regenerator: upscale or restore."""
+    timing: Timing
+    scales: list[int]
+    """Zoom factors a; [1]: none."""
+    base: bool
+    """Whether the training camera itself is zoomed in."""
+    base_source: str
+    """photo: its window of the photograph is redrawn; render: what the model shows there (row 2)."""
+    variants: int
+    """Cameras moved at random per training camera and scale."""
+    first_cameras: int
+    """Training cameras, in order, that pseudo views are made from; 0: all (row 22)."""
+    narrow: float
+    """Width of the window in training as a fraction of the raster; 1: uncropped."""
+    window: str
+    """center, random, grid (one after the other over the events), or error (where the model is worst)."""
+    zoom: str
+    """intrinsics: the result is seen at a times the focal length; none: rendered at 1/a of the density and compared at
+    the training density, the other reading of the paper (row 3)."""
+    rotation_noise: float
+    translation_noise: float
+    translation_unit: str
+    """world, or extent: of the scene (row 10)."""
+    noise: str
+    """uniform or normal (row 8)."""
+    kept: str
+    """What a turned camera keeps: t, or its center (row 9)."""
+    relative_noise: bool
+    """Turn less where the field of view is small: times min(1, 2 FOV'/FOV) (row 11)."""
+    mode: str
+    """hybrid: the term takes its share of the backbone's loss; direct: it is added; auto: hybrid with shared
+    parameters, such as colour networks, direct without (spec 1.4)."""
+    weights: list[float]
+    """lambda: first and last."""
+    weight_split: str
+    """window: the first weight holds for half of each window; run: for half of the run; linear: in between (row 4)."""
+    direct_weight: float
+    """In direct mode, in place of lambda (row 25)."""
+    gain: float
+    """Of the pseudo loss, before it is weighted (row 29)."""
+    per_pixel: bool
+    """Ours: weigh a pixel of a window like one of a whole picture, so that small windows do not outweigh the photos."""
+    reduce: str
+    """all: mean over all cameras; per_scale: mean over scales of the sum over cameras (row 6)."""
+    densify: bool
+    """Renders of pseudo views count in density control (row 28)."""
+    freeze_shared: str
+    """none; half, active: pseudo views do not move shared parameters, in the first half of a window or all of it
+    (de-MLP, row 26)."""
+    strength: list[float]
+    """How much may change: at the first event and at the last."""
+    prompt: str
+    seeds: str
+    """fixed: `seed` for every picture; per_view: another for each (row 21)."""
+    seed: int
+    samples: int
+    """Results averaged for each picture (row 34)."""
+    context: int
+    """Pixels around the window that the regenerator also sees."""
+    project: str
+    """exact: the nearest picture whose box average is its input, to the last of 8 bits (spec 5.3)."""
+
+    def __post_init__(self) -> None:
+        where = f"augmenter.{self.name}"
+        for key, allowed in CHOICES.items():
+            if getattr(self, key) not in allowed:
+                raise ValueError(f"{where}.{key} is '{getattr(self, key)}'; choose from {', '.join(allowed)}")
+        if self.translation_unit not in ("world", "extent"):
+            raise ValueError(f"{where}.translation_unit is '{self.translation_unit}'; choose world or extent")
+        if not self.scales or min(self.scales) < 1:
+            raise ValueError(f"{where}.scales is {list(self.scales)}; give factors of 1 or more")
+        if not 0 < self.narrow <= 1:
+            raise ValueError(f"{where}.narrow is {self.narrow}; give a fraction above 0, at most 1")
+        for key in ("weights", "strength"):
+            if len(getattr(self, key)) != 2 or not all(0 <= value <= 1 for value in getattr(self, key)):
+                raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
+        if self.variants < 0 or self.first_cameras < 0 or self.samples < 1 or self.context < 0:
+            raise ValueError(f"{where}: variants, first_cameras and context must be at least 0, samples at least 1")
+        if not self.base and self.variants == 0:
+            raise ValueError(f"{where}.base is false and variants is 0: there would be no pseudo view")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sketch:
+    """A pseudo view before its picture is drawn."""
+
+    parent: int
+    scale: int
+    kind: str
+    """base or random."""
+    seen: Camera
+    """What is redrawn, with context around it."""
+    inside: Window
+    """Of `seen`: what is kept."""
+    outer: Window | None
+    """Of the photograph, where `seen` is cut from it; None: it is rendered."""
+    camera: Camera
+    """Of the result."""
+    seed: int
+
+
+class PseudoDetails:
+    """Pseudo views of one kind and their share in the loss."""
+
+    def __init__(self, options: PseudoOptions, setting: Setting) -> None:
+        self.options, self.setting = options, setting
+        schedule = Schedule(
+            iterations=setting.iterations,
+            published_iterations=options.timing.published_iterations,
+            views=len(setting.scene.train),
+        )
+        self.events, self.span = events_of(options.timing, schedule), span_of(options.timing, schedule)
+        self.event = 0
+        self.views: dict[int, list[PseudoView]] = {}
+
+    # -- what the trainer asks -------------------------------------------------------------------------------------
+
+    def plan(self) -> dict[str, Any]:
+        """Events and windows in steps of this run."""
+        return {"events": self.events, "span": self.span}
+
+    def term(self, run: Run, step: int, view: int) -> Term | None:
+        """The pseudo views of the training view picked at this step, with their weights (spec 1.3)."""
+        event = event_at(step, self.events, self.span)
+        if event is None:
+            self.views, self.event = {}, 0
+            return None
+        if event != self.event:
+            self.views, self.event = by_parent(self.of_event(run, event)), event
+        found = self.views.get(view, [])
+        return self.weighted(run, found, progress(step, event, self.events, self.span, self.options.weight_split))
+
+    def weighted(self, run: Run, views: Sequence[PseudoView], place: float) -> Term | None:
+        """The term of these views; None for none."""
+        options = self.options
+        if not views:
+            return None
+        share = stepped(options.weights, place, options.weight_split)
+        direct = options.mode == "direct" or (options.mode == "auto" and not list(run.backbone.shared()))
+        each = options.gain * (options.direct_weight if direct else share)
+        count = len(views) if options.reduce == "all" else len({view.provenance["scale"] for view in views})
+        frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and place < 0.5)
+        whole = run.scene.train[views[0].parent].camera
+        return Term(
+            name=self.setting.name,
+            parts=[(view, each / count * (area_share(view, whole) if options.per_pixel else 1.0)) for view in views],
+            taken=0.0 if direct else share,
+            observed=options.densify,
+            shared=not frozen,
+        )
+
+    # -- events ----------------------------------------------------------------------------------------------------
+
+    def of_event(self, run: Run, event: int) -> list[PseudoView]:
+        """The pseudo views of an event: made now, or as the run made them before it was interrupted.
+
+        Raises:
+            InputError: the run is past the event, and the file of its pseudo views is gone.
+        """
+        path = run.folder / "pseudo" / f"{self.setting.name}.safetensors"
+        if run.step == event:
+            views, facts = self.made(run, event)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_views(path, views, facts)
+            return views
+        try:
+            views, facts = load_views(path)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "
+                f"cannot go on at step {run.step}; restore the file, or train anew"
+            ) from error
+        if facts["event"] != event:
+            raise InputError(
+                f"{path} holds the pseudo views of step {facts['event']}, and the run goes on at step {run.step} with "
+                f"those of step {event}: restore the file, or train anew"
+            )
+        return views
+
+    def made(self, run: Run, event: int) -> tuple[list[PseudoView], dict[str, Any]]:
+        """(pseudo views, facts) of an event, from the model as it is now.
+
+        Raises:
+            TrainingError: more than half of the pictures could not be used.
+        """
+        regenerator = self.setting.regenerator(self.options.role)
+        learnt = regenerator.prepare(self.material(run))
+        sketches = list(self.sketches(run, event))
+        views: list[PseudoView] = []
+        dropped: list[str] = []
+        for first in range(0, len(sketches), BATCH):
+            for view, problem in self.drawn(run, event, sketches[first : first + BATCH]):
+                (views if view else dropped).append(view or problem)  # type: ignore[arg-type]
+            logger.info(
+                "%s at step %d: %d of %d pictures", self.setting.name, event, len(views) + len(dropped), len(sketches)
+            )
+        if dropped:
+            logger.warning("%s: %d pictures dropped, the first because %s", self.setting.name, len(dropped), dropped[0])
+        if len(dropped) > MOST_DROPPED * len(sketches):
+            raise TrainingError(
+                f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
+                f"{dropped[0]}; choose another regenerator/{self.options.role}"
+            )
+        return views, {"event": event, "made": len(views), "dropped": len(dropped), "learnt": learnt}
+
+    def material(self, run: Run) -> Material:
+        """What the regenerator may learn from."""
+        return Material(
+            views=run.scene.train,
+            render=lambda camera: rendered(run, camera),
+            step=run.step,
+            seed=self.setting.seed,
+            device=run.device,
+            folder=run.folder / "regenerators",
+        )
+
+    def sketches(self, run: Run, event: int) -> Iterator[Sketch]:
+        """Cameras of an event, in the order of the training views, base before random."""
+        options, train = self.options, run.scene.train
+        for parent in range(min(options.first_cameras or len(train), len(train))):
+            for scale in options.scales:
+                variants = range(0 if options.base else 1, options.variants + 1)
+                yield from (self.sketch(run, event, parent, scale, variant) for variant in variants)
+
+    def sketch(self, run: Run, event: int, parent: int, scale: int, variant: int) -> Sketch:
+        """One camera; variant 0 is the training camera's own."""
+        options, own = self.options, run.scene.train[parent].camera
+        generator = torch.Generator().manual_seed(
+            number_of(self.setting.seed, self.setting.name, event, parent, scale, variant)
+        )
+        zoom = scale if options.zoom == "intrinsics" else 1
+        size = window_size(own.width, own.height, options.narrow, zoom)
+        pose = own if variant == 0 else self.beside(own, scale, generator)
+        window = self.placed(run, parent, pose, size, event, variant, generator)
+        outer = window.grown(options.context, own.width, own.height)
+        inside = Window(
+            left=window.left - outer.left, top=window.top - outer.top, width=window.width, height=window.height
+        )
+        result = window.of(pose)
+        seen = outer.of(pose)
+        if zoom > 1:
+            result = result.zoom(zoom)
+        elif scale > 1:  # the other reading: fewer pixels are redrawn to as many
+            inside, seen, result = reduced(window, pose, scale)
+        return Sketch(
+            parent=parent,
+            scale=scale,
+            kind="base" if variant == 0 else "random",
+            seen=seen,
+            inside=inside,
+            outer=outer if variant == 0 and options.base_source == "photo" and (zoom > 1 or scale == 1) else None,
+            camera=result,
+            seed=options.seed
+            if options.seeds == "fixed"
+            else number_of(self.setting.seed, "noise", event, parent, scale, variant),
+        )
+
+    def beside(self, camera: Camera, scale: int, generator: torch.Generator) -> Camera:
+        """A camera near a training camera."""
+        options = self.options
+        turn = options.rotation_noise
+        if options.relative_noise:
+            turn *= min(1.0, 2 * options.narrow / scale)
+        unit = self.setting.scene.extent if options.translation_unit == "extent" else 1.0
+        return moved(
+            camera,
+            noise((3, 3), options.noise, turn, generator),
+            noise((3,), options.noise, options.translation_noise * unit, generator),
+            options.kept,
+        )
+
+    def placed(
+        self,
+        run: Run,
+        parent: int,
+        pose: Camera,
+        size: tuple[int, int],
+        event: int,
+        variant: int,
+        generator: torch.Generator,
+    ) -> Window:
+        """Where the window lies on the raster (spec 1.7)."""
+        width, height = pose.size
+        kind = self.options.window
+        if kind == "random" or (kind == "error" and variant > 0):
+            return random_window(width, height, size, generator)
+        if kind == "grid":
+            turn = self.events.index(event) * (self.options.variants + 1) + variant + parent
+            return grid_window(width, height, size, turn)
+        if kind == "error":
+            view = run.scene.train[parent]
+            return worst_window((rendered(run, pose).cpu() - view.image()).abs().mean(0), size)
+        return centred_window(width, height, size)
+
+    def drawn(self, run: Run, event: int, sketches: Sequence[Sketch]) -> list[tuple[PseudoView | None, str]]:
+        """(pseudo view, "") of each sketch, or (None, what is wrong with its picture)."""
+        regenerator = self.setting.regenerator(self.options.role)
+        requests = [self.request(run, event, sketch) for sketch in sketches]
+        results = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
+        out: list[tuple[PseudoView | None, str]] = []
+        for number, (sketch, request) in enumerate(zip(sketches, requests, strict=True)):
+            result = torch.stack([sample[number].detach().cpu().float() for sample in results]).mean(0)
+            if torch.isfinite(result).all() and result.shape[0] == 3:
+                result = colour_matched(request, result)
+            problem = complaint(request, result)
+            view = None if problem else self.view(event, sketch, request, result)
+            if view is not None and sketch.parent < SHOWN:
+                self.show(run.folder / "pseudo", event, sketch, request, view)
+            out.append((view, problem and f"{run.scene.train[sketch.parent].name}: {problem}"))
+        return out
+
+    def request(self, run: Run, event: int, sketch: Sketch) -> Request:
+        """What the regenerator is asked for."""
+        view = run.scene.train[sketch.parent]
+        image = rendered(run, sketch.seen).cpu() if sketch.outer is None else sketch.outer.cut(view.image())
+        return Request(
+            image=image,
+            scale=sketch.scale,
+            camera=sketch.seen,
+            view=view,
+            number=sketch.parent,
+            photo=sketch.outer is not None,
+            seed=sketch.seed,
+            strength=ramp(self.options.strength, event, self.events),
+            prompt=self.options.prompt,
+            step=event,
+        )
+
+    def view(self, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]) -> PseudoView:
+        """The pseudo view of a result: its window, in 8 bits."""
+        a, inside = sketch.scale, sketch.inside
+        target = to_uint8(result.clamp(0, 1))
+        if self.options.project == "exact" and a > 1 and request.photo:
+            target = exactly_consistent(result, to_uint8(request.image), a)
+        window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
+        kept = window.cut(target).contiguous()
+        return PseudoView(
+            camera=sketch.camera,
+            target=kept,
+            parent=sketch.parent,
+            provenance={
+                "event": event,
+                "view": request.view.name,
+                "kind": sketch.kind,
+                "scale": a,
+                "source": "photo" if request.photo else "render",
+                "seed": request.seed,
+                "strength": request.strength,
+                "sha256": hashlib.sha256(kept.numpy().tobytes()).hexdigest(),
+            },
+        )
+
+    def show(self, folder: Path, event: int, sketch: Sketch, request: Request, view: PseudoView) -> None:
+        """Keep a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
+        given = enlarged(sketch.inside.cut(request.image), sketch.scale)
+        result = view.target.float() / 255
+        difference = (0.5 + 4 * (result - given)).clamp(0, 1)
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"{self.setting.name}_{event:07d}_{sketch.parent}_x{sketch.scale}_{sketch.kind}"
+        write_image(folder / f"{name}.png", torch.cat([given, result, difference], 2))
+
+
+def again(request: Request, number: int) -> Request:
+    """The request for its n-th sample."""
+    from dataclasses import replace
+
+    return replace(request, seed=request.seed + number)
+
+
+def reduced(window: Window, pose: Camera, scale: int) -> tuple[Window, Camera, Camera]:
+    """(all of it, camera of 1/scale the density, camera of the result) for a window whose sides are made divisible."""
+    width, height = max(1, window.width // scale), max(1, window.height // scale)
+    whole = Window(left=window.left, top=window.top, width=width * scale, height=height * scale).of(pose)
+    return Window(left=0, top=0, width=width, height=height), whole.resize(width, height), whole
+
+
+def enlarged(image: Float[Tensor, "3 h w"], scale: int) -> Float[Tensor, "3 H W"]:
+    """Every pixel as a block."""
+    return image.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+
+
+def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
+    """Pseudo views by the training view they were made from."""
+    found: dict[int, list[PseudoView]] = {}
+    for view in views:
+        found.setdefault(view.parent, []).append(view)
+    return found
+
+
+def area_share(view: PseudoView, whole: Camera) -> float:
+    """Pixels of a pseudo view per pixel of a training view."""
+    return view.camera.width * view.camera.height / (whole.width * whole.height)
+
+
+def number_of(*parts: object) -> int:
+    """A seed that depends on all parts, the same on every machine."""
+    return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:7], "big")
+
+
+@torch.no_grad()
+def rendered(run: Run, camera: Camera) -> Float[Tensor, "3 h w"]:
+    """The model as it is now."""
+    run.backbone.begin(max(1, run.step))
+    return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, TILE_PIXELS).image

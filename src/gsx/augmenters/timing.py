@@ -1,0 +1,69 @@
+"""When pseudo views are made, how long they count, and how much (spec 1.2)."""
+
+from dataclasses import dataclass
+
+from gsx.core.schedule import Schedule
+
+SPLITS = ("window", "run", "linear")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Events of a published run and the windows after them, in steps of that run."""
+
+    published_iterations: int
+    start: int
+    """Step at whose end pseudo views are first made."""
+    stop: int
+    every: int
+    span: int
+    """Steps after an event in which its pseudo views count."""
+    stop_inclusive: bool
+
+    def __post_init__(self) -> None:
+        if self.published_iterations < 1 or self.every < 1 or self.span < 1:
+            raise ValueError("timing: published_iterations, every and span must be at least 1")
+        if not 0 <= self.start <= self.stop:
+            raise ValueError(f"timing: start is {self.start} and stop {self.stop}; give 0 <= start <= stop")
+        if self.span > self.every:
+            raise ValueError(f"timing: span is {self.span}, longer than every, {self.every}: windows would overlap")
+
+
+def events_of(timing: Timing, schedule: Schedule) -> list[int]:
+    """Steps of this run at whose end pseudo views are made; in very short runs fewer, never two at one step."""
+    last = timing.stop + 1 if timing.stop_inclusive else timing.stop
+    published = range(timing.start, last, timing.every)
+    steps = {max(1, schedule.step(step)) for step in published}
+    return sorted(step for step in steps if step < schedule.iterations)
+
+
+def span_of(timing: Timing, schedule: Schedule) -> int:
+    """Steps of this run for which pseudo views count."""
+    return max(1, schedule.step(timing.span))
+
+
+def event_at(step: int, events: list[int], span: int) -> int | None:
+    """The event whose window a step (1-based) lies in; windows never outlast the next event."""
+    begun = [event for event in events if event < step]
+    return begun[-1] if begun and step <= begun[-1] + span else None
+
+
+def progress(step: int, event: int, events: list[int], span: int, split: str) -> float:
+    """How far along a step is, 0 to 1: in its window, or in the run from the first event to the last window's end."""
+    if split == "run":
+        return (step - events[0] - 1) / max(1, events[-1] + span - events[0] - 1)
+    return (step - event - 1) / max(1, span - 1)
+
+
+def stepped(values: list[float], place: float, split: str) -> float:
+    """A weight that changes half-way (window, run) or is interpolated between the two values (linear)."""
+    first, last = values
+    if split == "linear":
+        return first + (last - first) * place
+    return first if place < 0.5 else last
+
+
+def ramp(values: list[float], event: int, events: list[int]) -> float:
+    """A value that goes linearly from its first at the first event to its last at the last one."""
+    first, last = values
+    return first + (last - first) * (event - events[0]) / max(1, events[-1] - events[0])

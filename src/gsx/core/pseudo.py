@@ -1,0 +1,154 @@
+"""Pseudo details: pictures that nobody took, which training uses as truth for a while (spec 1.1-1.3)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.regenerator import Regenerator
+from gsx.core.scene import Scene
+from gsx.core.shapes import Float, UInt8
+
+if TYPE_CHECKING:
+    from gsx.core.run import Run
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PseudoView:
+    """A camera and the picture it is to show."""
+
+    camera: Camera
+    target: UInt8[Tensor, "3 h w"]
+    parent: int
+    """Number of the training view it was made from."""
+    trust: UInt8[Tensor, "h w"] | None = None
+    """Weight of each pixel in the loss, 255 counts whole; None: all count whole."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Where it comes from: kind, event, regenerator, seed, hash. JSON-serialisable."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Term:
+    """What an augmenter adds to the loss of one step: the sum of weight times mean |render - target|."""
+
+    name: str
+    parts: Sequence[tuple[PseudoView, float]]
+    """Pseudo views with their weights."""
+    taken: float
+    """Share of the backbone's own loss that this term takes the place of; 0: it is added (spec 1.3)."""
+    observed: bool
+    """Whether the renders count in density control (the authors' code does so)."""
+    shared: bool
+    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
+
+
+@runtime_checkable
+class Augmenter(Protocol):
+    """Makes pseudo views from training views, and says when they count."""
+
+    def term(self, run: "Run", step: int, view: int) -> Term | None:
+        """What this step adds for the training view that was picked; None outside the active windows.
+
+        The first call of a window makes its pseudo views, from the model as it is then.
+        """
+        ...
+
+    def plan(self) -> dict[str, Any]:
+        """The rescaled schedule in absolute steps, for the log and the report."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Setting:
+    """What an augmenter is built from."""
+
+    name: str
+    scene: Scene
+    iterations: int
+    seed: int
+    regenerator: Callable[[str], Regenerator]
+    """The regenerator of a role, `upscale` or `restore`."""
+
+
+def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView) -> Float[Tensor, ""]:
+    """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3)."""
+    difference = (image - view.target.to(image.device).float() / 255).abs()
+    if view.trust is not None:
+        difference = difference * (view.trust.to(image.device).float() / 255)
+    return difference.mean()
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
+    """Write pseudo views and `facts` as one safetensors file, whole or not at all."""
+    import json
+
+    from safetensors.torch import save
+
+    from gsx.core.files import replace_file
+
+    tensors: dict[str, Tensor] = {}
+    listed = []
+    for number, view in enumerate(views):
+        tensors[f"{number}.target"] = view.target.contiguous()
+        tensors[f"{number}.rotation"] = view.camera.rotation.contiguous()
+        tensors[f"{number}.translation"] = view.camera.translation.contiguous()
+        if view.trust is not None:
+            tensors[f"{number}.trust"] = view.trust.contiguous()
+        listed.append({"parent": view.parent, "provenance": view.provenance, "camera": intrinsics(view.camera)})
+    text = json.dumps({"facts": facts, "views": listed})
+    replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
+
+
+def intrinsics(camera: Camera) -> dict[str, Any]:
+    """Everything of a camera but its pose, as plain values."""
+    frame = camera.cut_from
+    return {
+        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")},
+        "cut_from": None if frame is None else [frame.left, frame.top, frame.width, frame.height],
+    }
+
+
+def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
+    """(views, facts) as `save_views` wrote them.
+
+    Raises:
+        OSError, ValueError: the file cannot be read.
+    """
+    import json
+
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            content = json.loads(file.metadata()["gsx"])
+            names = set(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names}
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
+    return [view_of(number, entry, tensors) for number, entry in enumerate(content["views"])], content["facts"]
+
+
+def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> PseudoView:
+    """One view of a file."""
+    from gsx.core.camera import Frame
+
+    values = dict(entry["camera"])
+    frame = values.pop("cut_from")
+    corner = None if frame is None else Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])
+    camera = Camera(
+        rotation=tensors[f"{number}.rotation"], translation=tensors[f"{number}.translation"], cut_from=corner, **values
+    )
+    return PseudoView(
+        camera=camera,
+        target=tensors[f"{number}.target"],
+        parent=entry["parent"],
+        trust=tensors.get(f"{number}.trust"),
+        provenance=entry["provenance"],
+    )

@@ -1,0 +1,1 @@
+"""Regenerators: what redraws pictures."""

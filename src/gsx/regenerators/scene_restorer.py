@@ -1,0 +1,201 @@
+"""A restorer learnt from this run: what photographs have that renders of the same views lack (spec 5.2).
+
+Two networks learn from half of the training views each. A picture made beside a training view is restored by the one
+that has not seen that view, so that neither can answer from memory.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, max_pool2d, pad
+
+from gsx.core.errors import InputError
+from gsx.core.files import replace_file
+from gsx.core.regenerator import Material, Request
+from gsx.core.shapes import Float
+from gsx.regenerators.scene_sr import begin, read_network
+
+logger = logging.getLogger(__name__)
+
+FOLDS = 2
+LARGEST_CHANGE = 32 / 255
+"""Of a display value."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestorerOptions:
+    """Options; values in conf/regenerator/restore/scene_restorer.yaml."""
+
+    name: str
+    channels: int
+    steps: int
+    batch: int
+    crop: int
+    """Edge of a training crop, px."""
+    rate: float
+    strongest: float
+    """Strength at which the whole restoration is applied; half of it at half of this."""
+
+    def __post_init__(self) -> None:
+        if min(self.channels, self.steps, self.batch) < 1 or self.crop < 16:
+            raise ValueError("regenerator.restore: channels, steps, batch must be at least 1, crop at least 16")
+        if not (self.rate > 0 and self.strongest > 0):
+            raise ValueError("regenerator.restore: rate and strongest must be above 0")
+
+
+class Residual(nn.Module):
+    """A network of three scales whose output is added to its input; it begins by changing nothing."""
+
+    def __init__(self, channels: int, generator: torch.Generator) -> None:
+        super().__init__()
+        c = channels
+        self.down = nn.ModuleList([block(3, c), block(c, 2 * c), block(2 * c, 4 * c)])
+        self.up = nn.ModuleList([block(6 * c, 2 * c), block(3 * c, c)])
+        self.last = nn.Conv2d(c, 3, 3, padding=1)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                begin(layer, generator)
+        nn.init.zeros_(self.last.weight)
+
+    def forward(self, image: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B 3 h w"]:
+        """The change of each value, at most LARGEST_CHANGE."""
+        height, width = image.shape[2:]
+        padded = pad(image - 0.5, (0, -width % 4, 0, -height % 4), mode="replicate")
+        fine = self.down[0](padded)
+        middle = self.down[1](max_pool2d(fine, 2))
+        coarse = self.down[2](max_pool2d(middle, 2))
+        middle = self.up[0](torch.cat([interpolate(coarse, scale_factor=2), middle], 1))
+        fine = self.up[1](torch.cat([interpolate(middle, scale_factor=2), fine], 1))
+        return LARGEST_CHANGE * torch.tanh(self.last(fine)[:, :, :height, :width])
+
+
+def block(inputs: int, outputs: int) -> nn.Sequential:
+    """Two convolutions."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, padding=1), nn.SiLU(), nn.Conv2d(outputs, outputs, 3, padding=1), nn.SiLU()
+    )
+
+
+class SceneRestorer:
+    """Learns at the first event of a run; later events go on from there."""
+
+    def __init__(self, options: RestorerOptions) -> None:
+        self.options = options
+        self.networks: list[Residual] = []
+        self.useful = [False] * FOLDS
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        """Train each network on renders of half of the views, and measure it on the other half.
+
+        A network that brings renders of views it has not seen no closer to their photographs is not used.
+        """
+        if len(material.views) < 2 * FOLDS:
+            raise InputError(
+                f"regenerator scene_restorer needs at least {2 * FOLDS} training views, there are "
+                f"{len(material.views)}: choose regenerator/restore=identity"
+            )
+        if not self.networks:
+            self.networks = [
+                Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
+                for fold in range(FOLDS)
+            ]
+            self.recall(material)
+        pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
+        figures: dict[str, float] = {}
+        for fold, network in enumerate(self.networks):
+            own = [pair for number, pair in enumerate(pairs) if number % FOLDS == fold]
+            others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
+            learn(network, own, self.options, material.seed * 1_000_003 + material.step * FOLDS + fold)
+            before, after = mean_error(None, others), mean_error(network, others)
+            self.useful[fold] = after < before
+            figures |= {f"error_before_{fold}": before, f"error_after_{fold}": after}
+        if not any(self.useful):
+            logger.warning("scene_restorer brings unseen views no closer to their photographs: it changes nothing")
+        self.keep(material)
+        return figures
+
+    @torch.no_grad()
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 h w"]]:
+        """Each picture by the network that has not seen its view, as strongly as asked."""
+        return [self.restored(request) for request in requests]
+
+    def restored(self, request: Request) -> Float[Tensor, "3 h w"]:
+        """One picture."""
+        if request.scale != 1:
+            raise InputError(
+                f"regenerator scene_restorer cannot enlarge x{request.scale}: choose another regenerator/upscale"
+            )
+        fold = (request.number + 1) % FOLDS
+        if not self.useful[fold]:
+            return request.image
+        network = self.networks[fold]
+        image = request.image.to(next(network.parameters()).device)
+        share = min(1.0, request.strength / self.options.strongest)
+        return (image + share * network(image[None])[0]).clamp(0, 1)
+
+    def keep(self, material: Material) -> None:
+        """Write the networks into the run's folder."""
+        from safetensors.torch import save
+
+        material.folder.mkdir(parents=True, exist_ok=True)
+        for fold, network in enumerate(self.networks):
+            tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
+            replace_file(material.folder / f"scene_restorer_{fold}.safetensors", save(tensors))
+
+    def recall(self, material: Material) -> None:
+        """Take the networks that the run had learnt before it was interrupted."""
+        for fold, network in enumerate(self.networks):
+            path = material.folder / f"scene_restorer_{fold}.safetensors"
+            if path.is_file() and (found := read_network(path)) is not None:
+                network.load_state_dict(found)
+
+
+Pair = tuple[Tensor, Tensor]
+"""(render, photograph), [3, H, W] each."""
+
+
+def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, seed: int) -> None:
+    """Adam on crops, L1 and a tenth of the L1 of differences of neighbours."""
+    generator = torch.Generator().manual_seed(seed)
+    device = next(network.parameters()).device
+    optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
+    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
+    for _ in range(options.steps):
+        render, photo = (part.to(device) for part in batch(pairs, options, generator))
+        out = render + network(render)
+        loss = (out - photo).abs().mean() + 0.1 * sum(
+            (out.diff(dim=axis) - photo.diff(dim=axis)).abs().mean() for axis in (2, 3)
+        )
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        decay.step()
+
+
+def batch(pairs: Sequence[Pair], options: RestorerOptions, generator: torch.Generator) -> Pair:
+    """Crops at the same places of renders and photographs, mirrored at random."""
+    edge = min(options.crop, *(min(photo.shape[1:]) for _, photo in pairs))
+    renders, photos = [], []
+    for _ in range(options.batch):
+        render, photo = pairs[int(torch.randint(len(pairs), (), generator=generator))]
+        top, left = (int(torch.randint(whole - edge + 1, (), generator=generator)) for whole in photo.shape[1:])
+        flips = [2] if bool(torch.randint(2, (), generator=generator)) else []
+        renders.append(render[:, top : top + edge, left : left + edge].flip(flips))
+        photos.append(photo[:, top : top + edge, left : left + edge].flip(flips))
+    return torch.stack(renders), torch.stack(photos)
+
+
+@torch.no_grad()
+def mean_error(network: Residual | None, pairs: Sequence[Pair]) -> float:
+    """Mean squared error against the photographs, of renders as they are (None) or restored."""
+    total = 0.0
+    for render, photo in pairs:
+        out = render
+        if network is not None:
+            image = render.to(next(network.parameters()).device)
+            out = (image + network(image[None])[0]).clamp(0, 1).cpu()
+        total += float((out - photo).square().mean())
+    return total / len(pairs)

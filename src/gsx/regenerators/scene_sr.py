@@ -1,0 +1,223 @@
+"""Super-resolution learnt from the scene's own photographs (spec 5.3; the idea: ZSSR, Shocher et al. 2018).
+
+Photographs reduced by two, and themselves, are pairs of input and truth; textures that recur at several distances are
+what it learns. Every picture it gives back reduces to its input (`augmenters.consistency`), x4 and x8 by recursion.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, interpolate
+
+from gsx.core.cache import cache_folder, content_key
+from gsx.core.errors import InputError
+from gsx.core.files import replace_file
+from gsx.core.regenerator import Material, Request, box_average
+from gsx.core.shapes import Float
+
+logger = logging.getLogger(__name__)
+
+STEP = 2
+"""Factor of one application."""
+ROUNDS = 5
+"""Of back-projection."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSROptions:
+    """Options; values in conf/regenerator/upscale/scene_sr.yaml."""
+
+    name: str
+    channels: int
+    layers: int
+    steps: int
+    batch: int
+    crop: int
+    """Edge of a training crop at the low resolution, px."""
+    rate: float
+    noise: float
+    """Standard deviation of noise added to inputs, in 8-bit levels: renders are not photographs."""
+    seconds: float
+    """Training ends after this time; 0: never. A run cut short by it cannot be repeated bit for bit."""
+
+    def __post_init__(self) -> None:
+        if min(self.channels, self.layers, self.steps, self.batch) < 1 or self.crop < 8:
+            raise ValueError("regenerator.upscale: channels, layers, steps, batch must be at least 1, crop at least 8")
+        if not self.rate > 0 or self.seconds < 0 or self.noise < 0:
+            raise ValueError("regenerator.upscale: rate must be above 0, seconds and noise at least 0")
+
+
+class Enlarger(nn.Module):
+    """Bicubic enlargement and what convolutions on the low resolution add to it."""
+
+    def __init__(self, channels: int, layers: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(3, channels, 3, padding=1)
+        self.middle = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in range(layers))
+        self.last = nn.Conv2d(channels, 3 * STEP * STEP, 3, padding=1)
+        for layer in (self.first, *self.middle):
+            begin(layer, generator)
+        nn.init.zeros_(self.last.weight)  # training starts from the plain enlargement
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+
+    def forward(self, image: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B 3 H W"]:
+        """Twice as wide and high."""
+        features = torch.relu(self.first(image - 0.5))
+        for layer in self.middle:
+            features = features + torch.relu(layer(features))
+        detail = nn.functional.pixel_shuffle(self.last(features), STEP)
+        return interpolate(image, scale_factor=STEP, mode="bicubic", align_corners=False) + detail
+
+
+def begin(layer: nn.Module, generator: torch.Generator) -> None:
+    """Initial weights from the generator (He et al. 2015)."""
+    assert isinstance(layer, nn.Conv2d)
+    assert layer.bias is not None
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+    nn.init.zeros_(layer.bias)
+
+
+class SceneSR:
+    """Learns once per scene, before its first pictures."""
+
+    def __init__(self, options: SceneSROptions) -> None:
+        self.options = options
+        self.network: Enlarger | None = None
+        self.figures: dict[str, float] = {}
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        """Train, or take what an earlier run of the same scene and options has learnt."""
+        if self.network is not None:
+            return {}
+        photos = [view.image() for view in material.views]
+        self.network = Enlarger(
+            self.options.channels, self.options.layers, torch.Generator().manual_seed(material.seed)
+        ).to(material.device)
+        path = kept_at(self.options, photos, material.seed)
+        if path.is_file() and (found := read_network(path)) is not None:
+            self.network.load_state_dict(found)
+            return {"learnt_before": 1.0}
+        begun = time.perf_counter()
+        loss, whole = train(self.network, photos, self.options, material.seed)
+        self.figures = {"seconds": time.perf_counter() - begun, "loss": loss}
+        logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), self.figures["seconds"])
+        if whole:
+            write_network(path, self.network)
+        return self.figures
+
+    @torch.no_grad()
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
+        """Each picture, `scale` times as large, by doubling.
+
+        Raises:
+            InputError: a scale is no power of two.
+        """
+        assert self.network is not None
+        return [enlarged(self.network, request) for request in requests]
+
+
+def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
+    """One picture, doubled until it is large enough."""
+    doublings = round(math.log2(request.scale)) if request.scale > 0 else 0
+    if 2**doublings != request.scale:
+        raise InputError(f"regenerator scene_sr enlarges x2, x4, x8, not x{request.scale}: change augmenter scales")
+    image = request.image.to(next(network.parameters()).device)
+    for _ in range(doublings):
+        image = back_projected(network(image[None])[0], image)
+    return image
+
+
+def back_projected(large: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
+    """The nearest picture whose box average is `low`, in [0, 1]."""
+    for _ in range(ROUNDS):
+        missing = low - box_average(large, STEP)
+        large = (large + missing.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2)).clamp(0, 1)
+    return large
+
+
+# -- learning ----------------------------------------------------------------------------------------------------------
+
+
+def train(
+    network: Enlarger, photos: Sequence[Float[Tensor, "3 H W"]], options: SceneSROptions, seed: int
+) -> tuple[float, bool]:
+    """(mean loss of the last tenth, whether all steps were taken)."""
+    generator = torch.Generator().manual_seed(seed)
+    device = next(network.parameters()).device
+    optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
+    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
+    losses: list[float] = []
+    begun = time.perf_counter()
+    for _ in range(options.steps):
+        if options.seconds and time.perf_counter() - begun > options.seconds:
+            logger.warning(
+                "scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps
+            )
+            break
+        truth = torch.stack([crop(photos, options.crop, generator) for _ in range(options.batch)]).to(device)
+        low = avg_pool2d(truth, STEP)
+        noise = torch.randn(low.shape, generator=generator).to(device) * options.noise / 255
+        out = network(low + noise)
+        loss = (out - truth).abs().mean() + (avg_pool2d(out, STEP) - low).abs().mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        decay.step()
+        losses.append(float(loss.detach()))
+    tail = losses[-max(1, len(losses) // 10) :]
+    return sum(tail) / max(1, len(tail)), len(losses) == options.steps
+
+
+def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.Generator) -> Float[Tensor, "3 h w"]:
+    """A part of a photograph, turned and mirrored at random; twice `edge` wide, or as much as there is."""
+    photo = photos[int(torch.randint(len(photos), (), generator=generator))]
+    size = STEP * min(edge, *(min(p.shape[1:]) // STEP for p in photos))
+    top, left = (int(torch.randint(whole - size + 1, (), generator=generator)) for whole in photo.shape[1:])
+    part = photo[:, top : top + size, left : left + size]
+    turns = int(torch.randint(8, (), generator=generator))
+    part = part.rot90(turns % 4, (1, 2))
+    return part.flip(2) if turns >= 4 else part
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def kept_at(options: SceneSROptions, photos: Sequence[Tensor], seed: int) -> Path:
+    """Where what is learnt from these photographs, with these options and seed, is kept."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for photo in photos:
+        digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
+    key = content_key(asdict(options), digest.hexdigest(), seed, torch.__version__, torch.get_num_threads())
+    return cache_folder("scene_sr", key) / "network.safetensors"
+
+
+def write_network(path: Path, network: nn.Module) -> None:
+    """Keep a network; a cache that cannot be written is no error."""
+    from safetensors.torch import save
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, save({name: value.contiguous() for name, value in network.state_dict().items()}))
+    except OSError as error:
+        logger.warning("%s cannot be written (%s): the next run learns again", path, error.strerror)
+
+
+def read_network(path: Path) -> dict[str, Any] | None:
+    """A network as `write_network` left it; None if the file is damaged."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        return load(path.read_bytes())
+    except (OSError, SafetensorError) as error:
+        logger.warning("%s cannot be read (%s): it is learnt again", path, error)
+        return None
