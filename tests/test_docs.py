@@ -13,7 +13,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def test_every_hook_is_documented_with_its_arguments() -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text()
+    text = (ROOT / "docs" / "writing-plugins.md").read_text()
     for name, hook in inspect.getmembers(Hooks, inspect.isfunction):
         arguments = ", ".join(list(inspect.signature(hook).parameters)[1:])
         assert f"`{name}({arguments})`" in text, name

@@ -29,15 +29,17 @@ from gsx.augmenters.cameras import (
 )
 from gsx.augmenters.consistency import exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
+from gsx.augmenters.trust import agreeing, in_bytes, sampled_better
 from gsx.core.camera import Camera
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.evaluate import render_tiled
 from gsx.core.images import to_uint8, write_image
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
+from gsx.core.pseudo_pictures import picture_name
 from gsx.core.regenerator import Material, Request, colour_matched, complaint
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
-from gsx.core.shapes import Float
+from gsx.core.shapes import Float, UInt8
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +58,7 @@ REDUCTIONS = ("all", "per_scale")
 FROZEN = ("none", "half", "active")
 SEEDS = ("fixed", "per_view")
 PROJECTIONS = ("none", "exact")
+WEIGHT_MAPS = ("none", "splatsure")
 CHOICES = {
     "window": WINDOWS,
     "noise": NOISES,
@@ -68,6 +71,7 @@ CHOICES = {
     "freeze_shared": FROZEN,
     "seeds": SEEDS,
     "project": PROJECTIONS,
+    "weight_map": WEIGHT_MAPS,
 }
 
 
@@ -138,6 +142,15 @@ class PseudoOptions:
     """Pixels around the window that the regenerator also sees."""
     project: str
     """exact: the nearest picture whose box average is its input, to the last of 8 bits (spec 5.3)."""
+    weight_map: str
+    """none, or splatsure: only pixels count whose surface no photograph shows as finely (spec 6.1)."""
+    gate: float
+    """Pixels do not count whose block's average is further than this from the known photograph, in 8-bit levels; 0:
+    all count."""
+    coarse_weight: float
+    """Of the mean difference between the reduced render and the known photograph, beside that of the pixels."""
+    progressive: bool
+    """The scales one after the other over the events, instead of all at once."""
 
     def __post_init__(self) -> None:
         where = f"augmenter.{self.name}"
@@ -155,6 +168,8 @@ class PseudoOptions:
                 raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
         if self.variants < 0 or self.first_cameras < 0 or self.samples < 1 or self.context < 0:
             raise ValueError(f"{where}: variants, first_cameras and context must be at least 0, samples at least 1")
+        if self.gate < 0 or self.coarse_weight < 0:
+            raise ValueError(f"{where}: gate and coarse_weight must be at least 0")
         if not self.base and self.variants == 0:
             raise ValueError(f"{where}.base is false and variants is 0: there would be no pseudo view")
 
@@ -193,6 +208,10 @@ class PseudoDetails:
         self.views: dict[int, list[PseudoView]] = {}
 
     # -- what the trainer asks -------------------------------------------------------------------------------------
+
+    def begins(self) -> int:
+        """The first event."""
+        return self.events[0] if self.events else self.setting.iterations
 
     def plan(self) -> dict[str, Any]:
         """Events and windows in steps of this run."""
@@ -280,7 +299,13 @@ class PseudoDetails:
                 f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
                 f"{dropped[0]}; choose another regenerator/{self.options.role}"
             )
-        return views, {"event": event, "made": len(views), "dropped": len(dropped), "learnt": learnt}
+        facts = {"event": event, "made": len(views), "dropped": len(dropped), "learnt": learnt}
+        trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
+        if trusted:
+            masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
+            facts["masked"] = masked
+            logger.info("%s: %.1f%% of the pixels do not count", self.setting.name, 100 * masked)
+        return views, facts
 
     def material(self, run: Run) -> Material:
         """What the regenerator may learn from."""
@@ -297,9 +322,16 @@ class PseudoDetails:
         """Cameras of an event, in the order of the training views, base before random."""
         options, train = self.options, run.scene.train
         for parent in range(min(options.first_cameras or len(train), len(train))):
-            for scale in options.scales:
+            for scale in self.scales_of(event):
                 variants = range(0 if options.base else 1, options.variants + 1)
                 yield from (self.sketch(run, event, parent, scale, variant) for variant in variants)
+
+    def scales_of(self, event: int) -> list[int]:
+        """All of them, or the one whose turn it is."""
+        scales = list(self.options.scales)
+        if not self.options.progressive:
+            return scales
+        return [scales[self.events.index(event) * len(scales) // len(self.events)]]
 
     def sketch(self, run: Run, event: int, parent: int, scale: int, variant: int) -> Sketch:
         """One camera; variant 0 is the training camera's own."""
@@ -382,9 +414,9 @@ class PseudoDetails:
             if torch.isfinite(result).all() and result.shape[0] == 3:
                 result = colour_matched(request, result)
             problem = complaint(request, result)
-            view = None if problem else self.view(event, sketch, request, result)
+            view = None if problem else self.view(run, event, sketch, request, result)
             if view is not None and sketch.parent < SHOWN:
-                self.show(run.folder / "pseudo", event, sketch, request, view)
+                self.show(run.folder / "pseudo", sketch, request, view)
             out.append((view, problem and f"{run.scene.train[sketch.parent].name}: {problem}"))
         return out
 
@@ -405,7 +437,9 @@ class PseudoDetails:
             step=event,
         )
 
-    def view(self, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]) -> PseudoView:
+    def view(
+        self, run: Run, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]
+    ) -> PseudoView:
         """The pseudo view of a result: its window, in 8 bits."""
         a, inside = sketch.scale, sketch.inside
         target = to_uint8(result.clamp(0, 1))
@@ -413,10 +447,14 @@ class PseudoDetails:
             target = exactly_consistent(result, to_uint8(request.image), a)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
+        known = request.photo and a > 1 and self.options.coarse_weight > 0
         return PseudoView(
             camera=sketch.camera,
             target=kept,
             parent=sketch.parent,
+            trust=self.trust(run, sketch, request, window.cut(target.float() / 255)),
+            coarse=to_uint8(inside.cut(request.image)).contiguous() if known else None,
+            coarse_weight=self.options.coarse_weight if known else 0.0,
             provenance={
                 "event": event,
                 "view": request.view.name,
@@ -429,14 +467,28 @@ class PseudoDetails:
             },
         )
 
-    def show(self, folder: Path, event: int, sketch: Sketch, request: Request, view: PseudoView) -> None:
+    def trust(
+        self, run: Run, sketch: Sketch, request: Request, result: Float[Tensor, "3 h w"]
+    ) -> UInt8[Tensor, "h w"] | None:
+        """How much each pixel counts; None where all count whole."""
+        options, trust = self.options, torch.ones(result.shape[1:])
+        if options.weight_map == "splatsure":
+            run.backbone.begin(max(1, run.step))
+            with torch.no_grad():
+                splats = run.backbone.splats(sketch.camera)
+            photographs = [view.camera for view in run.scene.train]
+            trust = trust * sampled_better(splats, sketch.camera, photographs, run.raster).cpu()
+        if options.gate > 0 and request.photo and sketch.scale > 1:
+            trust = trust * agreeing(result, sketch.inside.cut(request.image), sketch.scale, options.gate)
+        return None if bool((trust == 1).all()) else in_bytes(trust)
+
+    def show(self, folder: Path, sketch: Sketch, request: Request, view: PseudoView) -> None:
         """Keep a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
         given = enlarged(sketch.inside.cut(request.image), sketch.scale)
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
-        name = f"{self.setting.name}_{event:07d}_{sketch.parent}_x{sketch.scale}_{sketch.kind}"
-        write_image(folder / f"{name}.png", torch.cat([given, result, difference], 2))
+        write_image(folder / picture_name(self.setting.name, view), torch.cat([given, result, difference], 2))
 
 
 def again(request: Request, number: int) -> Request:

@@ -24,10 +24,19 @@ GENERATOR = "run.generator"
 
 def save(run: Run) -> Path:
     """Write the checkpoint of the current step and drop all but the newest `training.checkpoints_kept`."""
-    from safetensors.torch import save as to_bytes
-
     folder = run.folder / "checkpoints"
     folder.mkdir(parents=True, exist_ok=True)
+    path = write(run, folder)
+    for old in sidecars(folder)[: -run.training.checkpoints_kept]:
+        old.unlink()
+        old.with_suffix(".safetensors").unlink(missing_ok=True)
+    return path
+
+
+def write(run: Run, folder: Path) -> Path:
+    """Write a checkpoint of the current step into a folder."""
+    from safetensors.torch import save as to_bytes
+
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in run.backbone.tensors().items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
@@ -42,9 +51,6 @@ def save(run: Run) -> Path:
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     write_json(path.with_suffix(".json"), sidecar)
-    for old in sidecars(folder)[: -run.training.checkpoints_kept]:
-        old.unlink()
-        old.with_suffix(".safetensors").unlink(missing_ok=True)
     return path
 
 

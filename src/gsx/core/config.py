@@ -34,6 +34,12 @@ class GeneralOptions:
     device: str
     output: str
     folder: str
+    init: str = "scratch"
+    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`core.trunk`)."""
+
+    def __post_init__(self) -> None:
+        if self.init not in ("scratch", "trunk"):
+            raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
 
 
 @dataclass(frozen=True, kw_only=True)

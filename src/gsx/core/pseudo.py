@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
-from gsx.core.regenerator import Regenerator
+from gsx.core.regenerator import Regenerator, box_average
 from gsx.core.scene import Scene
 from gsx.core.shapes import Float, UInt8
 
@@ -27,6 +27,10 @@ class PseudoView:
     """Number of the training view it was made from."""
     trust: UInt8[Tensor, "h w"] | None = None
     """Weight of each pixel in the loss, 255 counts whole; None: all count whole."""
+    coarse: UInt8[Tensor, "3 l m"] | None = None
+    """What is known of it at a lower resolution: its box average over whole blocks."""
+    coarse_weight: float = 0.0
+    """Of the mean difference at that resolution, beside that of the pixels."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where it comes from: kind, event, regenerator, seed, hash. JSON-serialisable."""
 
@@ -57,6 +61,10 @@ class Augmenter(Protocol):
         """
         ...
 
+    def begins(self) -> int:
+        """Steps that a run has in common with one without this augmenter."""
+        ...
+
     def plan(self) -> dict[str, Any]:
         """The rescaled schedule in absolute steps, for the log and the report."""
         ...
@@ -75,11 +83,16 @@ class Setting:
 
 
 def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView) -> Float[Tensor, ""]:
-    """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3)."""
+    """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3); that at a lower resolution
+    beside it where that is known (SRGS, spec 6.1)."""
     difference = (image - view.target.to(image.device).float() / 255).abs()
     if view.trust is not None:
         difference = difference * (view.trust.to(image.device).float() / 255)
-    return difference.mean()
+    if view.coarse is None:
+        return difference.mean()
+    reduced = box_average(image, view.camera.width // view.coarse.shape[2])
+    known = view.coarse.to(image.device).float() / 255
+    return difference.mean() + view.coarse_weight * (reduced - known).abs().mean()
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -99,9 +112,10 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
         tensors[f"{number}.target"] = view.target.contiguous()
         tensors[f"{number}.rotation"] = view.camera.rotation.contiguous()
         tensors[f"{number}.translation"] = view.camera.translation.contiguous()
-        if view.trust is not None:
-            tensors[f"{number}.trust"] = view.trust.contiguous()
-        listed.append({"parent": view.parent, "provenance": view.provenance, "camera": intrinsics(view.camera)})
+        optional = {"trust": view.trust, "coarse": view.coarse}
+        tensors |= {f"{number}.{name}": value.contiguous() for name, value in optional.items() if value is not None}
+        entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
+        listed.append(entry | {"camera": intrinsics(view.camera)})
     text = json.dumps({"facts": facts, "views": listed})
     replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
 
@@ -150,5 +164,7 @@ def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> P
         target=tensors[f"{number}.target"],
         parent=entry["parent"],
         trust=tensors.get(f"{number}.trust"),
+        coarse=tensors.get(f"{number}.coarse"),
+        coarse_weight=entry["coarse_weight"],
         provenance=entry["provenance"],
     )

@@ -68,6 +68,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "views": [with_images(run, entry) for entry in drawn],
         "anchors": {str(entry.get("name")): f"view-{number}" for number, entry in enumerate(drawn, 1)},
         "crops": crops_by_factor(run),
+        "pseudo": [with_pseudo_images(run, entry) for entry in run.pseudo.get("views", [])],
         "error_full": run.pictures.get("error_full"),
         "ramp": ", ".join(f"rgb{colour} {place:.0%}" for place, colour in ERROR_COLOURS),
         "bars": bars(evaluation.get("views", [])),
@@ -280,6 +281,12 @@ def with_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:
     """An entry of renders/index.json with its pictures embedded; None for files that are gone."""
     images = {kind: embedded(run.folder / "renders" / Path(file).name) for kind, file in part(entry, "files").items()}
     return entry | {"images": images}
+
+
+def with_pseudo_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry of pseudo/index.json with its pictures embedded; None for files that are gone."""
+    files = {kind: Path(str(entry.get(kind, ""))).name for kind in ("made", "after")}
+    return entry | {"images": {kind: embedded(run.folder / "pseudo" / file) for kind, file in files.items()}}
 
 
 def embedded(path: Path) -> str | None:

@@ -22,6 +22,8 @@ class RunFiles:
     """Intact lines of metrics.jsonl."""
     evaluation: dict[str, Any]
     pictures: dict[str, Any]
+    pseudo: dict[str, Any]
+    """Content of pseudo/index.json."""
     status: dict[str, Any]
     problems: dict[str, str]
     """What is wrong, by file."""
@@ -89,6 +91,7 @@ def read_run(folder: Path) -> RunFiles:
         lines=read_lines(folder / "metrics.jsonl", problems),
         evaluation=evaluation,
         pictures=read_mapping(folder, "renders/index.json", problems),
+        pseudo=read_mapping(folder, "pseudo/index.json", problems),
         status=read_mapping(folder, "status.json", problems),
         problems=problems,
     )

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx import __version__
-from gsx.core import checkpoint
+from gsx.core import checkpoint, trunk
 from gsx.core.backbone import Beginning
 from gsx.core.cache import cache_root
 from gsx.core.camera import Camera
@@ -35,6 +35,7 @@ from gsx.core.pictures import file_names, write_pictures
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.progress import MetricsLog, Progress, read_curves
 from gsx.core.pseudo import Augmenter, Setting
+from gsx.core.pseudo_pictures import write_pseudo_pictures
 from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.regenerator import Regenerator
 from gsx.core.report import write_report
@@ -251,6 +252,9 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
         write_json(run.folder / "environment.json", environment(run, plugins))
+        if settings.general.init == "trunk":
+            trunk.adopt(run)
+            run.curves = read_curves(run.folder)
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
@@ -342,7 +346,9 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
-    listeners = (Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress())
+    listeners: list[object] = [Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress()]
+    if settings.general.init == "trunk":
+        listeners.append(trunk.TrunkKeeper())
     try:
         with plugins.listening(listeners):
             train(run, plugins)
@@ -377,6 +383,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     evaluation = Evaluator(run, settings.evaluation).evaluate()
     write_json(run.folder / "evaluation.json", evaluation)
     write_pictures(run, settings.evaluation, evaluation)
+    write_pseudo_pictures(run, settings.evaluation)
     for line in summary(evaluation):
         logger.info("%s", line)
     return evaluation

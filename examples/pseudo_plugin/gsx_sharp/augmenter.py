@@ -1,0 +1,48 @@
+"""An augmenter: from some step on, the middle of every training view at twice its density, at every step."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from gsx.core.images import to_uint8
+from gsx.core.pseudo import PseudoView, Setting, Term
+from gsx.core.regenerator import Request
+from gsx.core.run import Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteadyOptions:
+    name: str
+    start: float
+    """Fraction of the run after which it begins."""
+    weight: float
+
+
+class SteadyZoom:
+    def __init__(self, options: SteadyOptions, setting: Setting) -> None:
+        self.options, self.setting = options, setting
+        self.views: dict[int, PseudoView] = {}
+
+    def begins(self) -> int:
+        return round(self.options.start * self.setting.iterations)
+
+    def plan(self) -> dict[str, Any]:
+        return {"from": self.begins()}
+
+    def term(self, run: Run, step: int, view: int) -> Term | None:
+        if step <= self.begins():
+            return None
+        if view not in self.views:
+            self.views[view] = self.zoomed(view)
+        parts = [(self.views[view], self.options.weight)]
+        return Term(name=self.setting.name, parts=parts, taken=0.0, observed=False, shared=True)
+
+    def zoomed(self, number: int) -> PseudoView:
+        """The middle half of a photograph, redrawn; it depends on nothing else, so a resumed run makes it again."""
+        view = self.setting.scene.train[number]
+        camera = view.camera.narrow(0.5)
+        request = Request(
+            image=view.source.image(camera).float() / 255, scale=2, camera=camera, view=view, number=number,
+            photo=True, seed=self.setting.seed, strength=0.0, prompt="", step=0,
+        )  # fmt: skip
+        (picture,) = self.setting.regenerator("upscale").regenerate([request])
+        return PseudoView(camera=camera.zoom(2), target=to_uint8(picture), parent=number)

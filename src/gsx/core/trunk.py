@@ -1,0 +1,95 @@
+"""What runs have in common until the first of them makes pseudo views: trained once, kept, and branched from.
+
+With `init=trunk` a run starts from the latest state that an earlier run of the same composition, but for its
+augmenters, has left behind, and leaves states for later ones. The result is bit for bit that of a run from scratch.
+"""
+
+import hashlib
+import json
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gsx
+from gsx.core import checkpoint
+from gsx.core.cache import cache_folder, content_key, make_folder
+from gsx.core.files import read_json, write_json
+from gsx.core.plugins import hookimpl
+from gsx.core.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40)
+"""Where the paper's variants begin, of a whole run: states are kept there (spec 1.8)."""
+BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init")
+"""Keys of a composition that change nothing before the first pseudo views."""
+WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
+"""Keys of `training` that change nothing at all."""
+
+
+def common_steps(run: Run) -> int:
+    """Steps that the run shares with its control: up to the first pseudo views, or all of them."""
+    return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
+
+
+def trunk_folder(run: Run) -> Path:
+    """Where states of runs like this one are kept."""
+    config: dict[str, Any] = {key: value for key, value in run.config.items() if key not in BESIDE}
+    config["training"] = {key: value for key, value in config["training"].items() if key not in WATCHING}
+    machine = (sources(), str(run.device), torch.get_num_threads(), torch.__version__, run.raster.path)
+    return cache_folder("trunks", content_key(json.dumps(config, sort_keys=True, default=str), machine))
+
+
+def sources() -> str:
+    """A digest of this gsx: another one may train otherwise."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(gsx.__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def adopt(run: Run) -> None:
+    """Bring a new run to the latest state that it has in common with an earlier one, if there is any."""
+    folder, common = trunk_folder(run), common_steps(run)
+    usable = [path for path in checkpoint.sidecars(folder) if step_of(path) <= common]
+    if not usable:
+        logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
+        return
+    latest = usable[-1]
+    own = run.folder / "checkpoints"
+    own.mkdir(parents=True, exist_ok=True)
+    for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
+        shutil.copyfile(latest.with_suffix(suffix), own / latest.with_suffix(suffix).name)
+    (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(latest)))
+    checkpoint.restore(run)
+    logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
+
+
+def step_of(sidecar: Path) -> int:
+    """The step a checkpoint was written at."""
+    return int(sidecar.stem.removeprefix("step_"))
+
+
+def lines_of(sidecar: Path) -> list[dict[str, Any]]:
+    """Lines of metrics.jsonl up to a kept state."""
+    path = sidecar.with_name(f"lines_{sidecar.stem}.json")
+    return read_json(path)["lines"] if path.is_file() else []
+
+
+class TrunkKeeper:
+    """Listener: keeps states that other runs can branch from."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Keep this one if it is common ground and not kept yet."""
+        wanted = {round(share * run.iterations) for share in SHARES} | {common_steps(run)}
+        if run.step not in wanted or run.step > common_steps(run) or run.complete:
+            return
+        folder = make_folder(trunk_folder(run))
+        if any(step_of(path) == run.step for path in checkpoint.sidecars(folder)):
+            return
+        write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
+        checkpoint.write(run, folder)

@@ -1,0 +1,520 @@
+"""Augmenters in the training loop: the hybrid loss by hand, provenance, resume, and what goes wrong (spec 1.1-1.7)."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny import tiny_run, tiny_settings
+from torch import Tensor
+
+from gsx.augmenters.pseudo_details import PseudoDetails, rendered
+from gsx.cli import plugins
+from gsx.core.config import compose
+from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.losses import photometric
+from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
+from gsx.core.rasterizer import rasterize
+from gsx.core.regenerator import Material, Request
+from gsx.core.run import Run
+from gsx.core.session import execute, open_run, start
+from gsx.core.trainer import backward
+
+PLAIN = ("regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager")
+
+
+def run_at(folder: Path, step: int, *words: str) -> Run:
+    """A tiny run of 80 steps that stands at a step without having been trained there."""
+    run = start(tiny_settings(folder, "iterations=80", *PLAIN, *words), plugins())
+    run.step = step
+    return run
+
+
+def augmenter_of(run: Run, number: int = 0) -> PseudoDetails:
+    found = run.augmenters[number]
+    assert isinstance(found, PseudoDetails)
+    assert isinstance(found, Augmenter)
+    return found
+
+
+def by_options(run: Run, **changes: Any) -> PseudoDetails:
+    """The run's first augmenter with other options."""
+    old = augmenter_of(run)
+    return PseudoDetails(replace(old.options, **changes), old.setting)
+
+
+# -- the loss ----------------------------------------------------------------------------------------------------------
+
+
+def gradients(run: Run) -> dict[str, Tensor]:
+    return {name: gradient.clone() for name, gradient in run.backbone.gradients()}
+
+
+def own_loss(run: Run, view: int) -> Tensor:
+    camera, truth = run.scene.train[view].camera, run.scene.train[view].image()
+    image = rasterize(run.backbone.splats(camera), camera, run.raster, background=run.background).image
+    extra = run.backbone.regulariser()
+    loss = photometric(image, truth, 0.2)
+    return loss if extra is None else loss + extra
+
+
+@pytest.mark.parametrize(("backbone", "mode", "taken"), [
+    ("octree_scaffold", "auto", 0.1),
+    ("gs3d", "auto", 0.0),
+    ("gs3d", "hybrid", 0.1),
+    ("octree_scaffold", "direct", 0.0),
+])  # fmt: skip
+def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_path: Path) -> None:
+    """(1 - lambda) L_o + lambda / M sum L1, or L_o + 1 / M sum L1, with its gradients."""
+    run = run_at(tmp_path / "run", 44, f"backbone={backbone}", "augmenter=upscale", f"augmenter.upscale.mode={mode}")
+    picked = run.sampler.count - 1
+    run.sampler.order = [picked]
+    step = backward(run)
+    found = gradients(run)
+    run.backbone.discard()
+    views = augmenter_of(run).views[picked]
+    assert len(views) == 3
+    losses = [
+        pseudo_loss(rasterize(run.backbone.splats(v.camera), v.camera, run.raster, background=run.background).image, v)
+        for v in views
+    ]
+    weight = taken or 1.0
+    pseudo = weight * torch.stack(losses).mean()
+    whole = (1 - taken) * own_loss(run, picked) + pseudo
+    whole.backward()
+    assert float(step.loss) == pytest.approx(float(whole.detach()), rel=1e-5)
+    assert step.terms["upscale"] == pytest.approx(float(pseudo.detach()), rel=1e-5)
+    assert step.terms["own"] + step.terms["upscale"] == pytest.approx(float(step.loss), rel=1e-5)
+    for name, gradient in run.backbone.gradients():
+        torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
+
+
+def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale,bootstrap]")
+    run.sampler.order = [0]
+    step = backward(run)
+    run.backbone.discard()
+    assert step.terms["own"] == pytest.approx(0.75 * float(own_loss(run, 0).detach()), rel=1e-4)
+    assert list(step.terms) == ["own", "upscale", "bootstrap"]
+
+
+def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_path: Path) -> None:
+    """de-MLP: its gradient is that of (1 - lambda) L_o alone, while anchors feel the pseudo views (spec 1.4)."""
+    words = ("backbone=octree_scaffold", "augmenter=bootstrap", "augmenter.bootstrap.freeze_shared=active")
+    run = run_at(tmp_path / "run", 40, *words)
+    run.sampler.order = [1]
+    backward(run)
+    found = gradients(run)
+    run.backbone.discard()
+    (0.85 * own_loss(run, 1)).backward()
+    alone = gradients(run)
+    colour = [name for name in alone if name.startswith("heads.colour")]
+    assert colour
+    for name in colour:
+        torch.testing.assert_close(found[name], alone[name], rtol=1e-4, atol=1e-8)
+    assert not torch.allclose(found["features"], alone["features"], rtol=1e-2, atol=1e-9)
+    assert not torch.allclose(found["heads.opacity.0.weight"], alone["heads.opacity.0.weight"], rtol=1e-3, atol=1e-9)
+
+
+def test_freezing_for_half_of_a_window(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    half = by_options(run, freeze_shared="half")
+    view = PseudoView(camera=run.scene.train[0].camera, target=torch.zeros(3, 36, 48, dtype=torch.uint8), parent=0)
+    found = [half.weighted(run, [view], place) for place in (0.0, 0.49, 0.5, 1.0)]
+    assert [term is not None and term.shared for term in found] == [False, False, True, True]
+
+
+def test_trust_weighs_pixels() -> None:
+    target = torch.zeros(3, 2, 2, dtype=torch.uint8)
+    trust = torch.tensor([[255, 0], [51, 0]], dtype=torch.uint8)
+    camera = compose_camera()
+    view = PseudoView(camera=camera, target=target, parent=0, trust=trust)
+    assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), view)) == pytest.approx(0.5 * 1.2 / 4)
+    assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, trust=None))) == pytest.approx(0.5)
+
+
+def compose_camera() -> Any:
+    from gsx.core.camera import look_at
+
+    return look_at([0.0, -4.0, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=2, height=2)
+
+
+def test_pixels_of_small_windows_can_weigh_like_those_of_whole_pictures(tmp_path: Path) -> None:
+    """48 x 36 px: windows of 12 x 9 seen at 24 x 18 are a quarter of the pixels."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.per_pixel=true")
+    term = augmenter_of(run).term(run, 45, 0)
+    assert term is not None
+    assert [weight for _, weight in term.parts] == pytest.approx([0.25 / 3] * 3)
+
+
+def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.scales=[2,4]")
+    term = augmenter_of(run).term(run, 45, 0)
+    assert term is not None
+    assert [weight for _, weight in term.parts] == pytest.approx([1 / 6] * 6)
+    term = by_options(run, reduce="per_scale").weighted(run, [view for view, _ in term.parts], 0.0)
+    assert term is not None
+    assert [weight for _, weight in term.parts] == pytest.approx([1 / 2] * 6)
+
+
+# -- pseudo views ------------------------------------------------------------------------------------------------------
+
+
+def test_views_of_an_event(tmp_path: Path) -> None:
+    """One zoomed copy of every training camera and two moved ones; the copy shows the photograph's own window."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    augmenter_of(run).term(run, 45, 0)
+    for parent, views in augmenter_of(run).views.items():
+        own = run.scene.train[parent].camera
+        assert [view.provenance["kind"] for view in views] == ["base", "random", "random"]
+        for view in views:
+            assert view.camera.size == (24, 18)
+            assert view.camera.fx == 2 * own.fx
+            assert view.provenance["view"] == run.scene.train[parent].name
+        base = views[0]
+        assert torch.equal(base.camera.rotation, own.rotation)
+        assert (base.camera.cx, base.camera.cy) == (2 * (own.cx - 18), 2 * (own.cy - 13))
+        low = run.scene.train[parent].image()[:, 13:22, 18:30]
+        average = base.target.float().view(3, 9, 2, 12, 2).mean((2, 4)) / 255
+        assert float((average - low).abs().mean()) < 0.02
+        assert not torch.equal(views[1].camera.rotation, own.rotation)
+        assert torch.equal(views[1].camera.translation, own.translation)
+    assert sorted(augmenter_of(run).views) == list(range(6))
+
+
+def test_exact_projection_gives_back_the_photograph(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.project=exact")
+    augmenter_of(run).term(run, 45, 0)
+    for parent, views in augmenter_of(run).views.items():
+        sums = views[0].target.long().view(3, 9, 2, 12, 2).sum((2, 4))
+        low = (run.scene.train[parent].image()[:, 13:22, 18:30] * 255).round().long()
+        assert torch.equal((2 * sums + 4) // 8, low)
+
+
+def test_restored_views_show_what_the_model_shows(tmp_path: Path) -> None:
+    """With the identity as regenerator targets are renders, to 8 bits: nothing to learn."""
+    run = run_at(tmp_path / "run", 40, "augmenter=bootstrap")
+    augmenter_of(run).term(run, 41, 0)
+    views = [view for views in augmenter_of(run).views.values() for view in views]
+    assert len(views) == 12
+    for view in views:
+        assert view.camera.size == (19, 14)
+        assert float((rendered(run, view.camera) - view.target.float() / 255).abs().max()) <= 0.5001 / 255
+
+
+def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.zoom=none")
+    augmenter_of(run).term(run, 45, 0)
+    for views in augmenter_of(run).views.values():
+        for view in views:
+            assert view.camera.fx == run.scene.train[0].camera.fx
+            assert view.camera.size == (24, 18)
+
+
+@pytest.mark.parametrize("window", ["center", "random", "grid", "error"])
+def test_windows_lie_inside_the_raster(window: str, tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", f"augmenter.upscale.window={window}")
+    augmenter_of(run).term(run, 45, 0)
+    places = set()
+    for parent, views in augmenter_of(run).views.items():
+        own = run.scene.train[parent].camera
+        left, top = own.cx - views[0].camera.cx / 2, own.cy - views[0].camera.cy / 2
+        assert 0 <= left <= 48 - 12
+        assert 0 <= top <= 36 - 9
+        places.add((left, top))
+    assert (len(places) == 1) == (window == "center")
+
+
+def test_only_the_first_cameras(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.first_cameras=2")
+    assert augmenter_of(run).term(run, 45, 5) is None
+    assert sorted(augmenter_of(run).views) == [0, 1]
+
+
+def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
+    """Level of detail counts distances in focal lengths: at twice the focal length a level more is drawn (1.4)."""
+    run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "augmenter=upscale")
+    own = run.scene.train[0].camera
+    run.backbone.begin(80)
+    levels = [int(run.backbone.drawn(c).rows.numel()) for c in (own, own.crop(18, 13, 12, 9).zoom(4))]  # type: ignore[attr-defined]
+    full = run.backbone.table["level"][run.backbone.drawn(own.zoom(4)).rows].max()  # type: ignore[attr-defined]
+    assert full >= run.backbone.table["level"][run.backbone.drawn(own).rows].max()  # type: ignore[attr-defined]
+    assert levels[0] > 0
+
+
+def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=[upscale,bootstrap]")
+    held_out = {view.name for view in run.scene.test}
+    run.sampler.order = [0]
+    backward(run)
+    for augmenter in run.augmenters:
+        assert isinstance(augmenter, PseudoDetails)
+        views = [view for views in augmenter.views.values() for view in views]
+        assert views
+        assert not held_out & {view.provenance["view"] for view in views}
+        for view in views:
+            for test in run.scene.test:
+                assert not torch.allclose(view.camera.centre.double(), test.camera.centre.double(), atol=1e-6)
+
+
+def test_scales_in_turn(tmp_path: Path) -> None:
+    words = ("augmenter=upscale", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true")
+    augmenter = augmenter_of(run_at(tmp_path / "run", 44, *words))
+    assert [augmenter.scales_of(event) for event in augmenter.events] == [[2]] * 3 + [[4]] * 3 + [[8]] * 3
+
+
+def test_a_known_lower_resolution_enters_the_loss(tmp_path: Path) -> None:
+    """Only where the photograph is known: the zoomed copy of the training camera."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.coarse_weight=0.5")
+    augmenter_of(run).term(run, 45, 0)
+    base, *moved = augmenter_of(run).views[0]
+    assert all(view.coarse is None for view in moved)
+    assert base.coarse is not None
+    assert torch.equal(base.coarse, (run.scene.train[0].image()[:, 13:22, 18:30] * 255).round().to(torch.uint8))
+    grey = torch.full((3, 18, 24), 0.25)
+    fine = (grey - base.target.float() / 255).abs().mean()
+    low = (grey[:, :9, :12] - base.coarse.float() / 255).abs().mean()
+    assert float(pseudo_loss(grey, base)) == pytest.approx(float(fine + 0.5 * low))
+
+
+def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path) -> None:
+    """At the training cameras' own density nothing is finer; zoomed in twice almost everything is."""
+    shares = []
+    for scale in (1, 2):
+        words = ("augmenter=upscale", "augmenter.upscale.weight_map=splatsure", f"augmenter.upscale.scales=[{scale}]")
+        run = run_at(tmp_path / f"run{scale}", 44, *words)
+        augmenter_of(run).term(run, 45, 0)
+        views = [view for views in augmenter_of(run).views.values() for view in views]
+        trust = [1.0 if view.trust is None else float(view.trust.float().mean()) / 255 for view in views]
+        shares.append(sum(trust) / len(trust))
+    assert shares[0] < 0.5 < shares[1]
+
+
+# -- regenerators that fail --------------------------------------------------------------------------------------------
+
+
+class Spoiling:
+    """Enlarges well, but for every n-th picture."""
+
+    def __init__(self, every: int, spoil: Any) -> None:
+        self.every, self.spoil, self.calls = every, spoil, 0
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        return {}
+
+    def regenerate(self, requests: Any) -> list[Tensor]:
+        from gsx.regenerators.classical import enlarged
+
+        out = []
+        for request in requests:
+            self.calls += 1
+            image = enlarged(request)
+            out.append(self.spoil(image) if self.calls % self.every == 0 else image)
+        return out
+
+
+SPOILT = {
+    "not finite": lambda image: image * torch.nan,
+    "should be": lambda image: image[:, 1:],
+    "box-averaged": lambda image: image.flip(2),
+}
+
+
+def with_regenerator(run: Run, regenerator: Any) -> PseudoDetails:
+    old = augmenter_of(run)
+    return PseudoDetails(old.options, replace(old.setting, regenerator=lambda role: regenerator))
+
+
+@pytest.mark.parametrize("reason", SPOILT)
+def test_pictures_that_cannot_be_used_are_dropped_and_counted(
+    reason: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    augmenter = with_regenerator(run, Spoiling(3, SPOILT[reason]))
+    augmenter.term(run, 45, 0)
+    assert sum(map(len, augmenter.views.values())) == 12
+    assert "6 pictures dropped" in caplog.text
+    assert reason in caplog.text
+
+
+def test_an_event_that_loses_most_pictures_is_an_error(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at step 44.*regenerator/upscale"):
+        with_regenerator(run, Spoiling(1, SPOILT["not finite"])).term(run, 45, 0)
+
+
+def test_results_can_be_averaged(tmp_path: Path) -> None:
+    class Noisy(Spoiling):
+        def regenerate(self, requests: Any) -> list[Tensor]:
+            return [
+                image + 0.05 * torch.randn(image.shape, generator=torch.Generator().manual_seed(request.seed))
+                for image, request in zip(super().regenerate(requests), requests, strict=True)
+            ]
+
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    plain = with_regenerator(run, Spoiling(10**9, None))
+    plain.term(run, 45, 0)
+    errors = []
+    for samples in (1, 16):
+        old = augmenter_of(run)
+        options = replace(old.options, samples=samples, seeds="per_view")
+        noisy = PseudoDetails(options, replace(old.setting, regenerator=lambda role: Noisy(10**9, None)))
+        noisy.term(run, 45, 0)
+        pairs = [(a.target.float(), b.target.float()) for a, b in zip(plain.views[0], noisy.views[0], strict=True)]
+        errors.append(float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean()))
+    assert errors[1] < errors[0] / 8
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+RUN = ("iterations=40", *PLAIN, "augmenter=[upscale,bootstrap]", "training.checkpoint_every=100")
+
+
+def final_tensors(folder: Path) -> dict[str, Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    tiny_run(folder, RUN)
+    return folder
+
+
+def test_every_window_is_active_and_logged(finished: Path) -> None:
+    plan = json.loads((finished / "environment.json").read_text())["plan"]
+    assert plan["upscale"]["events"] == list(range(22, 39, 2))
+    assert plan["bootstrap"]["events"] == list(range(20, 39, 2))
+    pictures = [path.name for path in (finished / "pseudo").glob("*.png")]
+    for name in ("upscale", "bootstrap"):
+        assert {int(p.split("_")[1]) for p in pictures if p.startswith(name)} == set(plan[name]["events"])
+
+
+@pytest.mark.parametrize("stop", [20, 21, 22, 23, 30])
+def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", RUN, stop_after=stop)
+    run, settings = open_run(tmp_path / "run", plugins(), ())
+    execute(run, settings, plugins())
+    whole, parts = final_tensors(finished), final_tensors(tmp_path / "run")
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_before_the_first_window_a_run_is_that_of_the_control(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "augmented", RUN, stop_after=20)
+    control = tuple(word for word in RUN if not word.startswith("augmenter"))
+    tiny_run(tmp_path / "control", control, stop_after=20)
+    a, b = final_tensors(tmp_path / "augmented"), final_tensors(tmp_path / "control")
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_lost_file_of_pseudo_views_is_named(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", RUN, stop_after=21)
+    path = tmp_path / "run" / "pseudo" / "bootstrap.safetensors"
+    path.unlink()
+    run, settings = open_run(tmp_path / "run", plugins(), ())
+    with pytest.raises(InputError, match=r"bootstrap.safetensors cannot be read.*step 20.*train anew"):
+        execute(run, settings, plugins())
+
+
+def test_files_hold_everything(tmp_path: Path) -> None:
+    camera = compose_camera().crop(1, 0, 1, 2)
+    view = PseudoView(
+        camera=camera,
+        target=torch.arange(6, dtype=torch.uint8).view(3, 2, 1),
+        parent=4,
+        trust=torch.tensor([[7], [255]], dtype=torch.uint8),
+        provenance={"seed": 22},
+        coarse=torch.ones(3, 1, 1, dtype=torch.uint8),
+        coarse_weight=0.25,
+    )
+    save_views(tmp_path / "views", [view, replace(view, trust=None)], {"event": 3})
+    (first, second), facts = load_views(tmp_path / "views")
+    assert facts == {"event": 3}
+    assert torch.equal(first.target, view.target)
+    assert torch.equal(first.trust, view.trust)
+    assert second.trust is None
+    assert first.coarse is not None
+    assert torch.equal(first.coarse, torch.ones(3, 1, 1, dtype=torch.uint8))
+    assert first.coarse_weight == 0.25
+    assert (first.parent, first.provenance) == (4, {"seed": 22})
+    for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "cut_from"):
+        assert getattr(first.camera, name) == getattr(camera, name)
+    assert torch.equal(first.camera.rotation, camera.rotation)
+    assert torch.equal(first.camera.translation, camera.translation)
+
+
+# -- options -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("word", "complaint"), [
+    ("augmenter.upscale.window=middle", "choose from center, random, grid, error"),
+    ("augmenter.upscale.scales=[0]", "give factors of 1 or more"),
+    ("augmenter.upscale.narrow=0", "give a fraction above 0"),
+    ("augmenter.upscale.weights=[0.1]", "give two values"),
+    ("augmenter.upscale.weights=[0.1,2]", "from 0 to 1"),
+    ("augmenter.upscale.base=false augmenter.upscale.variants=0", "no pseudo view"),
+    ("augmenter.upscale.timing.span=2001", "windows would overlap"),
+    ("augmenter.upscale.narow=0.5", "Did you mean"),
+    ("augmenter.upscale.samples=0", "samples at least 1"),
+])  # fmt: skip
+def test_options_are_checked(word: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        compose(["augmenter=upscale", *word.split()], plugins())
+
+
+def test_unknown_augmenters_get_the_nearest_name() -> None:
+    with pytest.raises(ConfigError, match=r"augmenter=upscal.*Did you mean 'upscale'"):
+        compose(["augmenter=[upscal]"], plugins())
+
+
+def test_regenerators_are_chosen_by_role() -> None:
+    found = compose(["regenerator/upscale=lanczos", "regenerator/restore=identity"], plugins())
+    assert {role: chosen.component.name for role, chosen in found.regenerators.items()} == {
+        "upscale": "lanczos",
+        "restore": "identity",
+    }
+    assert found.augmenters == {}
+
+
+def term_of(run: Run) -> Term | None:
+    return augmenter_of(run).term(run, run.step + 1, 0)
+
+
+def test_oracle_needs_finer_photographs_or_an_analytic_scene(tmp_path: Path) -> None:
+    """The built-in scene has truth everywhere: also for cameras moved at random."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "regenerator/upscale=oracle")
+    assert term_of(run) is not None
+    view = augmenter_of(run).views[0][0]
+    finer = run.scene.train[0].source.image(view.camera)
+    assert torch.equal(view.target, finer)
+
+
+def asked(**changes: Any) -> Request:
+    from gsx.core.scene import View
+
+    class Coarse:
+        def image(self, camera: Any) -> Tensor:
+            return torch.zeros(3, camera.height, camera.width, dtype=torch.uint8)
+
+        def max_zoom(self, camera: Any) -> float:
+            return 1.0
+
+    camera = compose_camera()
+    given = Request(
+        image=torch.zeros(3, 2, 2), scale=2, camera=camera, view=View("a", camera, Coarse()), number=0, photo=True,
+        seed=0, strength=0.0, prompt="", step=0,
+    )  # fmt: skip
+    return replace(given, **changes)
+
+
+def test_oracle_refuses_what_it_does_not_know() -> None:
+    from gsx.regenerators.classical import Oracle, PlainOptions, Unchanged
+
+    with pytest.raises(InputError, match="not 2 times finer than the training images"):
+        Oracle(PlainOptions(name="oracle")).regenerate([asked()])
+    with pytest.raises(InputError, match="identity cannot enlarge x2"):
+        Unchanged(PlainOptions(name="identity")).regenerate([asked()])

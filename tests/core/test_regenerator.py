@@ -1,0 +1,77 @@
+"""Checks that every regenerator's pictures pass: size, colour, agreement, displacement (spec 6.4)."""
+
+import pytest
+import torch
+from test_scene_sr import request
+from torch import Tensor
+
+from gsx.core.regenerator import box_average, colour_matched, complaint, displacement
+
+
+def texture(height: int = 40, width: int = 50, shift: float = 0.0) -> Tensor:
+    """A smooth pattern, displaced to the right by so many px."""
+    row, column = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5 - shift, indexing="ij")
+    waves = [
+        torch.sin(column / 3 + row / 5),
+        torch.cos(column / 4 - row / 3),
+        torch.sin(row / 2) * torch.cos(column / 5),
+    ]
+    return 0.5 + 0.3 * torch.stack(waves)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, 0.25, 0.5, -0.4])
+def test_displacement_is_measured(shift: float) -> None:
+    assert displacement(texture(shift=shift), texture()) == pytest.approx(abs(shift), abs=0.03)
+
+
+def test_flat_pictures_show_no_displacement() -> None:
+    assert displacement(torch.full((3, 9, 9), 0.4), torch.full((3, 9, 9), 0.5)) == 0.0
+    assert displacement(torch.rand(3, 2, 2), torch.rand(3, 2, 2)) == 0.0
+
+
+def fine(shift: float = 0.0) -> Tensor:
+    """The texture at twice the density."""
+    row, column = torch.meshgrid((torch.arange(80) + 0.5) / 2, (torch.arange(100) + 0.5) / 2 - shift, indexing="ij")
+    waves = [
+        torch.sin(column / 3 + row / 5),
+        torch.cos(column / 4 - row / 3),
+        torch.sin(row / 2) * torch.cos(column / 5),
+    ]
+    return 0.5 + 0.3 * torch.stack(waves)
+
+
+def test_sound_pictures_pass() -> None:
+    assert complaint(request(texture()), fine()) == ""
+
+
+def test_half_a_pixel_of_the_finer_raster_is_the_limit() -> None:
+    """An enlargement with aligned corners or integer centres is displaced by half a fine pixel: a quarter of a px."""
+    assert complaint(request(texture()), fine(0.2)) == ""
+    assert "displaced by 0.3" in complaint(request(texture()), fine(0.3)) or "differs" in complaint(
+        request(texture()), fine(0.3)
+    )
+    weak = 0.5 + 0.1 * (texture() - 0.5)
+    assert "displaced by 0.3" in complaint(request(weak), 0.5 + 0.1 * (fine(0.3) - 0.5))
+
+
+@pytest.mark.parametrize(("spoil", "reason"), [
+    (lambda image: image[:, :, 1:], "should be (3, 80, 100)"),
+    (lambda image: image / 0, "not finite"),
+    (lambda image: image + 0.05, "levels off"),
+    (lambda image: image.flip(2), "differs from its input"),
+])  # fmt: skip
+def test_others_do_not(spoil, reason: str) -> None:
+    assert reason in complaint(request(texture()), spoil(fine()))
+
+
+def test_colours_are_put_right_where_they_drift() -> None:
+    given = request(texture())
+    assert torch.equal(colour_matched(given, fine() + 1 / 255), fine() + 1 / 255)
+    matched = colour_matched(given, fine() + torch.tensor([0.1, 0.0, -0.05])[:, None, None])
+    torch.testing.assert_close(matched.mean((1, 2)), texture().mean((1, 2)))
+
+
+def test_box_averages() -> None:
+    image = torch.arange(16.0).view(1, 4, 4)
+    assert box_average(image, 2).tolist() == [[[2.5, 4.5], [10.5, 12.5]]]
+    assert torch.equal(box_average(image, 1), image)

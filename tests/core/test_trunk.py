@@ -1,0 +1,79 @@
+"""Branching from a common trunk: the same bits as from scratch, and only what is common."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny import tiny_run
+from torch import Tensor
+
+from gsx.core.trunk import trunk_folder
+
+RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
+       "training.checkpoint_every=100", "training.log_every=2")  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+
+
+def final_tensors(folder: Path) -> dict[str, Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def assert_same(a: Path, b: Path) -> None:
+    first, second = final_tensors(a), final_tensors(b)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The control trains all of it and leaves states at 10, 15, 20, 22; bootstrap branches at 20, upscale at 22."""
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "control", (*RUN, "init=trunk"))
+    assert "no earlier run" in caplog.text
+    for name, step in (("bootstrap", 20), ("upscale", 22)):
+        caplog.clear()
+        tiny_run(tmp_path / name, (*RUN, f"augmenter={name}", "init=trunk"))
+        assert f"branching at step {step} from an earlier run" in caplog.text
+        tiny_run(tmp_path / f"{name}_scratch", (*RUN, f"augmenter={name}"))
+        assert_same(tmp_path / name, tmp_path / f"{name}_scratch")
+        assert [line["step"] for line in lines(tmp_path / name)] == [
+            line["step"] for line in lines(tmp_path / f"{name}_scratch")
+        ]
+
+
+def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
+    """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
+    run = tiny_run(tmp_path / "upscale", (*RUN, "augmenter=upscale", "init=trunk"))
+    assert sorted(path.stem for path in trunk_folder(run).glob("step_*.json")) == [
+        f"step_{step:07d}" for step in (10, 15, 20, 22)
+    ]
+    tiny_run(tmp_path / "both", (*RUN, "augmenter=[upscale,bootstrap]", "init=trunk"))
+    tiny_run(tmp_path / "scratch", (*RUN, "augmenter=[upscale,bootstrap]"))
+    assert_same(tmp_path / "both", tmp_path / "scratch")
+
+
+@pytest.mark.parametrize(
+    "other", ["seed=1", "backbone.density.gradient=1e-5", "iterations=41", "training.ssim_weight=0"]
+)
+def test_other_compositions_have_other_trunks(other: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    caplog.clear()
+    tiny_run(tmp_path / "second", (*RUN, other, "init=trunk"), stop_after=1)
+    assert "no earlier run" in caplog.text
+
+
+def test_how_a_run_is_watched_makes_no_other_trunk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=trunk"), stop_after=14)
+    assert "branching at step 10" in caplog.text

@@ -1,0 +1,130 @@
+"""A restorer learnt on half of the views each, measured on views it has not seen."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from test_scene_sr import EDGE, Photo, camera, request, stripes
+from torch import Tensor
+
+from gsx.core.errors import InputError
+from gsx.core.images import to_uint8
+from gsx.core.regenerator import Material, Regenerator
+from gsx.core.scene import View
+from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer, mean_error
+
+
+def options(**changes: float) -> RestorerOptions:
+    values = {"channels": 8, "steps": 120, "batch": 4, "crop": 32, "rate": 3e-3, "strongest": 0.06}
+    return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
+
+
+def blurred(image: Tensor) -> Tensor:
+    """What a model that has not finished training shows: everything, softly, a little too dark."""
+    weights = torch.tensor([1.0, 2, 1]) / 4
+    kernel = (weights[:, None] * weights).expand(3, 1, 3, 3)
+    padded = torch.nn.functional.pad(image[None], (1, 1, 1, 1), mode="replicate")
+    return 0.95 * torch.nn.functional.conv2d(padded, kernel, groups=3)[0]
+
+
+def material(folder: Path, spoil=blurred, count: int = 8) -> Material:
+    views = [View(f"photo{i}", camera(), Photo(stripes(i))) for i in range(count)]
+    renders = {view.camera: spoil(view.image()) for view in views}
+    return Material(
+        views=views, render=lambda seen: renders[seen], step=40, seed=0, device=torch.device("cpu"), folder=folder
+    )
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneRestorer, dict[str, float]]:
+    restorer = SceneRestorer(options())
+    return restorer, restorer.prepare(material(tmp_path_factory.mktemp("run")))
+
+
+def restored(restorer: SceneRestorer, image: Tensor, number: int = 0, strength: float = 0.06) -> Tensor:
+    from dataclasses import replace
+
+    asked = replace(request(image, 1), number=number, strength=strength)
+    return restorer.regenerate([asked])[0]
+
+
+def test_it_brings_unseen_views_closer_to_their_photographs(learnt: tuple[SceneRestorer, dict[str, float]]) -> None:
+    restorer, figures = learnt
+    assert isinstance(restorer, Regenerator)
+    assert restorer.useful == [True, True]
+    for fold in (0, 1):
+        assert figures[f"error_after_{fold}"] < 0.7 * figures[f"error_before_{fold}"]
+    truth = stripes(50).float() / 255
+    before, after = blurred(truth), restored(restorer, blurred(truth))
+    assert float((after - truth).square().mean()) < 0.7 * float((before - truth).square().mean())
+
+
+def test_views_are_restored_by_the_network_that_has_not_seen_them(
+    learnt: tuple[SceneRestorer, dict[str, float]],
+) -> None:
+    restorer, _ = learnt
+    image = blurred(stripes(0).float() / 255)
+    with torch.no_grad():
+        changes = [network(image[None])[0] for network in restorer.networks]
+    for number in (0, 1, 2, 3):  # network n has learnt from views n, n + 2, ...
+        torch.testing.assert_close(
+            restored(restorer, image, number), (image + changes[(number + 1) % 2]).clamp(0, 1), rtol=0, atol=1e-6
+        )
+
+
+def test_strength_is_a_share_of_the_correction(learnt: tuple[SceneRestorer, dict[str, float]]) -> None:
+    restorer, _ = learnt
+    image = blurred(stripes(9).float() / 255).clamp(0.2, 0.8)
+    whole, third = restored(restorer, image) - image, restored(restorer, image, strength=0.02) - image
+    torch.testing.assert_close(third, whole / 3, rtol=1e-4, atol=1e-6)
+    assert torch.equal(restored(restorer, image, strength=0.0), image)
+
+
+def test_one_that_helps_nobody_changes_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Renders that are the photographs already: whatever is learnt can only do harm."""
+    restorer = SceneRestorer(options(steps=3))
+    figures = restorer.prepare(material(tmp_path, spoil=lambda image: image))
+    assert figures["error_before_0"] == 0
+    assert "changes nothing" in caplog.text
+    image = stripes(3).float() / 255
+    assert torch.equal(restored(restorer, image), image)
+
+
+def test_what_was_learnt_stays_with_the_run(tmp_path: Path) -> None:
+    """A resumed run goes on from the networks it had, not from new ones."""
+    first, resumed, fresh = (SceneRestorer(options(steps=steps)) for steps in (20, 1, 1))
+    first.prepare(material(tmp_path / "run"))
+    given = material(tmp_path / "run")
+    resumed.prepare(given)
+    fresh.prepare(material(tmp_path / "other"))
+    pairs = [(given.render(view.camera), view.image()) for view in given.views]
+    assert mean_error(resumed.networks[0], pairs) < mean_error(fresh.networks[0], pairs)
+
+
+def test_it_begins_by_changing_nothing_and_never_changes_much() -> None:
+    network = Residual(8, torch.Generator().manual_seed(0))
+    image = torch.rand(1, 3, 13, 18, generator=torch.Generator().manual_seed(1))
+    assert network(image).shape == image.shape
+    assert not network(image).any()
+    torch.nn.init.constant_(network.last.bias, 1e6)
+    torch.testing.assert_close(network(image), torch.full_like(image, LARGEST_CHANGE))
+
+
+def test_it_needs_views_for_both_halves(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least 4 training views, there are 3"):
+        SceneRestorer(options()).prepare(material(tmp_path, count=3))
+    with pytest.raises(InputError, match="cannot enlarge x2"):
+        SceneRestorer(options()).regenerate([request(torch.zeros(3, EDGE, EDGE))])
+
+
+def test_classical_ones() -> None:
+    from gsx.regenerators.classical import PlainOptions, Resampled, Unchanged
+
+    image = to_uint8(torch.rand(3, 8, 10, generator=torch.Generator().manual_seed(2))).float() / 255
+    assert torch.equal(Unchanged(PlainOptions(name="identity")).regenerate([request(image, 1)])[0], image)
+    larger = Resampled(PlainOptions(name="lanczos")).regenerate([request(image, 4)])[0]
+    assert larger.shape == (3, 32, 40)
+    flat = torch.full((3, 8, 8), 100 / 255)
+    torch.testing.assert_close(
+        Resampled(PlainOptions(name="lanczos")).regenerate([request(flat, 2)])[0], torch.full((3, 16, 16), 100 / 255)
+    )

@@ -1,0 +1,175 @@
+"""Super-resolution learnt from a scene: better than a filter on unseen texture, true to its input."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsx.core.camera import look_at
+from gsx.core.errors import InputError
+from gsx.core.images import resize, to_uint8
+from gsx.core.regenerator import Material, Regenerator, Request, box_average, complaint
+from gsx.core.scene import View
+from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at
+
+EDGE = 48
+
+
+def stripes(seed: int, edge: int = EDGE) -> Tensor:
+    """Crisp bars of two colours in some direction, as 8-bit RGB: an enlargement by a filter blurs their edges."""
+    generator = torch.Generator().manual_seed(seed)
+    angle, phase = (float(value) for value in torch.rand(2, generator=generator) * 3.14159)
+    row, column = torch.meshgrid(torch.arange(edge * 4.0), torch.arange(edge * 4.0), indexing="ij")
+    wave = torch.sin((column * torch.cos(torch.tensor(angle)) + row * torch.sin(torch.tensor(angle))) / 11 + phase)
+    colours = torch.rand(2, 3, 1, 1, generator=generator) * 0.5 + torch.tensor([0.0, 0.5]).view(2, 1, 1, 1)
+    picture = torch.where(wave > 0, colours[0], colours[1])
+    return to_uint8(box_average(picture, 4))
+
+
+class Photo:
+    def __init__(self, image: Tensor) -> None:
+        self.stored = image
+
+    def image(self, camera: object) -> Tensor:
+        return self.stored
+
+    def max_zoom(self, camera: object) -> float:
+        return 1.0
+
+
+def camera(edge: int = EDGE):
+    return look_at([0.0, -4.0, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=edge, height=edge)
+
+
+def material(folder: Path, count: int = 6) -> Material:
+    views = [View(f"photo{i}", camera(), Photo(stripes(i))) for i in range(count)]
+    return Material(
+        views=views,
+        render=lambda seen: torch.zeros(3, seen.height, seen.width),
+        step=1,
+        seed=0,
+        device=torch.device("cpu"),
+        folder=folder,
+    )
+
+
+def options(**changes: float) -> SceneSROptions:
+    values = {
+        "channels": 16,
+        "layers": 3,
+        "steps": 200,
+        "batch": 8,
+        "crop": 16,
+        "rate": 2e-3,
+        "noise": 0.5,
+        "seconds": 0,
+    }
+    return SceneSROptions(name="scene_sr", **(values | changes))  # type: ignore[arg-type]
+
+
+def request(image: Tensor, scale: int = 2) -> Request:
+    seen = camera(image.shape[2])
+    return Request(
+        image=image, scale=scale, camera=seen, view=View("a", seen, Photo(to_uint8(image))), number=0, photo=True,
+        seed=22, strength=0.0, prompt="", step=1,
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory) -> SceneSR:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GSX_CACHE", str(tmp_path_factory.mktemp("cache")))
+        regenerator = SceneSR(options())
+        regenerator.prepare(material(tmp_path_factory.mktemp("run")))
+    return regenerator
+
+
+def error(image: Tensor, truth: Tensor) -> float:
+    return float((image - truth).square().mean())
+
+
+def test_it_enlarges_unseen_texture_better_than_a_filter(learnt: SceneSR) -> None:
+    assert isinstance(learnt, Regenerator)
+    gains = []
+    for seed in range(100, 106):
+        truth = stripes(seed).float() / 255
+        low = to_uint8(box_average(truth, 2))
+        (result,) = learnt.regenerate([request(low.float() / 255)])
+        plain = resize(low, EDGE, EDGE, "lanczos").float() / 255
+        gains.append(error(plain, truth) / error(result, truth))
+    assert sorted(gains)[2] > 1.5, gains
+
+
+def test_what_it_makes_reduces_to_what_it_was_given(learnt: SceneSR) -> None:
+    for scale in (2, 4, 8):
+        low = stripes(7, 12).float() / 255
+        given = request(low, scale)
+        (result,) = learnt.regenerate([given])
+        assert result.shape == (3, 12 * scale, 12 * scale)
+        assert float((box_average(result, scale) - low).abs().max()) < 2 / 255
+        assert complaint(given, result) == ""
+
+
+def test_before_learning_it_is_the_bicubic_enlargement() -> None:
+    network = Enlarger(8, 2, torch.Generator().manual_seed(0))
+    image = torch.rand(1, 3, 9, 11, generator=torch.Generator().manual_seed(1))
+    plain = torch.nn.functional.interpolate(image, scale_factor=2, mode="bicubic", align_corners=False)
+    torch.testing.assert_close(network(image), plain)
+
+
+def test_what_was_learnt_is_found_again(tmp_path: Path) -> None:
+    first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
+    assert "loss" in first.prepare(material(tmp_path))
+    assert again.prepare(material(tmp_path)) == {"learnt_before": 1.0}
+    given = request(stripes(3, 12).float() / 255)
+    assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
+    assert first.prepare(material(tmp_path)) == {}
+
+
+def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
+    first.prepare(material(tmp_path))
+    photos = [view.image() for view in material(tmp_path).views]
+    kept_at(options(steps=5), photos, 0).write_bytes(b"no network")
+    assert "loss" in again.prepare(material(tmp_path))
+    assert "learnt again" in caplog.text
+    given = request(stripes(3, 12).float() / 255)
+    assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
+
+
+def test_other_photographs_are_another_scene(tmp_path: Path) -> None:
+    photos = [view.image() for view in material(tmp_path).views]
+    assert kept_at(options(), photos, 0) != kept_at(options(), photos[:-1], 0)
+    assert kept_at(options(), photos, 0) != kept_at(options(steps=7), photos, 0)
+    assert kept_at(options(), photos, 0) != kept_at(options(), photos, 1)
+
+
+def test_the_time_is_limited_and_its_result_not_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    hurried = options(steps=100_000, seconds=0.2)
+    SceneSR(hurried).prepare(material(tmp_path))
+    assert "regenerator.upscale.seconds" in caplog.text
+    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], 0).exists()
+
+
+def test_crops_are_of_every_orientation_and_place() -> None:
+    photo = torch.arange(3 * 20 * 20.0).view(3, 20, 20)
+    generator = torch.Generator().manual_seed(0)
+    corners = {tuple(crop([photo], 8, generator)[0, [0, 0, -1], [0, -1, 0]].tolist()) for _ in range(2000)}
+    assert len(corners) == 8 * 5 * 5
+
+
+def test_only_powers_of_two(learnt: SceneSR) -> None:
+    with pytest.raises(InputError, match="x2, x4, x8, not x3"):
+        learnt.regenerate([request(stripes(3, 12).float() / 255, 3)])
+
+
+@pytest.mark.parametrize("change", [{"steps": 0}, {"crop": 4}, {"rate": 0}, {"seconds": -1}])
+def test_options_are_checked(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"regenerator\.upscale"):
+        options(**change)
