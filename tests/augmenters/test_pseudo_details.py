@@ -11,14 +11,15 @@ from safetensors.torch import load_file
 from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
-from gsx.augmenters.pseudo_details import PseudoDetails, rendered
+from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.losses import photometric
+from gsx.core.material import rendered
 from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.rasterizer import rasterize
-from gsx.core.regenerator import Material, Request
+from gsx.core.regenerator import Material
 from gsx.core.run import Run
 from gsx.core.session import execute, open_run, start
 from gsx.core.trainer import backward
@@ -92,6 +93,29 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
+def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Path) -> None:
+    """(1 - lambda_b) L_o + L_b + sum L1 / M: only the upscaling term is added (spec 1.3)."""
+    run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale,bootstrap]")
+    run.sampler.order = [0]
+    step = backward(run)
+    run.backbone.discard()
+    assert step.terms["own"] == pytest.approx(0.85 * float(own_loss(run, 0).detach()), rel=1e-4)
+
+
+def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
+    """Of the window's render, not of the whole zoomed canvas that it is cut from (spec 1.4, 28)."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    view = run.scene.train[0].camera.crop(18, 13, 12, 9).zoom(2)
+    rendering = rasterize(run.backbone.splats(view), view, run.raster)
+    places, depth = view.project(run.backbone.table["means"].detach())  # type: ignore[attr-defined]
+    seen = rendering.screen.ids[rendering.screen.visible]
+    radii = rendering.screen.radii[rendering.screen.visible].float()
+    far = ((places[seen] < -radii[:, None] - 16) | (places[seen] > radii[:, None] + 16 + torch.tensor([24, 18]))).any(1)
+    assert len(seen) > 0
+    assert not far.any()
+    assert float(depth[seen].min()) > 0
+
+
 def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale,bootstrap]")
     run.sampler.order = [0]
@@ -123,7 +147,7 @@ def test_freezing_for_half_of_a_window(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "augmenter=upscale")
     half = by_options(run, freeze_shared="half")
     view = PseudoView(camera=run.scene.train[0].camera, target=torch.zeros(3, 36, 48, dtype=torch.uint8), parent=0)
-    found = [half.weighted(run, [view], place) for place in (0.0, 0.49, 0.5, 1.0)]
+    found = [half.weighted(run, [view], 0.0, place) for place in (0.0, 0.49, 0.5, 1.0)]
     assert [term is not None and term.shared for term in found] == [False, False, True, True]
 
 
@@ -155,7 +179,7 @@ def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 6] * 6)
-    term = by_options(run, reduce="per_scale").weighted(run, [view for view, _ in term.parts], 0.0)
+    term = by_options(run, reduce="per_scale").weighted(run, [view for view, _ in term.parts], 0.0, 0.0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 2] * 6)
 
@@ -179,7 +203,7 @@ def test_views_of_an_event(tmp_path: Path) -> None:
         assert (base.camera.cx, base.camera.cy) == (2 * (own.cx - 18), 2 * (own.cy - 13))
         low = run.scene.train[parent].image()[:, 13:22, 18:30]
         average = base.target.float().view(3, 9, 2, 12, 2).mean((2, 4)) / 255
-        assert float((average - low).abs().mean()) < 0.02
+        assert float((average - low).abs().mean()) < 0.03
         assert not torch.equal(views[1].camera.rotation, own.rotation)
         assert torch.equal(views[1].camera.translation, own.translation)
     assert sorted(augmenter_of(run).views) == list(range(6))
@@ -261,7 +285,8 @@ def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
 
 
 def test_scales_in_turn(tmp_path: Path) -> None:
-    words = ("augmenter=upscale", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true")
+    words = ("augmenter=upscale", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true",
+             "augmenter.upscale.narrow=1.0")  # fmt: skip
     augmenter = augmenter_of(run_at(tmp_path / "run", 44, *words))
     assert [augmenter.scales_of(event) for event in augmenter.events] == [[2]] * 3 + [[4]] * 3 + [[8]] * 3
 
@@ -350,7 +375,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
     class Noisy(Spoiling):
         def regenerate(self, requests: Any) -> list[Tensor]:
             return [
-                image + 0.05 * torch.randn(image.shape, generator=torch.Generator().manual_seed(request.seed))
+                image + 0.02 * torch.randn(image.shape, generator=torch.Generator().manual_seed(request.seed))
                 for image, request in zip(super().regenerate(requests), requests, strict=True)
             ]
 
@@ -370,7 +395,14 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
 
 # -- runs --------------------------------------------------------------------------------------------------------------
 
-RUN = ("iterations=40", *PLAIN, "augmenter=[upscale,bootstrap]", "training.checkpoint_every=100")
+RUN = (
+    "iterations=40",
+    *PLAIN,
+    "augmenter=[upscale,bootstrap]",
+    "augmenter.upscale.timing.span=2000",  # two steps: a run can be stopped inside a window
+    "augmenter.bootstrap.timing.span=2000",
+    "training.checkpoint_every=100",
+)
 
 
 def final_tensors(folder: Path) -> dict[str, Tensor]:
@@ -393,7 +425,7 @@ def test_every_window_is_active_and_logged(finished: Path) -> None:
         assert {int(p.split("_")[1]) for p in pictures if p.startswith(name)} == set(plan[name]["events"])
 
 
-@pytest.mark.parametrize("stop", [20, 21, 22, 23, 30])
+@pytest.mark.parametrize("stop", [20, 23])
 def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=stop)
     run, settings = open_run(tmp_path / "run", plugins(), ())
@@ -401,6 +433,38 @@ def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished:
     whole, parts = final_tensors(finished), final_tensors(tmp_path / "run")
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_window(
+    finished: Path, tmp_path: Path
+) -> None:
+    """The checkpoint of step 21 needs the views of 20, though those of 22 and 24 have been made since."""
+    folder = tmp_path / "run"
+    tiny_run(folder, (*RUN, "training.checkpoint_every=7"), stop_after=26)
+    for path in (folder / "checkpoints").glob("step_0000026*"):
+        path.unlink()
+    run, settings = open_run(folder, plugins(), ())
+    assert run.step == 21
+    execute(run, settings, plugins())
+    whole, parts = final_tensors(finished), final_tensors(folder)
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_files_of_events_that_no_checkpoint_needs_are_removed(finished: Path) -> None:
+    kept = sorted(path.name for path in (finished / "pseudo").glob("*.safetensors"))
+    assert kept == ["bootstrap_0000038.safetensors", "upscale_0000038.safetensors"]
+
+
+def test_a_longer_run_waits_for_its_next_event(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Of 40 steps the last events are at 38; of 60 those around 40 are at 39, which was never made, and 42."""
+    caplog.set_level("INFO")
+    words = tuple(word for word in RUN if not word.startswith("augmenter"))
+    tiny_run(tmp_path / "run", (*words, "augmenter=bootstrap", "augmenter.bootstrap.timing.span=1500"))
+    run, settings = open_run(tmp_path / "run", plugins(), ["iterations=60"])
+    assert augmenter_of(run).events[:5] == [30, 33, 36, 39, 42]
+    execute(run, settings, plugins())
+    assert run.complete
+    assert "rests until its next event" in caplog.text
 
 
 def test_before_the_first_window_a_run_is_that_of_the_control(tmp_path: Path) -> None:
@@ -413,10 +477,10 @@ def test_before_the_first_window_a_run_is_that_of_the_control(tmp_path: Path) ->
 
 def test_a_lost_file_of_pseudo_views_is_named(tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=21)
-    path = tmp_path / "run" / "pseudo" / "bootstrap.safetensors"
+    path = tmp_path / "run" / "pseudo" / "bootstrap_0000020.safetensors"
     path.unlink()
     run, settings = open_run(tmp_path / "run", plugins(), ())
-    with pytest.raises(InputError, match=r"bootstrap.safetensors cannot be read.*step 20.*train anew"):
+    with pytest.raises(InputError, match=r"bootstrap_0000020.safetensors cannot be read.*step 20.*train anew"):
         execute(run, settings, plugins())
 
 
@@ -484,37 +548,44 @@ def term_of(run: Run) -> Term | None:
     return augmenter_of(run).term(run, run.step + 1, 0)
 
 
-def test_oracle_needs_finer_photographs_or_an_analytic_scene(tmp_path: Path) -> None:
-    """The built-in scene has truth everywhere: also for cameras moved at random."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "regenerator/upscale=oracle")
+def test_the_oracle_gives_the_true_pixels(tmp_path: Path) -> None:
+    """The built-in scene has truth at any density; of cameras moved at random the untrained model shows another one."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "regenerator/upscale=oracle", "scene.samples=16",
+                 "augmenter.upscale.variants=0")  # fmt: skip
     assert term_of(run) is not None
     view = augmenter_of(run).views[0][0]
     finer = run.scene.train[0].source.image(view.camera)
     assert torch.equal(view.target, finer)
 
 
-def asked(**changes: Any) -> Request:
-    from gsx.core.scene import View
+def test_what_cannot_work_is_refused_before_training(tmp_path: Path) -> None:
+    up, boot = "augmenter=upscale", "augmenter=bootstrap"
+    for words, complaint in {
+        (up, "augmenter.upscale.scales=[3]", "regenerator/upscale=scene_sr"): "x2, x4, x8, not x3",
+        (boot, "augmenter.bootstrap.scales=[2]"): "identity cannot enlarge x2",
+        (up, "augmenter.upscale.role=upscal"): "no regenerator is chosen for 'upscal'",
+        (up, "augmenter.upscale.scales=[16]"): "are 2 x 1 px; 4 px are the least",
+        (up, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,1.0]"): "take the whole loss",
+    }.items():
+        with pytest.raises(ConfigError, match=complaint):
+            run_at(tmp_path / "run", 0, *words)
+        assert not (tmp_path / "run").exists()
 
-    class Coarse:
+
+def test_oracle_knows_photographs_only_where_they_were_taken() -> None:
+    from gsx.core.scene import View
+    from gsx.regenerators.classical import Oracle, PlainOptions
+
+    class Photo:
         def image(self, camera: Any) -> Tensor:
             return torch.zeros(3, camera.height, camera.width, dtype=torch.uint8)
 
         def max_zoom(self, camera: Any) -> float:
-            return 1.0
+            return 2.0
 
-    camera = compose_camera()
-    given = Request(
-        image=torch.zeros(3, 2, 2), scale=2, camera=camera, view=View("a", camera, Coarse()), number=0, photo=True,
-        seed=0, strength=0.0, prompt="", step=0,
-    )  # fmt: skip
-    return replace(given, **changes)
-
-
-def test_oracle_refuses_what_it_does_not_know() -> None:
-    from gsx.regenerators.classical import Oracle, PlainOptions, Unchanged
-
-    with pytest.raises(InputError, match="not 2 times finer than the training images"):
-        Oracle(PlainOptions(name="oracle")).regenerate([asked()])
-    with pytest.raises(InputError, match="identity cannot enlarge x2"):
-        Unchanged(PlainOptions(name="identity")).regenerate([asked()])
+    oracle, views = Oracle(PlainOptions(name="oracle")), [View("a", compose_camera(), Photo())]
+    oracle.check(views, [2], False)
+    with pytest.raises(ConfigError, match="variants=0"):
+        oracle.check(views, [2], True)
+    with pytest.raises(ConfigError, match=r"not 4 times finer.*scene.downscale=4"):
+        oracle.check(views, [4], False)

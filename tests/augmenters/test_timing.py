@@ -55,9 +55,10 @@ def test_combined_weights_after_a_common_event(offset: int, weights: tuple[float
 
 
 def test_strength_decays_over_the_events() -> None:
-    events = events_of(B, schedule())
-    found = [round(ramp([0.06, 0.01], event, events), 4) for event in (20000, 24000, 28000, 32000, 36000, 38000)]
+    found = [round(ramp([0.06, 0.01], at, B, schedule()), 4) for at in (20000, 24000, 28000, 32000, 36000, 38000)]
     assert found == [0.06, 0.0489, 0.0378, 0.0267, 0.0156, 0.01]
+    assert ramp([0.06, 0.01], 15000, replace(B, start=15000), schedule()) == 0.06
+    assert round(ramp([0.06, 0.01], 37000, replace(B, start=15000), schedule()), 4) == 0.0122
 
 
 def test_other_ways_to_split_the_weights() -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
+    chosen_places,
     clones,
     judged,
     relative_sizes,
@@ -22,12 +23,12 @@ from gsx.backbones.clone_split import (
     starting_points,
 )
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.levels import Levels, initial_nodes, seen_fraction
-from gsx.backbones.octree_gs3d import OctreeGS3DOptions
+from gsx.backbones.levels import Levels, initial_nodes
+from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians
 from gsx.cli import plugins
 from gsx.core.backbone import Backbone, Beginning
 from gsx.core.camera import Camera, look_at
-from gsx.core.config import compose
+from gsx.core.config import compose, read_config, write_config
 from gsx.core.errors import ConfigError
 from gsx.core.export import splats_of, write_columns
 from gsx.core.ply import read_ply
@@ -67,7 +68,7 @@ def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
     )
-    backbone = GS3D(options.clone_split, beginning)
+    backbone = GS3D(free_gaussians(options), beginning)
     assert backbone.levels is not None
     backbone.levels = replace(backbone.levels, farthest=8.0)
     return backbone
@@ -155,7 +156,7 @@ def test_verdicts_by_hand(level: int, gradient: float, scale: float, wanted: str
     scales[0, 1] = scale
     gradients = torch.zeros(401)
     gradients[0] = gradient
-    found = judged(gradients, scales, of, levels, CONTROL, threshold=2e-4, large=0.01)
+    found = judged(gradients, scales, of, levels, CONTROL, threshold=2e-4, large=0.01, splitting=True)
     assert [name for name in ("cloned", "split", "biased") if getattr(found, name)[0]] == wanted.split()
     assert not any(bool(getattr(found, name)[1:].any()) for name in ("cloned", "split", "biased"))
 
@@ -171,8 +172,8 @@ def test_clones_are_copies_on_their_level_without_bias() -> None:
     backbone = small_octree()
     stir(backbone)
     raw = raw_of(backbone)
-    cloned = torch.arange(len(backbone.table)) % 7 == 3
-    new = clones(raw, cloned, levels_of(backbone))
+    cloned = torch.arange(3, len(backbone.table), 7)
+    new = clones(raw, cloned)
     for name, value in new.items():
         assert torch.equal(value, torch.zeros_like(value) if name == "bias" else raw[name][cloned]), name
 
@@ -183,8 +184,8 @@ def test_a_child_is_smaller_a_level_finer_and_drawn_from_its_parent() -> None:
     raw = raw_of(backbone)
     raw["log_scales"][:] = torch.tensor([math.log(0.1), -30.0, -30.0])
     raw["quats"][:] = torch.tensor([math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)])
-    split = torch.ones(len(backbone.table), dtype=torch.bool)
-    new = small_children(raw, split, levels_of(backbone), 0.6, torch.Generator().manual_seed(0))
+    everyone = torch.arange(len(backbone.table))
+    new = small_children(raw, everyone, levels_of(backbone), 0.6, torch.Generator().manual_seed(0))
     offsets = new["means"] - raw["means"]
     assert offsets[:, [0, 2]].abs().max() < 1e-6
     assert 0.07 < float(offsets[:, 1].std()) < 0.13
@@ -195,16 +196,31 @@ def test_a_child_is_smaller_a_level_finer_and_drawn_from_its_parent() -> None:
 
 
 def test_what_too_few_cameras_would_draw_is_not_made() -> None:
-    """Half of the cameras stand at D/2 and farther, so hardly any child of level 2 is drawn by more than half."""
+    """Half of the cameras stand at D/2 and farther, so hardly anything of level 2 is drawn by more than half."""
     backbone = small_octree()
-    levels = replace(levels_of(backbone), threshold=0.5)
-    raw = raw_of(backbone)
-    split = torch.ones(len(backbone.table), dtype=torch.bool)
-    new = small_children(raw, split, levels, 0.6, torch.Generator().manual_seed(0))
-    children = small_children(raw, split, replace(levels, threshold=-1.0), 0.6, torch.Generator().manual_seed(0))
-    seen = seen_fraction(levels, children["means"], children["level"]) > 0.5
-    assert 0 < len(new["means"]) < len(seen)
-    assert torch.equal(new["means"], children["means"][seen])
+    levels, raw = replace(levels_of(backbone), threshold=0.5), raw_of(backbone)
+    everyone = torch.arange(len(backbone.table))
+    generator = torch.Generator().manual_seed(0)
+    for new in (clones(raw, everyone), small_children(raw, everyone, levels, 0.6, generator)):
+        keep = chosen_places(new, torch.ones(len(everyone)), levels, 10**6)
+        for row in range(len(everyone)):
+            place, level = new["means"][row].tolist(), int(new["level"][row])
+            reach = [math.log2(8 / math.dist(place, (0.0, -8.0 / 2**n, 0.0))) for n in range(4)]
+            drawn = sum(level <= min(2, max(0, round(value))) for value in reach)
+            assert bool(keep[row]) == (drawn > 2)
+        assert 0 < int(keep.sum()) < len(everyone)
+
+
+def test_room_goes_to_the_largest_gradients_of_those_that_are_seen() -> None:
+    backbone = small_octree()
+    levels, raw = replace(levels_of(backbone), threshold=0.5), raw_of(backbone)
+    everyone = torch.arange(len(backbone.table))
+    gradient = torch.rand(len(everyone), generator=torch.Generator().manual_seed(2))
+    seen = chosen_places(raw, gradient, levels, 10**6)
+    keep = chosen_places(raw, gradient, levels, 3)
+    best = sorted(gradient[seen].tolist())[-3:]
+    assert sorted(gradient[keep].tolist()) == best
+    assert int(chosen_places(raw, gradient, levels, 0).sum()) == 0
 
 
 # -- density events ----------------------------------------------------------------------------------------------------
@@ -259,8 +275,16 @@ def test_events_come_every_hundred_steps_of_their_window(step: int, happens: boo
     (False, 1600, 2), (True, 1600, 0), (True, 10000, 0), (True, 10100, 2),
 ])  # fmt: skip
 def test_the_gate_keeps_splits_until_all_levels_train(gate: bool, step: int, split: int) -> None:
-    done = due(f"clone_split.level_density.gate={gate}", step=step).adapt(step)
+    backbone = due(f"clone_split.level_density.gate={gate}", step=step)
+    done = backbone.adapt(step)
     assert (done["cloned"], done["split"]) == (2, split)
+    assert bool(backbone.table["bias"][3] > 0) == (split > 0)
+
+
+def test_splits_that_wait_take_no_room() -> None:
+    count = len(small_octree().table)
+    done = due("clone_split.level_density.gate=true", f"max_primitives={count + 1}").adapt(1600)
+    assert (done["cloned"], done["split"]) == (1, 0)
 
 
 def test_the_cap_is_never_passed() -> None:
@@ -300,6 +324,29 @@ def test_levels_join_as_the_camera_comes_near() -> None:
         splats = backbone.splats(camera)
         assert torch.equal(splats.means, means[wanted])
         assert len(splats.scales) == len(splats.colours) == len(splats.log_opacities) == len(wanted)
+
+
+def test_bias_lets_a_gaussian_be_drawn_from_farther() -> None:
+    """At 3 units from D = 8 the level asked for is log2(8/3) = 1.4: finer ones join with a bias of a few tenths."""
+    backbone = small_octree()
+    backbone.begin(40000)
+    camera = seen_from(3.0)
+    means, of = backbone.table["means"].detach(), backbone.table["level"]
+    reach = (8 / (means - camera.centre.float()).norm(dim=1)).log2()
+    close = ((of == 2) & (reach < 1.5) & (reach > 1.0)).nonzero()[:, 0]
+    assert len(close) > 0
+    row = int(close[0])
+    assert row not in backbone.shown(camera).rows.tolist()  # type: ignore[union-attr]
+    backbone.table["bias"][row] = 0.6
+    assert row in backbone.shown(camera).rows.tolist()  # type: ignore[union-attr]
+
+
+def test_levels_that_wait_are_not_drawn() -> None:
+    backbone = small_octree()
+    backbone.begin(1)
+    shown = backbone.shown(seen_from(1.0))
+    assert shown.rows is not None
+    assert int(backbone.table["level"][shown.rows].max()) == levels_of(backbone).first < 2
 
 
 def test_gradients_count_for_the_rows_that_were_drawn() -> None:
@@ -390,8 +437,12 @@ def test_a_view_as_a_standard_file_draws_the_same_picture(mode: str) -> None:
 
 @pytest.mark.parametrize(("words", "complaint"), [
     (("densification=split",), "choose anchors or clone_split"),
-    (("levels=null",), "take backbone=gs3d for none"),
-    (("clone_split.level_density=null",), "belong together"),
+    (("levels=null",), "without levels: backbone=gs3d"),
+    (("clone_split=null",), "clone_split is null"),
+    (("clone_split.level_density.shrink=0",), "give 0 < shrink <= 1"),
+    (("clone_split.level_density.bias_step=-1",), "must be at least 0"),
+    (("clone_split.density.absolute=true",), "does not know"),
+    (("levels.coarse_until=40000",), "would never train"),
 ])  # fmt: skip
 def test_options_are_checked(words: tuple[str, ...], complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
@@ -399,21 +450,51 @@ def test_options_are_checked(words: tuple[str, ...], complaint: str) -> None:
 
 
 def test_shared_options_reach_the_second_form() -> None:
-    given = options_of("filter=mip", "max_primitives=77", "levels.count=5", "growth.update_ratio=0.5").clone_split
-    assert (given.filter, given.max_primitives) == ("mip", 77)
+    words = ("filter=mip", "max_primitives=77", "levels.count=5", "published_iterations=50000")
+    given = free_gaussians(options_of(*words))
+    assert (given.filter, given.max_primitives, given.published_iterations) == ("mip", 77, 50000)
     assert given.levels is not None
-    assert given.level_density is not None
-    assert (given.levels.count, given.level_density.update_ratio) == (5, 0.5)
+    assert given.levels.count == 5
+
+
+def test_overrides_of_a_saved_run_reach_the_second_form(tmp_path: Path) -> None:
+    settings = compose(list(WORDS), plugins())
+    write_config(tmp_path / "config.yaml", settings.resolved)
+    again = read_config(tmp_path / "config.yaml", plugins(), ["backbone.levels.mode=progressive"])
+    levels = free_gaussians(again.backbone.options).levels
+    assert levels is not None
+    assert levels.mode == "progressive"
+
+
+def test_runs_older_than_the_second_form_are_opened_in_the_first(tmp_path: Path) -> None:
+    resolved = dict(compose(["backbone=octree_gs3d"], plugins()).resolved)
+    backbone = {
+        key: value for key, value in resolved["backbone"].items() if key not in ("densification", "clone_split")
+    }
+    write_config(tmp_path / "config.yaml", resolved | {"backbone": backbone})
+    assert read_config(tmp_path / "config.yaml", plugins()).backbone.options.densification == "anchors"
+
+
+def test_the_anchors_form_is_free_of_the_second_forms_demands() -> None:
+    words = ["backbone=octree_gs3d", "backbone.levels=null"]
+    assert compose(words, plugins()).backbone.options.levels is None
+
+
+def test_the_filter_follows_the_gaussians_to_the_end() -> None:
+    backbone = small_octree("filter=mip")
+    assert backbone.filter_due(39800)
+    assert not backbone.filter_due(39900)
 
 
 RUN = (
     *WORDS,
-    "iterations=14",
+    "iterations=24",
     "training.checkpoint_every=50",
     "backbone.levels.count=3",
     "backbone.levels.base_layer=4",
     "backbone.clone_split.density.every=400",
     "backbone.clone_split.density.gradient=1e-6",
+    "backbone.clone_split.density.split_extent=0.5",
 )
 
 
@@ -421,15 +502,20 @@ def final_tensors(folder: Path) -> dict[str, Tensor]:
     return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
-def test_runs_grow_and_resume_bit_for_bit(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "whole", RUN)
+@pytest.mark.parametrize("more", [(), ("backbone.filter=mip",)], ids=["plain", "mip"])
+def test_runs_grow_and_resume_bit_for_bit(more: tuple[str, ...], tmp_path: Path) -> None:
+    """Stopped before the switch to the finest level, and before the growth."""
+    tiny_run(tmp_path / "whole", (*RUN, *more))
     lines = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
-    assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs growth"
-    tiny_run(tmp_path / "parts", RUN, stop_after=7)
-    run, settings = open_run(tmp_path / "parts", plugins(), ())
-    execute(run, settings, plugins())
-    whole, parts = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "parts")
-    assert whole.keys() == parts.keys()
-    assert {"columns.level", "columns.bias", "statistics.gradient"} <= whole.keys()
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    grown = [line["step"] for line in lines if line.get("cloned") and line.get("split")]
+    assert grown, "the test needs growth of both kinds"
+    whole = final_tensors(tmp_path / "whole")
+    for stop in (3, grown[0] - 1, grown[0]):
+        tiny_run(tmp_path / f"parts{stop}", (*RUN, *more), stop_after=stop)
+        run, settings = open_run(tmp_path / f"parts{stop}", plugins(), ())
+        execute(run, settings, plugins())
+        parts = final_tensors(tmp_path / f"parts{stop}")
+        assert whole.keys() == parts.keys()
+        assert {"columns.level", "columns.bias", "statistics.gradient"} <= whole.keys()
+        assert all(torch.equal(whole[name], parts[name]) for name in whole)
     assert len(read_ply(tmp_path / "whole" / "point_cloud.ply")["level"]) == len(whole["columns.level"])

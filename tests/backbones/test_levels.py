@@ -15,6 +15,7 @@ from gsx.backbones.levels import (
     MODES,
     LevelOptions,
     Levels,
+    all_levels_from,
     box_of,
     checked_end,
     derive,
@@ -33,6 +34,7 @@ from gsx.backbones.levels import (
     whole_level,
 )
 from gsx.core.camera import Camera, look_at
+from gsx.core.schedule import Schedule
 
 PUBLISHED = LevelOptions(
     fork=2,
@@ -530,6 +532,14 @@ def test_options_are_checked(name, value):
 
 def test_levels_that_would_never_train_are_refused():
     checked_end(None, 30000)
-    checked_end(replace(PUBLISHED, coarse_until=30000), 30000)
-    with pytest.raises(ValueError, match="coarse_until is 30001, beyond the 30000 steps"):
-        checked_end(replace(PUBLISHED, coarse_until=30001), 30000)
+    checked_end(replace(PUBLISHED, coarse_until=29999), 30000)
+    with pytest.raises(ValueError, match=r"coarse_until is 30000, and the published run .* ends at 30000"):
+        checked_end(replace(PUBLISHED, coarse_until=30000), 30000)
+
+
+@pytest.mark.parametrize(("until", "iterations", "step"), [
+    (10000, 30000, 10000), (29999, 100, 99), (10000, 1, 0), (0, 100, 0), (15000, 100, 50),
+])  # fmt: skip
+def test_all_levels_take_part_before_the_end(until, iterations, step):
+    schedule = Schedule(iterations=iterations, published_iterations=30000, views=3)
+    assert all_levels_from(replace(PUBLISHED, coarse_until=until), schedule) == step

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_scene_sr import request
+from regenerating import request
 from torch import Tensor
 
 from gsx.core.regenerator import box_average, colour_matched, complaint, displacement

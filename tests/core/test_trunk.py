@@ -9,6 +9,8 @@ from safetensors.torch import load_file
 from tiny import tiny_run
 from torch import Tensor
 
+from gsx.cli import plugins
+from gsx.core.session import execute, open_run
 from gsx.core.trunk import trunk_folder
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
@@ -53,7 +55,7 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
     """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
     run = tiny_run(tmp_path / "upscale", (*RUN, "augmenter=upscale", "init=trunk"))
-    assert sorted(path.stem for path in trunk_folder(run).glob("step_*.json")) == [
+    assert sorted(path.stem for path in trunk_folder(run, plugins().versions).glob("step_*.json")) == [
         f"step_{step:07d}" for step in (10, 15, 20, 22)
     ]
     tiny_run(tmp_path / "both", (*RUN, "augmenter=[upscale,bootstrap]", "init=trunk"))
@@ -77,3 +79,33 @@ def test_how_a_run_is_watched_makes_no_other_trunk(tmp_path: Path, caplog: pytes
     tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
     tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=trunk"), stop_after=14)
     assert "branching at step 10" in caplog.text
+
+
+def test_resumed_runs_leave_nothing_behind(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Their first steps may have followed another schedule."""
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=5)
+    run, settings = open_run(tmp_path / "first", plugins(), ["iterations=44"])
+    execute(run, settings, plugins())
+    caplog.clear()
+    tiny_run(tmp_path / "second", (*RUN, "iterations=44", "init=trunk"), stop_after=1)
+    assert "no earlier run" in caplog.text
+
+
+def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    run = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=16)
+    (trunk_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
+    tiny_run(tmp_path / "second", (*RUN, "init=trunk"), stop_after=17)
+    assert "truncated or altered" in caplog.text
+    assert "branching at step 10" in caplog.text
+
+
+def test_a_cache_that_cannot_be_written_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "blocked").write_text("a file where a folder should be")
+    tiny_run(tmp_path / "demo", (*RUN,), stop_after=1)  # pictures of the scene are kept
+    monkeypatch.setattr("gsx.core.trunk.cache_folder", lambda kind, key: tmp_path / "blocked" / key)
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    assert "the state of step 10 is not kept" in caplog.text

@@ -1,21 +1,22 @@
 """A restorer learnt on half of the views each, measured on views it has not seen."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from test_scene_sr import EDGE, Photo, camera, request, stripes
+from regenerating import Photo, camera, request, stripes
 from torch import Tensor
 
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import to_uint8
 from gsx.core.regenerator import Material, Regenerator
 from gsx.core.scene import View
-from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer, mean_error
+from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer
 
 
 def options(**changes: float) -> RestorerOptions:
-    values = {"channels": 8, "steps": 120, "batch": 4, "crop": 32, "rate": 3e-3, "strongest": 0.06}
+    values = {"channels": 8, "steps": 120, "batch": 4, "crop": 32, "rate": 3e-3}
     return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
 
 
@@ -42,9 +43,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneRestorer, dic
 
 
 def restored(restorer: SceneRestorer, image: Tensor, number: int = 0, strength: float = 0.06) -> Tensor:
-    from dataclasses import replace
-
-    asked = replace(request(image, 1), number=number, strength=strength)
+    asked = replace(request(image, 1), number=number, strength=strength, strongest=0.06)
     return restorer.regenerate([asked])[0]
 
 
@@ -53,10 +52,10 @@ def test_it_brings_unseen_views_closer_to_their_photographs(learnt: tuple[SceneR
     assert isinstance(restorer, Regenerator)
     assert restorer.useful == [True, True]
     for fold in (0, 1):
-        assert figures[f"error_after_{fold}"] < 0.7 * figures[f"error_before_{fold}"]
+        assert figures[f"error_restored_{fold}"] < 0.8 * figures[f"error_of_renders_{fold}"]
     truth = stripes(50).float() / 255
     before, after = blurred(truth), restored(restorer, blurred(truth))
-    assert float((after - truth).square().mean()) < 0.7 * float((before - truth).square().mean())
+    assert float((after - truth).square().mean()) < 0.8 * float((before - truth).square().mean())
 
 
 def test_views_are_restored_by_the_network_that_has_not_seen_them(
@@ -84,21 +83,33 @@ def test_one_that_helps_nobody_changes_nothing(tmp_path: Path, caplog: pytest.Lo
     """Renders that are the photographs already: whatever is learnt can only do harm."""
     restorer = SceneRestorer(options(steps=3))
     figures = restorer.prepare(material(tmp_path, spoil=lambda image: image))
-    assert figures["error_before_0"] == 0
+    assert figures["error_of_renders_0"] == 0
     assert "changes nothing" in caplog.text
     image = stripes(3).float() / 255
     assert torch.equal(restored(restorer, image), image)
 
 
-def test_what_was_learnt_stays_with_the_run(tmp_path: Path) -> None:
-    """A resumed run goes on from the networks it had, not from new ones."""
-    first, resumed, fresh = (SceneRestorer(options(steps=steps)) for steps in (20, 1, 1))
-    first.prepare(material(tmp_path / "run"))
-    given = material(tmp_path / "run")
-    resumed.prepare(given)
-    fresh.prepare(material(tmp_path / "other"))
-    pairs = [(given.render(view.camera), view.image()) for view in given.views]
-    assert mean_error(resumed.networks[0], pairs) < mean_error(fresh.networks[0], pairs)
+def at_step(given: Material, step: int) -> Material:
+    return replace(given, step=step)
+
+
+def test_a_resumed_run_learns_on_from_the_event_before(tmp_path: Path) -> None:
+    """Also when it is resumed at the event itself, whose file is there already."""
+    whole, given = SceneRestorer(options(steps=10)), material(tmp_path / "run")
+    for step in (40, 42, 44):
+        whole.prepare(at_step(given, step))
+    resumed = SceneRestorer(options(steps=10))
+    resumed.prepare(at_step(given, 44))
+    for a, b in zip(whole.networks, resumed.networks, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+    assert resumed.useful == whole.useful
+    assert resumed.prepare(at_step(given, 44)) == {}
+
+
+def test_networks_of_another_size_are_refused(tmp_path: Path) -> None:
+    SceneRestorer(options(steps=1)).prepare(at_step(material(tmp_path), 40))
+    with pytest.raises(InputError, match="networks of another size"):
+        SceneRestorer(options(steps=1, channels=4)).prepare(at_step(material(tmp_path), 42))
 
 
 def test_it_begins_by_changing_nothing_and_never_changes_much() -> None:
@@ -112,9 +123,9 @@ def test_it_begins_by_changing_nothing_and_never_changes_much() -> None:
 
 def test_it_needs_views_for_both_halves(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 4 training views, there are 3"):
-        SceneRestorer(options()).prepare(material(tmp_path, count=3))
-    with pytest.raises(InputError, match="cannot enlarge x2"):
-        SceneRestorer(options()).regenerate([request(torch.zeros(3, EDGE, EDGE))])
+        SceneRestorer(options()).check(material(tmp_path, count=3).views, [1], True)
+    with pytest.raises(ConfigError, match="cannot enlarge x2"):
+        SceneRestorer(options()).check(material(tmp_path).views, [2], True)
 
 
 def test_classical_ones() -> None:

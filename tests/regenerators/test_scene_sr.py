@@ -4,42 +4,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from regenerating import EDGE, Photo, camera, request, stripes
 from torch import Tensor
 
-from gsx.core.camera import look_at
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError
 from gsx.core.images import resize, to_uint8
-from gsx.core.regenerator import Material, Regenerator, Request, box_average, complaint
+from gsx.core.regenerator import Material, Regenerator, box_average, complaint
 from gsx.core.scene import View
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at
 
-EDGE = 48
-
-
-def stripes(seed: int, edge: int = EDGE) -> Tensor:
-    """Crisp bars of two colours in some direction, as 8-bit RGB: an enlargement by a filter blurs their edges."""
-    generator = torch.Generator().manual_seed(seed)
-    angle, phase = (float(value) for value in torch.rand(2, generator=generator) * 3.14159)
-    row, column = torch.meshgrid(torch.arange(edge * 4.0), torch.arange(edge * 4.0), indexing="ij")
-    wave = torch.sin((column * torch.cos(torch.tensor(angle)) + row * torch.sin(torch.tensor(angle))) / 11 + phase)
-    colours = torch.rand(2, 3, 1, 1, generator=generator) * 0.5 + torch.tensor([0.0, 0.5]).view(2, 1, 1, 1)
-    picture = torch.where(wave > 0, colours[0], colours[1])
-    return to_uint8(box_average(picture, 4))
-
-
-class Photo:
-    def __init__(self, image: Tensor) -> None:
-        self.stored = image
-
-    def image(self, camera: object) -> Tensor:
-        return self.stored
-
-    def max_zoom(self, camera: object) -> float:
-        return 1.0
-
-
-def camera(edge: int = EDGE):
-    return look_at([0.0, -4.0, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=edge, height=edge)
+CPU = torch.device("cpu")
 
 
 def material(folder: Path, count: int = 6) -> Material:
@@ -58,7 +32,7 @@ def options(**changes: float) -> SceneSROptions:
     values = {
         "channels": 16,
         "layers": 3,
-        "steps": 200,
+        "steps": 800,
         "batch": 8,
         "crop": 16,
         "rate": 2e-3,
@@ -66,14 +40,6 @@ def options(**changes: float) -> SceneSROptions:
         "seconds": 0,
     }
     return SceneSROptions(name="scene_sr", **(values | changes))  # type: ignore[arg-type]
-
-
-def request(image: Tensor, scale: int = 2) -> Request:
-    seen = camera(image.shape[2])
-    return Request(
-        image=image, scale=scale, camera=seen, view=View("a", seen, Photo(to_uint8(image))), number=0, photo=True,
-        seed=22, strength=0.0, prompt="", step=1,
-    )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +52,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> SceneSR:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GSX_CACHE", str(tmp_path_factory.mktemp("cache")))
         regenerator = SceneSR(options())
-        regenerator.prepare(material(tmp_path_factory.mktemp("run")))
+        regenerator.prepare(material(tmp_path_factory.mktemp("run"), 12))
     return regenerator
 
 
@@ -136,7 +102,7 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
     first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
     first.prepare(material(tmp_path))
     photos = [view.image() for view in material(tmp_path).views]
-    kept_at(options(steps=5), photos, 0).write_bytes(b"no network")
+    kept_at(options(steps=5), photos, 0, CPU).write_bytes(b"no network")
     assert "loss" in again.prepare(material(tmp_path))
     assert "learnt again" in caplog.text
     given = request(stripes(3, 12).float() / 255)
@@ -145,16 +111,16 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
 
 def test_other_photographs_are_another_scene(tmp_path: Path) -> None:
     photos = [view.image() for view in material(tmp_path).views]
-    assert kept_at(options(), photos, 0) != kept_at(options(), photos[:-1], 0)
-    assert kept_at(options(), photos, 0) != kept_at(options(steps=7), photos, 0)
-    assert kept_at(options(), photos, 0) != kept_at(options(), photos, 1)
+    assert kept_at(options(), photos, 0, CPU) != kept_at(options(), photos[:-1], 0, CPU)
+    assert kept_at(options(), photos, 0, CPU) != kept_at(options(steps=7), photos, 0, CPU)
+    assert kept_at(options(), photos, 0, CPU) != kept_at(options(), photos, 1, CPU)
 
 
 def test_the_time_is_limited_and_its_result_not_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     hurried = options(steps=100_000, seconds=0.2)
     SceneSR(hurried).prepare(material(tmp_path))
     assert "regenerator.upscale.seconds" in caplog.text
-    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], 0).exists()
+    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], 0, CPU).exists()
 
 
 def test_crops_are_of_every_orientation_and_place() -> None:
@@ -165,8 +131,9 @@ def test_crops_are_of_every_orientation_and_place() -> None:
 
 
 def test_only_powers_of_two(learnt: SceneSR) -> None:
-    with pytest.raises(InputError, match="x2, x4, x8, not x3"):
-        learnt.regenerate([request(stripes(3, 12).float() / 255, 3)])
+    learnt.check([], [1, 2, 4, 8], True)
+    with pytest.raises(ConfigError, match="x2, x4, x8, not x3"):
+        learnt.check([], [2, 3], True)
 
 
 @pytest.mark.parametrize("change", [{"steps": 0}, {"crop": 4}, {"rate": 0}, {"seconds": -1}])

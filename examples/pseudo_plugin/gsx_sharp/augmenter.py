@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsx.core.images import to_uint8
+from gsx.core.material import material_of
 from gsx.core.pseudo import PseudoView, Setting, Term
 from gsx.core.regenerator import Request
 from gsx.core.run import Run
@@ -31,6 +32,8 @@ class SteadyZoom:
     def term(self, run: Run, step: int, view: int) -> Term | None:
         if step <= self.begins():
             return None
+        if not self.views:
+            self.setting.regenerator("upscale").prepare(material_of(run, self.setting.seed))
         if view not in self.views:
             self.views[view] = self.zoomed(view)
         parts = [(self.views[view], self.options.weight)]
@@ -42,7 +45,7 @@ class SteadyZoom:
         camera = view.camera.narrow(0.5)
         request = Request(
             image=view.source.image(camera).float() / 255, scale=2, camera=camera, view=view, number=number,
-            photo=True, seed=self.setting.seed, strength=0.0, prompt="", step=0,
+            photo=True, seed=self.setting.seed, strength=0.0, strongest=0.0, prompt="", step=0,
         )  # fmt: skip
         (picture,) = self.setting.regenerator("upscale").regenerate([request])
         return PseudoView(camera=camera.zoom(2), target=to_uint8(picture), parent=number)

@@ -65,8 +65,10 @@ def grid_window(width: int, height: int, size: tuple[int, int], turn: int) -> Wi
 
 def worst_window(error: Float[Tensor, "H W"], size: tuple[int, int]) -> Window:
     """Where the mean error is largest."""
-    means = torch.nn.functional.avg_pool2d(error[None, None], (size[1], size[0]), stride=1)[0, 0]
-    top, left = divmod(int(means.argmax()), means.shape[1])
+    sums = torch.nn.functional.pad(error.double(), (1, 0, 1, 0)).cumsum(0).cumsum(1)
+    width, height = size
+    windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = divmod(int(windows.argmax()), windows.shape[1])
     return Window(left=left, top=top, width=size[0], height=size[1])
 
 

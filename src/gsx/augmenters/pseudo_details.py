@@ -31,22 +31,22 @@ from gsx.augmenters.consistency import exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.augmenters.trust import agreeing, in_bytes, sampled_better
 from gsx.core.camera import Camera
-from gsx.core.errors import InputError, TrainingError
-from gsx.core.evaluate import render_tiled
+from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import to_uint8, write_image
+from gsx.core.material import material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.regenerator import Material, Request, colour_matched, complaint
+from gsx.core.regenerator import Checked, Request, colour_matched, complaint
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
 from gsx.core.shapes import Float, UInt8
 
 logger = logging.getLogger(__name__)
 
-TILE_PIXELS = 1 << 20
-"""Pictures are rendered in pieces of this many pixels."""
 BATCH = 64
 """Pictures redrawn between two lines of progress."""
+LEAST_WINDOW = 4
+"""Narrowest window that shows anything, px."""
 MOST_DROPPED = 0.5
 """An event that loses more than this share of its pictures is an error (spec 6.4)."""
 SHOWN = 3
@@ -168,8 +168,8 @@ class PseudoOptions:
                 raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
         if self.variants < 0 or self.first_cameras < 0 or self.samples < 1 or self.context < 0:
             raise ValueError(f"{where}: variants, first_cameras and context must be at least 0, samples at least 1")
-        if self.gate < 0 or self.coarse_weight < 0:
-            raise ValueError(f"{where}: gate and coarse_weight must be at least 0")
+        if min(self.gate, self.coarse_weight, self.gain, self.direct_weight) < 0:
+            raise ValueError(f"{where}: gate, coarse_weight, gain and direct_weight must be at least 0")
         if not self.base and self.variants == 0:
             raise ValueError(f"{where}.base is false and variants is 0: there would be no pseudo view")
 
@@ -198,14 +198,36 @@ class PseudoDetails:
 
     def __init__(self, options: PseudoOptions, setting: Setting) -> None:
         self.options, self.setting = options, setting
-        schedule = Schedule(
+        self.schedule = Schedule(
             iterations=setting.iterations,
             published_iterations=options.timing.published_iterations,
             views=len(setting.scene.train),
         )
-        self.events, self.span = events_of(options.timing, schedule), span_of(options.timing, schedule)
+        self.events, self.span = events_of(options.timing, self.schedule), span_of(options.timing, self.schedule)
+        self.refuse_impossible()
         self.event = 0
         self.views: dict[int, list[PseudoView]] = {}
+
+    def refuse_impossible(self) -> None:
+        """Now, not when half of the run is over.
+
+        Raises:
+            ConfigError, InputError: windows would be too small, or the regenerator cannot do what it will be asked for.
+        """
+        options, name = self.options, self.setting.name
+        for view in self.setting.scene.train:
+            for scale in options.scales:
+                width, height = size = window_size(*view.camera.size, options.narrow, scale)
+                if min(size) < LEAST_WINDOW:
+                    raise ConfigError(
+                        f"augmenter.{name}: at scale {scale} and narrow {options.narrow:g} windows of '{view.name}' "
+                        f"are {width} x {height} px; {LEAST_WINDOW} px are the least: lower scales or raise narrow"
+                    )
+        regenerator = self.setting.regenerator(options.role)
+        if isinstance(regenerator, Checked):
+            regenerator.check(self.setting.scene.train, options.scales, options.variants > 0)
+        if not self.events:
+            logger.warning("augmenter %s has no event in a run of %d steps", name, self.setting.iterations)
 
     # -- what the trainer asks -------------------------------------------------------------------------------------
 
@@ -215,7 +237,8 @@ class PseudoDetails:
 
     def plan(self) -> dict[str, Any]:
         """Events and windows in steps of this run."""
-        return {"events": self.events, "span": self.span}
+        share = 0.0 if self.options.mode == "direct" else max(self.options.weights)
+        return {"events": self.events, "span": self.span, "share": share}
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
         """The pseudo views of the training view picked at this step, with their weights (spec 1.3)."""
@@ -225,11 +248,12 @@ class PseudoDetails:
             return None
         if event != self.event:
             self.views, self.event = by_parent(self.of_event(run, event)), event
-        found = self.views.get(view, [])
-        return self.weighted(run, found, progress(step, event, self.events, self.span, self.options.weight_split))
+        split = self.options.weight_split
+        inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
+        return self.weighted(run, self.views.get(view, []), place, inside)
 
-    def weighted(self, run: Run, views: Sequence[PseudoView], place: float) -> Term | None:
-        """The term of these views; None for none."""
+    def weighted(self, run: Run, views: Sequence[PseudoView], place: float, inside: float) -> Term | None:
+        """The term of these views, so far along the weights and inside the window; None for none."""
         options = self.options
         if not views:
             return None
@@ -237,7 +261,7 @@ class PseudoDetails:
         direct = options.mode == "direct" or (options.mode == "auto" and not list(run.backbone.shared()))
         each = options.gain * (options.direct_weight if direct else share)
         count = len(views) if options.reduce == "all" else len({view.provenance["scale"] for view in views})
-        frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and place < 0.5)
+        frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and inside < 0.5)
         whole = run.scene.train[views[0].parent].camera
         return Term(
             name=self.setting.name,
@@ -255,25 +279,48 @@ class PseudoDetails:
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
-        path = run.folder / "pseudo" / f"{self.setting.name}.safetensors"
         if run.step == event:
             views, facts = self.made(run, event)
+            path = self.path(run, event)
             path.parent.mkdir(parents=True, exist_ok=True)
             save_views(path, views, facts)
+            self.forget(run, event)
             return views
+        return self.recalled(run, event)
+
+    def path(self, run: Run, event: int) -> Path:
+        """Where the pseudo views of an event are kept while a checkpoint may need them."""
+        return run.folder / "pseudo" / f"{self.setting.name}_{event:07d}.safetensors"
+
+    def forget(self, run: Run, event: int) -> None:
+        """Remove the files of events in whose windows no checkpoint lies, but for that of the current one."""
+        steps = [int(path.stem.removeprefix("step_")) for path in (run.folder / "checkpoints").glob("step_*.json")]
+        needed = {event} | {event_at(step + 1, self.events, self.span) for step in steps}
+        kept = {self.path(run, number) for number in needed if number is not None}
+        for path in (run.folder / "pseudo").glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"):
+            if path not in kept:
+                path.unlink()
+
+    def recalled(self, run: Run, event: int) -> list[PseudoView]:
+        """The pseudo views that the run had made before it was interrupted.
+
+        None where it was made longer since, so that its events lie elsewhere: the next one goes on.
+
+        Raises:
+            InputError: the file is gone or damaged.
+        """
+        path = self.path(run, event)
+        others = sorted(path.parent.glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"))
+        if not path.is_file() and others and load_views(others[-1])[1]["iterations"] != self.setting.iterations:
+            logger.info("%s rests until its next event: the run has become longer", self.setting.name)
+            return []
         try:
-            views, facts = load_views(path)
+            return load_views(path)[0]
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "
                 f"cannot go on at step {run.step}; restore the file, or train anew"
             ) from error
-        if facts["event"] != event:
-            raise InputError(
-                f"{path} holds the pseudo views of step {facts['event']}, and the run goes on at step {run.step} with "
-                f"those of step {event}: restore the file, or train anew"
-            )
-        return views
 
     def made(self, run: Run, event: int) -> tuple[list[PseudoView], dict[str, Any]]:
         """(pseudo views, facts) of an event, from the model as it is now.
@@ -282,7 +329,7 @@ class PseudoDetails:
             TrainingError: more than half of the pictures could not be used.
         """
         regenerator = self.setting.regenerator(self.options.role)
-        learnt = regenerator.prepare(self.material(run))
+        learnt = regenerator.prepare(material_of(run, self.setting.seed))
         sketches = list(self.sketches(run, event))
         views: list[PseudoView] = []
         dropped: list[str] = []
@@ -299,24 +346,19 @@ class PseudoDetails:
                 f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
                 f"{dropped[0]}; choose another regenerator/{self.options.role}"
             )
-        facts = {"event": event, "made": len(views), "dropped": len(dropped), "learnt": learnt}
+        facts = {
+            "event": event,
+            "iterations": self.setting.iterations,
+            "made": len(views),
+            "dropped": len(dropped),
+            "learnt": learnt,
+        }
         trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
         if trusted:
             masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
             facts["masked"] = masked
             logger.info("%s: %.1f%% of the pixels do not count", self.setting.name, 100 * masked)
         return views, facts
-
-    def material(self, run: Run) -> Material:
-        """What the regenerator may learn from."""
-        return Material(
-            views=run.scene.train,
-            render=lambda camera: rendered(run, camera),
-            step=run.step,
-            seed=self.setting.seed,
-            device=run.device,
-            folder=run.folder / "regenerators",
-        )
 
     def sketches(self, run: Run, event: int) -> Iterator[Sketch]:
         """Cameras of an event, in the order of the training views, base before random."""
@@ -432,7 +474,8 @@ class PseudoDetails:
             number=sketch.parent,
             photo=sketch.outer is not None,
             seed=sketch.seed,
-            strength=ramp(self.options.strength, event, self.events),
+            strength=ramp(self.options.strength, event, self.options.timing, self.schedule),
+            strongest=self.options.strength[0],
             prompt=self.options.prompt,
             step=event,
         )
@@ -526,10 +569,3 @@ def area_share(view: PseudoView, whole: Camera) -> float:
 def number_of(*parts: object) -> int:
     """A seed that depends on all parts, the same on every machine."""
     return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:7], "big")
-
-
-@torch.no_grad()
-def rendered(run: Run, camera: Camera) -> Float[Tensor, "3 h w"]:
-    """The model as it is now."""
-    run.backbone.begin(max(1, run.step))
-    return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, TILE_PIXELS).image

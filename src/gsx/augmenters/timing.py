@@ -63,7 +63,8 @@ def stepped(values: list[float], place: float, split: str) -> float:
     return first if place < 0.5 else last
 
 
-def ramp(values: list[float], event: int, events: list[int]) -> float:
-    """A value that goes linearly from its first at the first event to its last at the last one."""
+def ramp(values: list[float], event: int, timing: Timing, schedule: Schedule) -> float:
+    """A value that goes linearly from its first at `start` to its last at `stop` (spec 1.2)."""
     first, last = values
-    return first + (last - first) * (event - events[0]) / max(1, events[-1] - events[0])
+    start, stop = schedule.step(timing.start), schedule.step(timing.stop)
+    return first + (last - first) * min(1.0, max(0, event - start) / max(1, stop - start))

@@ -34,6 +34,7 @@ from gsx.backbones.heads import HeadOptions, Heads
 from gsx.backbones.levels import (
     LevelOptions,
     Levels,
+    all_levels_from,
     checked_end,
     derive,
     drawn,
@@ -262,7 +263,7 @@ class Anchors:
             self.voxel = self.options.voxel or automatic_voxel(points, self.quirks.voxel == "squared")
             positions, owner = voxel_nodes(points, self.voxel)
             return positions, {}, owner, torch.arange(len(points))
-        until = self.schedule.step(self.options.levels.coarse_until)
+        until = all_levels_from(self.options.levels, self.schedule)
         self.levels = derive(points, self.cameras, self.options.levels, until)
         positions, of, group = initial_nodes(points, self.levels)
         for warning in warnings_of(self.levels, len(of)):

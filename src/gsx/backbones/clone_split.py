@@ -35,6 +35,14 @@ class LevelDensityOptions:
     volume_weight: float
     """Of the mean volume of the Gaussians drawn, in the loss."""
 
+    def __post_init__(self) -> None:
+        if not 0 < self.shrink <= 1:
+            raise ValueError(f"backbone.clone_split.level_density.shrink is {self.shrink}; give 0 < shrink <= 1")
+        if min(self.bias_gradient, self.bias_step, self.volume_weight) < 0:
+            raise ValueError(
+                "backbone.clone_split.level_density: bias_gradient, bias_step and volume_weight must be at least 0"
+            )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Verdict:
@@ -59,10 +67,10 @@ def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dic
 
 def relative_sizes(scales: Float[Tensor, "N 3"], of: Int[Tensor, "N"], count: int) -> Float[Tensor, "K"]:
     """Mean scale of each level over that of level 0 (spec 4B); 1 where one of them is empty: nothing to compare."""
-    sums = torch.zeros(count, device=scales.device).index_add_(0, of.long(), scales.mean(1))
-    means = sums / of.long().bincount(minlength=count).clamp_min(1)
+    sizes = scales.double().mean(1)  # a mean for each level by itself: sums by index have no fixed order on a GPU
+    means = torch.stack([sizes[of == level].sum() / (of == level).sum().clamp_min(1) for level in range(count)])
     known = (means > 0) & (means[0] > 0)
-    return torch.where(known, means / means[0].clamp_min(torch.finfo(means.dtype).tiny), 1.0)
+    return torch.where(known, means / means[0].clamp_min(torch.finfo(means.dtype).tiny), 1.0).to(scales)
 
 
 def judged(
@@ -74,41 +82,51 @@ def judged(
     *,
     threshold: float,
     large: float,
+    splitting: bool,
 ) -> Verdict:
     """Who is cloned, split and drawn from farther: each by the threshold and the size of its own level (spec 4B).
 
-    `threshold` and `large` (a scale, world units) are those of level 0. Ours: never a Gaussian without any gradient.
+    `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` nothing happens to large
+    ones. Ours: never a Gaussian without any gradient.
     """
     taus = torch.tensor(thresholds(threshold, levels.fork, options.update_ratio, levels.count)).to(gradient)
     tau = taus[of.long()]
-    split = scales.amax(1) > large * relative_sizes(scales, of, levels.count)[of.long()]
-    chosen = (gradient >= tau) & (gradient > 0)
-    return Verdict(cloned=chosen & ~split, split=chosen & split, biased=gradient >= options.bias_gradient * tau)
+    big = scales.amax(1) > large * relative_sizes(scales, of, levels.count)[of.long()]
+    chosen = (gradient >= tau) & (gradient > 0) & (~big | splitting)
+    biased = (gradient >= options.bias_gradient * tau) & (gradient > 0) & (~big | splitting)
+    return Verdict(cloned=chosen & ~big, split=chosen & big, biased=biased)
 
 
-def clones(raw: dict[str, Tensor], cloned: Bool[Tensor, "N"], levels: Levels) -> dict[str, Tensor]:
-    """Copies on the same level, without bias, of those that enough cameras would draw."""
-    return weeded({name: value[cloned] for name, value in raw.items()}, levels)
+def clones(raw: dict[str, Tensor], rows: Int[Tensor, "M"]) -> dict[str, Tensor]:
+    """Copies on the same level, without bias."""
+    return without_bias({name: value[rows] for name, value in raw.items()})
 
 
 def small_children(
-    raw: dict[str, Tensor], split: Bool[Tensor, "N"], levels: Levels, shrink: float, generator: torch.Generator
+    raw: dict[str, Tensor], rows: Int[Tensor, "M"], levels: Levels, shrink: float, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """One child each, drawn from its parent's Gaussian, smaller and a level finer."""
-    rows = {name: value[split] for name, value in raw.items()}
+    """One child each, drawn from its parent's Gaussian, smaller and a level finer, without bias."""
+    parents = {name: value[rows] for name, value in raw.items()}
     changed = {
-        "means": sampled_means(rows, generator),
-        "log_scales": rows["log_scales"] + math.log(shrink),
-        "level": (rows["level"] + 1).clamp_max(levels.count - 1),
+        "means": sampled_means(parents, generator),
+        "log_scales": parents["log_scales"] + math.log(shrink),
+        "level": (parents["level"] + 1).clamp_max(levels.count - 1),
     }
-    return weeded(rows | changed, levels)
+    return without_bias(parents | changed)
 
 
-def weeded(rows: dict[str, Tensor], levels: Levels) -> dict[str, Tensor]:
-    """New Gaussians that enough cameras would draw (spec 3.4), with a bias of 0."""
-    keep = kept(levels, rows["means"], rows["level"])
-    rows = {name: value[keep] for name, value in rows.items()}
+def without_bias(rows: dict[str, Tensor]) -> dict[str, Tensor]:
+    """New Gaussians are drawn from no farther than their level."""
     return rows | {"bias": torch.zeros_like(rows["bias"])}
+
+
+def chosen_places(new: dict[str, Tensor], gradient: Float[Tensor, "M"], levels: Levels, room: int) -> Bool[Tensor, "M"]:
+    """Of new Gaussians those that enough cameras would draw (spec 3.4), at most `room`: of the largest gradients."""
+    seen = kept(levels, new["means"], new["level"])
+    if int(seen.sum()) <= room:
+        return seen
+    ranked = torch.where(seen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
+    return torch.zeros_like(seen).index_fill_(0, ranked, True)
 
 
 def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ from torch.nn.functional import logsigmoid, normalize
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
     bias_levels,
+    chosen_places,
     clones,
     judged,
     small_children,
@@ -23,6 +24,7 @@ from gsx.backbones.clone_split import (
 from gsx.backbones.levels import (
     LevelOptions,
     Levels,
+    all_levels_from,
     checked_end,
     derive,
     drawn,
@@ -207,7 +209,8 @@ class GS3D:
         options = self.options.levels
         if options is None:
             return None
-        return derive(points.positions.float(), self.cameras, options, self.schedule.step(options.coarse_until))
+        until = all_levels_from(options, self.schedule)
+        return derive(points.positions.float(), self.cameras, options, until)
 
     def initial_table(self, points: PointCloud, device: torch.device) -> Table:
         """One Gaussian per point, or per node of the levels."""
@@ -381,20 +384,18 @@ class GS3D:
             control,
             threshold=density.gradient,
             large=density.split_extent * self.extent,
+            splitting=not control.gate or self.highest() == levels.count - 1,
         )
-        chosen = self.within_cap(gradient, verdict.cloned | verdict.split)
-        ready = not control.gate or self.highest() == levels.count - 1
-        split = verdict.split & chosen & ready
-        added = [
-            clones(raw, verdict.cloned & chosen, levels),
-            small_children(raw, split, levels, control.shrink, self.generator),
-        ]
+        cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
+        children_made = small_children(raw, split, levels, control.shrink, self.generator)
+        new = stacked([clones(raw, cloned), children_made])
+        room = max(0, self.options.max_primitives - len(self.table))
+        keep = chosen_places(new, gradient[torch.cat([cloned, split])], levels, room)
         bias_levels(self.table, verdict.biased, control.bias_step)
-        append_rows(self.table, stacked(added))
+        append_rows(self.table, {name: value[keep] for name, value in new.items()})
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
-        cloned, children_made = (len(part["means"]) for part in added)
-        return {"cloned": cloned, "split": children_made, "pruned": pruned}
+        return {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum()), "pruned": pruned}
 
     def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (spec 10.5).

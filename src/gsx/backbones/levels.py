@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsx.backbones.cells import new_cells
 from gsx.core.camera import Camera
+from gsx.core.schedule import Schedule
 from gsx.core.shapes import Bool, Float, Int
 
 MODES = ("round", "floor", "ceil", "progressive")
@@ -87,11 +88,16 @@ class LevelOptions:
 
 def checked_end(options: LevelOptions | None, published: int) -> None:
     """Refuse a schedule that ends with levels that never took part in training."""
-    if options is not None and options.coarse_until > published:
+    if options is not None and options.coarse_until >= published:
         raise ValueError(
-            f"backbone.levels.coarse_until is {options.coarse_until}, beyond the {published} steps of the published "
-            "run (backbone.published_iterations): the finest levels would never train; give a step of that run"
+            f"backbone.levels.coarse_until is {options.coarse_until}, and the published run "
+            f"(backbone.published_iterations) ends at {published}: the finest level would never train; give less"
         )
+
+
+def all_levels_from(options: LevelOptions, schedule: Schedule) -> int:
+    """Step of this run at which all levels take part: before its last one, however short it is; 0: from the start."""
+    return min(schedule.step(options.coarse_until), schedule.iterations - 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

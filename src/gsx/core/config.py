@@ -135,11 +135,14 @@ def check_groups(overrides: Sequence[str]) -> None:
     from hydra.core.global_hydra import GlobalHydra
 
     loader = GlobalHydra.instance().config_loader()
-    groups = [group for group in loader.list_groups("") if not group.startswith("hydra")]
+    groups = known_groups()
     for override in parse_overrides(overrides):
         if override.key_or_group not in groups or override.is_sweep_override():
             continue
         options = loader.get_group_options(override.key_or_group)
+        if not options:
+            inner = ", ".join(group for group in groups if group.startswith(f"{override.key_or_group}/"))
+            raise ConfigError(f"{override.key_or_group} is chosen by role: {inner}")
         value = override.value()
         for name in value if isinstance(value, list) else [value]:
             if str(name) not in options:
@@ -147,6 +150,15 @@ def check_groups(overrides: Sequence[str]) -> None:
                     f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
                     f"choose from {', '.join(options)}.{nearest(str(name), options)}"
                 )
+
+
+def known_groups() -> list[str]:
+    """Configuration groups, nested ones included: `regenerator/upscale`."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    outer = [group for group in loader.list_groups("") if not group.startswith("hydra")]
+    return outer + [f"{group}/{inner}" for group in outer for inner in loader.list_groups(group)]
 
 
 def explain(error: Exception, overrides: Sequence[str]) -> str:
@@ -169,9 +181,7 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
 
 def is_group(key: str) -> bool:
     """Whether a key names a configuration group."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    return key in GlobalHydra.instance().config_loader().list_groups("")
+    return key in known_groups()
 
 
 def dotted(node: Any, prefix: str = "") -> Iterator[str]:
@@ -238,7 +248,8 @@ def chosen(kind: str, node: Any, plugins: Plugins, inner: str = "") -> Chosen:
 def typed(schema: type, values: Any, path: str) -> Any:
     """An instance of a dataclass from plain values; see `settings_from` for errors."""
     try:
-        merged = OmegaConf.merge(writable(OmegaConf.structured(schema)), OmegaConf.create(values or {}))
+        given = values if isinstance(values, dict) else {}
+        merged = OmegaConf.merge(writable(OmegaConf.structured(schema), given), OmegaConf.create(values or {}))
         return OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(complaint(error, schema, path)) from error
@@ -246,15 +257,18 @@ def typed(schema: type, values: Any, path: str) -> Any:
         raise ConfigError(str(error)) from error
 
 
-def writable(node: DictConfig) -> DictConfig:
-    """Frozen dataclasses make read-only nodes, which OmegaConf cannot merge into."""
+def writable(node: DictConfig, given: dict[str, Any]) -> DictConfig:
+    """Frozen dataclasses make read-only nodes, which OmegaConf cannot merge into; `given`: what is to be merged."""
     OmegaConf.set_readonly(node, False)
     for key in node:
         child = node._get_node(key)
         if isinstance(child, DictConfig):
-            if child._is_missing() and dataclasses.is_dataclass(child._metadata.ref_type):
+            inner = given.get(str(key))
+            absent = child._is_missing() or (child._is_none() and isinstance(inner, dict))
+            if absent and dataclasses.is_dataclass(child._metadata.ref_type):
                 child._set_value(child._metadata.ref_type)  # its fields must be there to be made writable
-            writable(child)
+            if not child._is_none():
+                writable(child, inner if isinstance(inner, dict) else {})
     return node
 
 
@@ -316,7 +330,14 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:
     """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed."""
     with hydra_session(plugins):
         parsed = parse_overrides(overrides)
-        compose_raw([o.input_line for o in parsed if o.input_line and not o.is_sweep_override()])
+        compose_raw([first_of(override) for override in parsed if override.input_line])
+
+
+def first_of(override: Any) -> str:
+    """An override with its first value where it is swept."""
+    if not override.is_sweep_override():
+        return str(override.input_line)
+    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
 
 
 def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> tuple[int, Path | None]:

@@ -138,5 +138,9 @@ class MetricsLog:
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
         """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, however training ended."""
         if self.stream is not None:
             self.stream.close()

@@ -109,11 +109,11 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
     tensors: dict[str, Tensor] = {}
     listed = []
     for number, view in enumerate(views):
-        tensors[f"{number}.target"] = view.target.contiguous()
-        tensors[f"{number}.rotation"] = view.camera.rotation.contiguous()
-        tensors[f"{number}.translation"] = view.camera.translation.contiguous()
-        optional = {"trust": view.trust, "coarse": view.coarse}
-        tensors |= {f"{number}.{name}": value.contiguous() for name, value in optional.items() if value is not None}
+        held = {"target": view.target, "rotation": view.camera.rotation, "translation": view.camera.translation}
+        held |= {name: value for name in ("trust", "coarse") if (value := getattr(view, name)) is not None}
+        tensors |= {
+            f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
+        }
         entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
         listed.append(entry | {"camera": intrinsics(view.camera)})
     text = json.dumps({"facts": facts, "views": listed})

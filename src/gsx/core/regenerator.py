@@ -16,6 +16,8 @@ LARGEST_DRIFT = 2 / 255
 """Largest change of a picture's mean colour (spec 6.4)."""
 LEAST_AGREEMENT = 30.0
 """Least PSNR between an upscaled picture, box-averaged, and what it was made from, dB (spec 6.4)."""
+LEAST_SLOPE = 1e-3
+"""Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
 LARGEST_SHIFT = 0.25
 """Largest displacement, px of the input (spec 1.5)."""
 
@@ -39,6 +41,8 @@ class Request:
     seed: int
     strength: float
     """How much may change, 0 to 1, for regenerators that know such a thing."""
+    strongest: float
+    """The strength at the first event."""
     prompt: str
     step: int
 
@@ -67,6 +71,16 @@ class Regenerator(Protocol):
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """A picture for each request, in order; display values."""
+        ...
+
+
+@runtime_checkable
+class Checked(Protocol):
+    """A regenerator that can say before training that it will not do."""
+
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """Raise ConfigError or InputError if it cannot redraw these training views at these scales; `moved`: other
+        places are asked for as well."""
         ...
 
 
@@ -120,6 +134,6 @@ def displacement(image: Float[Tensor, "3 h w"], reference: Float[Tensor, "3 h w"
     difference = (other - grey)[1:-1, 1:-1]
     slopes = torch.stack([dx.flatten(), dy.flatten()])
     system, right = slopes @ slopes.T, slopes @ difference.flatten()
-    if float(torch.linalg.eigvalsh(system)[0]) < 1e-4 * slopes.shape[1]:
+    if float(torch.linalg.eigvalsh(system)[0]) < LEAST_SLOPE**2 * slopes.shape[1]:
         return 0.0
     return float(torch.linalg.solve(system, right).norm())

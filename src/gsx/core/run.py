@@ -68,6 +68,8 @@ class Run:
     augmenters: Sequence[Augmenter] = ()
     step: int = 0
     """Steps done."""
+    trunk: Path | None = None
+    """Where states are kept that other runs may branch from; None: nowhere, as for all runs that were resumed."""
     seconds: float = 0.0
     """Time spent in training steps, without evaluation and files."""
     stopping: bool = False

@@ -22,6 +22,7 @@ from gsx.core.backbone import Beginning
 from gsx.core.cache import cache_root
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
+from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, InputError, TrainingError, nearest
 from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
@@ -153,6 +154,10 @@ def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
             regenerator=regenerator,
         )
         out.append(chosen.component.factory(chosen.options, setting))
+    shares = {name: float(a.plan().get("share", 0)) for name, a in zip(settings.augmenters, out, strict=True)}
+    if sum(shares.values()) >= 1:
+        listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
+        raise ConfigError(f"augmenters take the whole loss of the photographs ({listed}): lower their weights")
     return out
 
 
@@ -172,9 +177,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "rasterizer": run.raster.path,
-        "device": torch.cuda.get_device_name(run.device)
-        if run.device.type == "cuda"
-        else platform.processor() or "cpu",
+        "device": device_name(run.device),
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
         "plan": plan_of(run),
@@ -253,7 +256,8 @@ def start(settings: Settings, plugins: Plugins) -> Run:
         write_config(run.folder / "config.yaml", settings.resolved)
         write_json(run.folder / "environment.json", environment(run, plugins))
         if settings.general.init == "trunk":
-            trunk.adopt(run)
+            run.trunk = trunk.trunk_folder(run, plugins.versions)
+            trunk.adopt(run, run.trunk)
             run.curves = read_curves(run.folder)
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
@@ -346,9 +350,10 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
-    listeners: list[object] = [Guard(), MetricsLog(settings.evaluation), Checkpointer(), Progress()]
-    if settings.general.init == "trunk":
-        listeners.append(trunk.TrunkKeeper())
+    log = MetricsLog(settings.evaluation)
+    listeners: list[object] = [Guard(), log, Checkpointer(), Progress()]
+    if run.trunk is not None:
+        listeners.append(trunk.TrunkKeeper(run.trunk))
     try:
         with plugins.listening(listeners):
             train(run, plugins)
@@ -361,6 +366,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     except BaseException as error:
         status(run, "failed", f"{type(error).__name__}: {error}")
         raise
+    finally:
+        log.close()
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsx.core.losses import photometric
 from gsx.core.plugins import Plugins
 from gsx.core.pseudo import Term, pseudo_loss
-from gsx.core.rasterizer import rasterize
+from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.run import Run, Step
 from gsx.core.shapes import Float
 
@@ -60,7 +60,11 @@ def backward(run: Run) -> Step:
     number, picked = run.step + 1, run.sampler.next()
     view = run.scene.train[picked]
     target = view.image().to(run.device)
-    terms = [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
+    try:
+        terms = [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
+    except Exception:  # the step has not been taken: a checkpoint written now begins with this view again
+        run.sampler.order.append(picked)
+        raise
     run.backbone.begin(number)
     parts = {term.name: add_term(run, term, number) for term in sorted(terms, key=lambda term: term.shared)}
     own = 1 - sum(term.taken for term in terms)
@@ -97,12 +101,18 @@ def add_term(run: Run, term: Term, number: int) -> float:
         loss = weight * pseudo_loss(rendering.image, view)
         loss.backward()
         total += float(loss.detach())
-        if term.observed and math.isfinite(total):
+        if term.observed and math.isfinite(total) and finite_shift(rendering):
             run.backbone.observe(rendering, number)
     if not term.shared:
         for parameter in run.backbone.shared():
             parameter.grad = None
     return total
+
+
+def finite_shift(rendering: Rendering) -> bool:
+    """Whether the screen gradients that density control gathers are finite: those of a step to be vetoed may not be."""
+    gradient = rendering.screen.shift.grad
+    return gradient is None or bool(torch.isfinite(gradient).all())
 
 
 def background(run: Run) -> Float[Tensor, "3"]:

@@ -8,6 +8,7 @@ import hashlib
 import json
 import logging
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ import torch
 
 import gsx
 from gsx.core import checkpoint
-from gsx.core.cache import cache_folder, content_key, make_folder
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.device import device_name
+from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
@@ -35,12 +38,25 @@ def common_steps(run: Run) -> int:
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
 
 
-def trunk_folder(run: Run) -> Path:
-    """Where states of runs like this one are kept."""
+def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
+    """Where states of runs like this one are kept; `plugins`: versions of those installed."""
     config: dict[str, Any] = {key: value for key, value in run.config.items() if key not in BESIDE}
     config["training"] = {key: value for key, value in config["training"].items() if key not in WATCHING}
-    machine = (sources(), str(run.device), torch.get_num_threads(), torch.__version__, run.raster.path)
-    return cache_folder("trunks", content_key(json.dumps(config, sort_keys=True, default=str), machine))
+    machine = (device_name(run.device), torch.get_num_threads(), torch.__version__, run.raster.path)
+    parts = (json.dumps(config, sort_keys=True, default=str), seen_by(run), sources(), sorted(plugins.items()), machine)
+    return cache_folder("trunks", content_key(*parts))
+
+
+def seen_by(run: Run) -> str:
+    """A digest of what the run is trained on: cameras, points, and the files of photographs."""
+    digest = hashlib.sha256(run.scene.points.positions.numpy().tobytes())
+    digest.update(run.scene.points.colours.numpy().tobytes())
+    for view in run.scene.train:
+        camera, path = view.camera, getattr(view.source, "path", None)
+        digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
+        digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
+        digest.update(repr(file_stamp(Path(path)) if path is not None else "").encode())
+    return digest.hexdigest()
 
 
 def sources() -> str:
@@ -51,19 +67,27 @@ def sources() -> str:
     return digest.hexdigest()
 
 
-def adopt(run: Run) -> None:
+def adopt(run: Run, folder: Path) -> None:
     """Bring a new run to the latest state that it has in common with an earlier one, if there is any."""
-    folder, common = trunk_folder(run), common_steps(run)
-    usable = [path for path in checkpoint.sidecars(folder) if step_of(path) <= common]
-    if not usable:
-        logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
+    common = common_steps(run)
+    for sidecar in reversed([path for path in checkpoint.sidecars(folder) if step_of(path) <= common]):
+        try:
+            checkpoint.read(sidecar)
+        except CheckpointError as error:
+            logger.warning("%s", error)
+            continue
+        branch(run, sidecar)
         return
-    latest = usable[-1]
+    logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
+
+
+def branch(run: Run, sidecar: Path) -> None:
+    """Start from a kept state: its checkpoint and its lines of metrics.jsonl become the run's own."""
     own = run.folder / "checkpoints"
     own.mkdir(parents=True, exist_ok=True)
     for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
-        shutil.copyfile(latest.with_suffix(suffix), own / latest.with_suffix(suffix).name)
-    (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(latest)))
+        shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
+    (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
     checkpoint.restore(run)
     logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
 
@@ -82,13 +106,23 @@ def lines_of(sidecar: Path) -> list[dict[str, Any]]:
 class TrunkKeeper:
     """Listener: keeps states that other runs can branch from."""
 
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
-        """Keep this one if it is common ground and not kept yet."""
+        """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
         wanted = {round(share * run.iterations) for share in SHARES} | {common_steps(run)}
         if run.step not in wanted or run.step > common_steps(run) or run.complete:
             return
-        folder = make_folder(trunk_folder(run))
+        try:
+            self.keep(run)
+        except (OSError, InputError) as error:
+            logger.warning("init=trunk: the state of step %d is not kept (%s)", run.step, error)
+
+    def keep(self, run: Run) -> None:
+        """Write the state where other runs look for it."""
+        folder = make_folder(self.folder)
         if any(step_of(path) == run.step for path in checkpoint.sidecars(folder)):
             return
         write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})

@@ -1,13 +1,15 @@
 """Regenerators without anything to learn: Lanczos enlargement, identity, and the truth itself as an upper bound."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError
 from gsx.core.images import resize, to_uint8
 from gsx.core.regenerator import Material, Request
+from gsx.core.scene import View
 from gsx.core.shapes import Float
 
 
@@ -49,18 +51,21 @@ class Unchanged:
         """Nothing to learn."""
         return {}
 
-    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 h w"]]:
-        """Each picture as it is.
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """It cannot enlarge."""
+        refuse_enlarging("identity", scales)
 
-        Raises:
-            InputError: a picture is to be enlarged.
-        """
-        for request in requests:
-            if request.scale != 1:
-                raise InputError(
-                    f"regenerator identity cannot enlarge x{request.scale}: choose another regenerator/upscale"
-                )
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 h w"]]:
+        """Each picture as it is."""
         return [request.image for request in requests]
+
+
+def refuse_enlarging(name: str, scales: Sequence[int]) -> None:
+    """Raise ConfigError if a restorer is asked to enlarge."""
+    if max(scales) > 1:
+        raise ConfigError(
+            f"regenerator {name} cannot enlarge x{max(scales)}: choose another for that role, or augmenter scales=[1]"
+        )
 
 
 class Oracle:
@@ -73,28 +78,26 @@ class Oracle:
         """Nothing to learn."""
         return {}
 
-    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """What the scene truly shows.
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """Photographs must be fine enough, and show no place but their own."""
+        for view in views:
+            finest = view.source.max_zoom(view.camera)
+            if max(scales) > finest:
+                raise ConfigError(
+                    f"regenerator oracle: the photograph of '{view.name}' is not {max(scales)} times finer than the "
+                    f"training image; train at scene.downscale={max(scales)} or more"
+                )
+            if moved and finest < math.inf:
+                raise ConfigError(
+                    "regenerator oracle knows no truth beside the photographs: set variants=0 of the augmenter"
+                )
 
-        Raises:
-            InputError: the photographs hold no such pixels.
-        """
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
+        """What the scene truly shows."""
         return [truth(request) for request in requests]
 
 
 def truth(request: Request) -> Float[Tensor, "3 H W"]:
     """The truth that the camera of a request sees at `scale` times the density."""
-    view, scale = request.view, request.scale
-    if scale > view.source.max_zoom(view.camera):
-        raise InputError(
-            f"regenerator oracle: photographs of '{view.name}' are not {scale} times finer than the training images; "
-            f"train at scene.downscale={scale} or more"
-        )
-    height, width = (side * scale for side in request.image.shape[1:])
-    try:
-        return view.source.image(request.camera.resize(width, height)).float() / 255
-    except ValueError as error:
-        raise InputError(
-            f"regenerator oracle knows no truth beside the photograph of '{view.name}' ({error}): "
-            "set augmenter.NAME.variants=0"
-        ) from error
+    height, width = (side * request.scale for side in request.image.shape[1:])
+    return request.view.source.image(request.camera.resize(width, height)).float() / 255

@@ -15,7 +15,9 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.regenerator import Material, Request
+from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.scene_sr import begin, read_network
 
 logger = logging.getLogger(__name__)
@@ -36,14 +38,12 @@ class RestorerOptions:
     crop: int
     """Edge of a training crop, px."""
     rate: float
-    strongest: float
-    """Strength at which the whole restoration is applied; half of it at half of this."""
 
     def __post_init__(self) -> None:
         if min(self.channels, self.steps, self.batch) < 1 or self.crop < 16:
             raise ValueError("regenerator.restore: channels, steps, batch must be at least 1, crop at least 16")
-        if not (self.rate > 0 and self.strongest > 0):
-            raise ValueError("regenerator.restore: rate and strongest must be above 0")
+        if not self.rate > 0:
+            raise ValueError("regenerator.restore: rate must be above 0")
 
 
 class Residual(nn.Module):
@@ -86,35 +86,44 @@ class SceneRestorer:
         self.options = options
         self.networks: list[Residual] = []
         self.useful = [False] * FOLDS
+        self.prepared = -1
+
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """It cannot enlarge, and each half needs views to learn from."""
+        refuse_enlarging("scene_restorer", scales)
+        if len(views) < 2 * FOLDS:
+            raise InputError(
+                f"regenerator scene_restorer needs at least {2 * FOLDS} training views, there are {len(views)}: choose "
+                "regenerator/restore=identity"
+            )
 
     def prepare(self, material: Material) -> dict[str, float]:
         """Train each network on renders of half of the views, and measure it on the other half.
 
-        A network that brings renders of views it has not seen no closer to their photographs is not used.
+        One that has become worse there goes back to what it was. One that brings renders of views it has not seen no
+        closer to their photographs is not used.
         """
-        if len(material.views) < 2 * FOLDS:
-            raise InputError(
-                f"regenerator scene_restorer needs at least {2 * FOLDS} training views, there are "
-                f"{len(material.views)}: choose regenerator/restore=identity"
-            )
+        if self.prepared == material.step:  # another augmenter has asked at this event
+            return {}
         if not self.networks:
-            self.networks = [
-                Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
-                for fold in range(FOLDS)
-            ]
-            self.recall(material)
+            self.networks = self.recalled(material)
         pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
         figures: dict[str, float] = {}
         for fold, network in enumerate(self.networks):
             own = [pair for number, pair in enumerate(pairs) if number % FOLDS == fold]
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
+            renders, before = mean_error(None, others), mean_error(network, others)
+            earlier = {name: value.clone() for name, value in network.state_dict().items()}
             learn(network, own, self.options, material.seed * 1_000_003 + material.step * FOLDS + fold)
-            before, after = mean_error(None, others), mean_error(network, others)
-            self.useful[fold] = after < before
-            figures |= {f"error_before_{fold}": before, f"error_after_{fold}": after}
+            after = mean_error(network, others)
+            if after > before:
+                network.load_state_dict(earlier)
+            self.useful[fold] = min(before, after) < renders
+            figures |= {f"error_of_renders_{fold}": renders, f"error_restored_{fold}": min(before, after)}
         if not any(self.useful):
             logger.warning("scene_restorer brings unseen views no closer to their photographs: it changes nothing")
         self.keep(material)
+        self.prepared = material.step
         return figures
 
     @torch.no_grad()
@@ -123,34 +132,52 @@ class SceneRestorer:
         return [self.restored(request) for request in requests]
 
     def restored(self, request: Request) -> Float[Tensor, "3 h w"]:
-        """One picture."""
-        if request.scale != 1:
-            raise InputError(
-                f"regenerator scene_restorer cannot enlarge x{request.scale}: choose another regenerator/upscale"
-            )
+        """One picture; the whole correction at the first event's strength, half of it at half of that (spec 5.2)."""
         fold = (request.number + 1) % FOLDS
-        if not self.useful[fold]:
+        if not self.useful[fold] or request.strength == 0:
             return request.image
         network = self.networks[fold]
         image = request.image.to(next(network.parameters()).device)
-        share = min(1.0, request.strength / self.options.strongest)
-        return (image + share * network(image[None])[0]).clamp(0, 1)
+        return (image + request.strength / request.strongest * network(image[None])[0]).clamp(0, 1)
 
     def keep(self, material: Material) -> None:
-        """Write the networks into the run's folder."""
+        """Write both networks into the run's folder, as one file for each event."""
         from safetensors.torch import save
 
+        tensors = {
+            f"{fold}.{name}": value.contiguous()
+            for fold, network in enumerate(self.networks)
+            for name, value in network.state_dict().items()
+        }
         material.folder.mkdir(parents=True, exist_ok=True)
-        for fold, network in enumerate(self.networks):
-            tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-            replace_file(material.folder / f"scene_restorer_{fold}.safetensors", save(tensors))
+        replace_file(material.folder / f"scene_restorer_{material.step:07d}.safetensors", save(tensors))
 
-    def recall(self, material: Material) -> None:
-        """Take the networks that the run had learnt before it was interrupted."""
-        for fold, network in enumerate(self.networks):
-            path = material.folder / f"scene_restorer_{fold}.safetensors"
-            if path.is_file() and (found := read_network(path)) is not None:
-                network.load_state_dict(found)
+    def recalled(self, material: Material) -> list[Residual]:
+        """Networks as the run had them after its last event before this one, or new ones.
+
+        Raises:
+            InputError: they were of another size.
+        """
+        networks = [
+            Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
+            for fold in range(FOLDS)
+        ]
+        earlier = [
+            path
+            for path in sorted(material.folder.glob("scene_restorer_*.safetensors"))
+            if int(path.stem.rpartition("_")[2]) < material.step
+        ]
+        found = read_network(earlier[-1]) if earlier else None
+        for fold, network in enumerate(networks if found else ()):
+            own = {name.partition(".")[2]: value for name, value in found.items() if name.startswith(f"{fold}.")}  # type: ignore[union-attr]
+            try:
+                network.load_state_dict(own)
+            except RuntimeError as error:
+                raise InputError(
+                    f"{earlier[-1]} holds networks of another size ({str(error).splitlines()[0]}): go on with the "
+                    "regenerator.restore options that the run was begun with"
+                ) from error
+        return networks
 
 
 Pair = tuple[Tensor, Tensor]

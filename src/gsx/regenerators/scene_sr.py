@@ -4,6 +4,7 @@ Photographs reduced by two, and themselves, are pairs of input and truth; textur
 what it learns. Every picture it gives back reduces to its input (`augmenters.consistency`), x4 and x8 by recursion.
 """
 
+import hashlib
 import logging
 import math
 import time
@@ -17,9 +18,11 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.cache import cache_folder, content_key
-from gsx.core.errors import InputError
+from gsx.core.device import device_name
+from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
 from gsx.core.regenerator import Material, Request, box_average
+from gsx.core.scene import View
 from gsx.core.shapes import Float
 
 logger = logging.getLogger(__name__)
@@ -92,6 +95,12 @@ class SceneSR:
         self.network: Enlarger | None = None
         self.figures: dict[str, float] = {}
 
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """It doubles, any number of times."""
+        odd = [scale for scale in scales if scale & (scale - 1)]
+        if odd:
+            raise ConfigError(f"regenerator scene_sr enlarges x2, x4, x8, not x{odd[0]}: change the augmenter's scales")
+
     def prepare(self, material: Material) -> dict[str, float]:
         """Train, or take what an earlier run of the same scene and options has learnt."""
         if self.network is not None:
@@ -100,7 +109,7 @@ class SceneSR:
         self.network = Enlarger(
             self.options.channels, self.options.layers, torch.Generator().manual_seed(material.seed)
         ).to(material.device)
-        path = kept_at(self.options, photos, material.seed)
+        path = kept_at(self.options, photos, material.seed, material.device)
         if path.is_file() and (found := read_network(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
@@ -114,22 +123,15 @@ class SceneSR:
 
     @torch.no_grad()
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each picture, `scale` times as large, by doubling.
-
-        Raises:
-            InputError: a scale is no power of two.
-        """
+        """Each picture, `scale` times as large, by doubling."""
         assert self.network is not None
         return [enlarged(self.network, request) for request in requests]
 
 
 def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
     """One picture, doubled until it is large enough."""
-    doublings = round(math.log2(request.scale)) if request.scale > 0 else 0
-    if 2**doublings != request.scale:
-        raise InputError(f"regenerator scene_sr enlarges x2, x4, x8, not x{request.scale}: change augmenter scales")
     image = request.image.to(next(network.parameters()).device)
-    for _ in range(doublings):
+    for _ in range(round(math.log2(request.scale))):
         image = back_projected(network(image[None])[0], image)
     return image
 
@@ -189,14 +191,14 @@ def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.G
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def kept_at(options: SceneSROptions, photos: Sequence[Tensor], seed: int) -> Path:
-    """Where what is learnt from these photographs, with these options and seed, is kept."""
-    import hashlib
-
-    digest = hashlib.sha256()
+def kept_at(options: SceneSROptions, photos: Sequence[Tensor], seed: int, device: torch.device) -> Path:
+    """Where what is learnt from these photographs, with these options and seed, by this code and machine, is kept."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
     for photo in photos:
+        digest.update(repr(tuple(photo.shape)).encode())
         digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
-    key = content_key(asdict(options), digest.hexdigest(), seed, torch.__version__, torch.get_num_threads())
+    machine = (torch.__version__, torch.get_num_threads(), device_name(device))
+    key = content_key(asdict(options), digest.hexdigest(), seed, machine)
     return cache_folder("scene_sr", key) / "network.safetensors"
 
 

@@ -16,7 +16,7 @@ from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 
 FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""
@@ -61,6 +61,13 @@ def published_windows(
     edges = (corner - radii[:, None], corner + radii[:, None] + (WINDOW_TILE - 1))
     first, last = (torch.minimum((edge / WINDOW_TILE).nan_to_num().clamp(0, FAR).int(), grid) for edge in edges)
     return WINDOW_TILE * first, WINDOW_TILE * last
+
+
+def on_raster(first: Int[Tensor, "M 2"], last: Int[Tensor, "M 2"], camera: Camera) -> Bool[Tensor, "M"]:
+    """Whether windows of the frame share a pixel with the raster: all that are not empty, unless it is a crop."""
+    corner = torch.tensor([camera.frame.left, camera.frame.top], device=first.device, dtype=first.dtype)
+    size = torch.tensor(camera.size, device=first.device, dtype=first.dtype)
+    return (last.minimum(corner + size) > first.maximum(corner)).all(1)
 
 
 def reach(log_opacities: Float[Tensor, "M"], alpha_min: float) -> Float[Tensor, "M"]:
@@ -134,7 +141,7 @@ def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pair
         if settings.cull == "published":
             first = first.maximum(window_first // grid.tile)
             last = last.minimum(window_last // grid.tile).maximum(first)
-        seen = (window_last > window_first).all(1)
+        seen = on_raster(window_first, window_last, camera)
         radii = torch.where(seen, radii, 0.0).nan_to_num().clamp_max(FAR).int()
         return reached_tiles(screen, limits, first, last, grid, settings, radii)
 

@@ -1,0 +1,32 @@
+"""What a regenerator may learn from, taken from a run: training views, and what the model shows as it is now."""
+
+import torch
+from torch import Tensor
+
+from gsx.core.camera import Camera
+from gsx.core.evaluate import render_tiled
+from gsx.core.regenerator import Material
+from gsx.core.run import Run
+from gsx.core.shapes import Float
+
+TILE_PIXELS = 1 << 20
+"""Pictures are rendered in pieces of this many pixels."""
+
+
+@torch.no_grad()
+def rendered(run: Run, camera: Camera) -> Float[Tensor, "3 h w"]:
+    """The model as it is now."""
+    run.backbone.begin(max(1, run.step))
+    return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, TILE_PIXELS).image
+
+
+def material_of(run: Run, seed: int) -> Material:
+    """Everything but held-out views."""
+    return Material(
+        views=run.scene.train,
+        render=lambda camera: rendered(run, camera),
+        step=run.step,
+        seed=seed,
+        device=run.device,
+        folder=run.folder / "regenerators",
+    )
