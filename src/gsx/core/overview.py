@@ -9,6 +9,7 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.charts import Dot, pareto_front, scatter
+from gsx.core.control import control_rows
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.page import fixed, template
@@ -36,7 +37,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     runs = [read_run(path) for path in (runs_below(folder) if chosen is None else chosen)]
     if not runs:
         raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give the folder of some runs")
-    rows = overview_rows(folder, runs)
+    rows, controls = overview_rows(folder, runs), control_rows(runs)
     replace_file(folder / "report.csv", csv_of(rows).encode())
     context = {
         "title": f"{len(rows)} runs {'below' if chosen is None else 'of'} {folder.name or folder}",
@@ -46,6 +47,8 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
         "mixed": mixed_protocols(rows),
         "comparisons": comparisons(rows),
+        "controls": controls,
+        "control_zooms": sorted({factor for entry in controls for factor in entry["gains"]}, key=float),
         "any_lpips": any(is_number(row["lpips"]) for row in rows),
     }
     path = folder / "report.html"
