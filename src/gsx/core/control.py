@@ -66,9 +66,9 @@ def add(entry: Comparison, run: RunFiles, control: RunFiles) -> None:
         other = zooms(control).get(factor)
         if other is not None:
             entry.gains.setdefault(factor, []).append(figures - other)
-    seconds = [files.evaluation.get("train_seconds") for files in (run, control)]
-    if all(is_number(value) and value > 0 for value in seconds):
-        entry.cost.append(seconds[0] / seconds[1])
+    own, other_own = (files.evaluation.get("train_seconds") for files in (run, control))
+    if is_number(own) and is_number(other_own) and other_own > 0:
+        entry.cost.append(own / other_own)
     entry.seeds.append(seed_of(run))
 
 
