@@ -399,8 +399,12 @@ RUN = (
     "iterations=40",
     *PLAIN,
     "augmenter=[upscale,bootstrap]",
+    "augmenter.upscale.timing.every=4000",
+    "augmenter.bootstrap.timing.every=4000",
     "augmenter.upscale.timing.span=2000",  # two steps: a run can be stopped inside a window
     "augmenter.bootstrap.timing.span=2000",
+    "augmenter.upscale.first_cameras=3",
+    "augmenter.bootstrap.first_cameras=3",
     "training.checkpoint_every=100",
 )
 
@@ -418,14 +422,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_window_is_active_and_logged(finished: Path) -> None:
     plan = json.loads((finished / "environment.json").read_text())["plan"]
-    assert plan["upscale"]["events"] == list(range(22, 39, 2))
-    assert plan["bootstrap"]["events"] == list(range(20, 39, 2))
+    assert plan["upscale"]["events"] == list(range(22, 39, 4))
+    assert plan["bootstrap"]["events"] == list(range(20, 39, 4))
     pictures = [path.name for path in (finished / "pseudo").glob("*.png")]
     for name in ("upscale", "bootstrap"):
         assert {int(p.split("_")[1]) for p in pictures if p.startswith(name)} == set(plan[name]["events"])
 
 
-@pytest.mark.parametrize("stop", [20, 23])
+@pytest.mark.parametrize("stop", [20, 21, 25])
 def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=stop)
     run, settings = open_run(tmp_path / "run", plugins(), ())
@@ -438,10 +442,10 @@ def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished:
 def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_window(
     finished: Path, tmp_path: Path
 ) -> None:
-    """The checkpoint of step 21 needs the views of 20, though those of 22 and 24 have been made since."""
+    """The checkpoint of step 21 needs the views of 20, though those of 22, 24 and 26 have been made since."""
     folder = tmp_path / "run"
-    tiny_run(folder, (*RUN, "training.checkpoint_every=7"), stop_after=26)
-    for path in (folder / "checkpoints").glob("step_0000026*"):
+    tiny_run(folder, (*RUN, "training.checkpoint_every=7"), stop_after=27)
+    for path in (folder / "checkpoints").glob("step_0000027*"):
         path.unlink()
     run, settings = open_run(folder, plugins(), ())
     assert run.step == 21
@@ -452,14 +456,17 @@ def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_wi
 
 def test_files_of_events_that_no_checkpoint_needs_are_removed(finished: Path) -> None:
     kept = sorted(path.name for path in (finished / "pseudo").glob("*.safetensors"))
-    assert kept == ["bootstrap_0000038.safetensors", "upscale_0000038.safetensors"]
+    assert kept == ["bootstrap_0000036.safetensors", "upscale_0000038.safetensors"]
 
 
 def test_a_longer_run_waits_for_its_next_event(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Of 40 steps the last events are at 38; of 60 those around 40 are at 39, which was never made, and 42."""
     caplog.set_level("INFO")
     words = tuple(word for word in RUN if not word.startswith("augmenter"))
-    tiny_run(tmp_path / "run", (*words, "augmenter=bootstrap", "augmenter.bootstrap.timing.span=1500"))
+    tiny_run(
+        tmp_path / "run",
+        (*words, "augmenter=bootstrap", "augmenter.bootstrap.timing.span=1500", "augmenter.bootstrap.first_cameras=1"),
+    )
     run, settings = open_run(tmp_path / "run", plugins(), ["iterations=60"])
     assert augmenter_of(run).events[:5] == [30, 33, 36, 39, 42]
     execute(run, settings, plugins())

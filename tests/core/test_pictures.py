@@ -68,6 +68,9 @@ class FourSplats:
     def gradients(self) -> Iterator[tuple[str, Tensor]]:
         return iter(())
 
+    def shared(self) -> Iterator[Tensor]:
+        return iter(())
+
     def heal(self) -> int:
         return 0
 

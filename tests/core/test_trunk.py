@@ -22,6 +22,12 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
 
 
+def augmented(*names: str) -> tuple[str, ...]:
+    """Few pseudo views of few events."""
+    few = [(f"augmenter.{name}.first_cameras=2", f"augmenter.{name}.timing.every=8000") for name in names]
+    return (f"augmenter=[{','.join(names)}]", *(word for words in few for word in words))
+
+
 def final_tensors(folder: Path) -> dict[str, Tensor]:
     return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
@@ -43,9 +49,9 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
     assert "no earlier run" in caplog.text
     for name, step in (("bootstrap", 20), ("upscale", 22)):
         caplog.clear()
-        tiny_run(tmp_path / name, (*RUN, f"augmenter={name}", "init=trunk"))
+        tiny_run(tmp_path / name, (*RUN, *augmented(name), "init=trunk"))
         assert f"branching at step {step} from an earlier run" in caplog.text
-        tiny_run(tmp_path / f"{name}_scratch", (*RUN, f"augmenter={name}"))
+        tiny_run(tmp_path / f"{name}_scratch", (*RUN, *augmented(name)))
         assert_same(tmp_path / name, tmp_path / f"{name}_scratch")
         assert [line["step"] for line in lines(tmp_path / name)] == [
             line["step"] for line in lines(tmp_path / f"{name}_scratch")
@@ -54,12 +60,12 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
 
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
     """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
-    run = tiny_run(tmp_path / "upscale", (*RUN, "augmenter=upscale", "init=trunk"))
+    run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=trunk"))
     assert sorted(path.stem for path in trunk_folder(run, plugins().versions).glob("step_*.json")) == [
         f"step_{step:07d}" for step in (10, 15, 20, 22)
     ]
-    tiny_run(tmp_path / "both", (*RUN, "augmenter=[upscale,bootstrap]", "init=trunk"))
-    tiny_run(tmp_path / "scratch", (*RUN, "augmenter=[upscale,bootstrap]"))
+    tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=trunk"))
+    tiny_run(tmp_path / "scratch", (*RUN, *augmented("upscale", "bootstrap")))
     assert_same(tmp_path / "both", tmp_path / "scratch")
 
 
