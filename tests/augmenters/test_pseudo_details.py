@@ -15,6 +15,7 @@ from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.images import read_image
 from gsx.core.losses import photometric
 from gsx.core.material import rendered
 from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
@@ -427,6 +428,17 @@ def test_every_window_is_active_and_logged(finished: Path) -> None:
     pictures = [path.name for path in (finished / "pseudo").glob("*.png")]
     for name in ("upscale", "bootstrap"):
         assert {int(p.split("_")[1]) for p in pictures if p.startswith(name)} == set(plan[name]["events"])
+
+
+def test_the_report_shows_pseudo_views_and_what_became_of_them(finished: Path) -> None:
+    entries = json.loads((finished / "pseudo" / "index.json").read_text())["views"]
+    assert {entry["augmenter"] for entry in entries} == {"upscale", "bootstrap"}
+    assert {entry["event"] for entry in entries} == {36, 38}
+    for entry in entries:
+        made, after = (read_image(finished / "pseudo" / entry[kind]) for kind in ("made", "after"))
+        assert made.shape[1:] == (after.shape[1], 3 * after.shape[2])
+    page = (finished / "report.html").read_text()
+    assert page.count("after training</figcaption>") == len(entries) > 3
 
 
 @pytest.mark.parametrize("stop", [20, 21, 25])

@@ -22,13 +22,14 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
     """Render pseudo views of the last events from the trained model, beside what augmenters left to be looked at."""
     folder = run.folder / "pseudo"
     entries: list[dict[str, Any]] = []
-    for path in sorted(folder.glob("*.safetensors")):
+    latest = {path.stem.rpartition("_")[0]: path for path in sorted(folder.glob("*.safetensors"))}
+    for augmenter, path in latest.items():
         try:
             views, _ = load_views(path)
         except (OSError, ValueError) as error:
             logger.warning("%s cannot be read (%s): its pseudo views are not shown", path, error)
             continue
-        entries += [shown(run, options, path.stem, view) for view in with_pictures(folder, path.stem, views)[:SHOWN]]
+        entries += [shown(run, options, augmenter, view) for view in with_pictures(folder, augmenter, views)[:SHOWN]]
     if entries:
         write_json(folder / "index.json", {"views": entries})
 
