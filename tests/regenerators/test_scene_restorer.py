@@ -16,7 +16,7 @@ from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOp
 
 
 def options(**changes: float) -> RestorerOptions:
-    values = {"channels": 8, "steps": 120, "batch": 4, "crop": 32, "rate": 3e-3}
+    values = {"channels": 8, "steps": 120, "later_steps": 10, "batch": 4, "crop": 32, "rate": 3e-3}
     return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
 
 

@@ -7,6 +7,7 @@ that has not seen that view, so that neither can answer from memory.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -34,14 +35,19 @@ class RestorerOptions:
     name: str
     channels: int
     steps: int
+    """At the first event of a run."""
+    later_steps: int
+    """At each later one, which goes on from there."""
     batch: int
     crop: int
     """Edge of a training crop, px."""
     rate: float
 
     def __post_init__(self) -> None:
-        if min(self.channels, self.steps, self.batch) < 1 or self.crop < 16:
-            raise ValueError("regenerator.restore: channels, steps, batch must be at least 1, crop at least 16")
+        if min(self.channels, self.steps, self.later_steps, self.batch) < 1 or self.crop < 16:
+            raise ValueError(
+                "regenerator.restore: channels, steps, later_steps, batch must be at least 1, crop at least 16"
+            )
         if not self.rate > 0:
             raise ValueError("regenerator.restore: rate must be above 0")
 
@@ -105,6 +111,7 @@ class SceneRestorer:
         """
         if self.prepared == material.step:  # another augmenter has asked at this event
             return {}
+        steps = self.options.later_steps if self.earlier(material) else self.options.steps
         if not self.networks:
             self.networks = self.recalled(material)
         pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
@@ -114,7 +121,7 @@ class SceneRestorer:
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
             renders, before = mean_error(None, others), mean_error(network, others)
             earlier = {name: value.clone() for name, value in network.state_dict().items()}
-            learn(network, own, self.options, material.seed * 1_000_003 + material.step * FOLDS + fold)
+            learn(network, own, self.options, steps, material.seed * 1_000_003 + material.step * FOLDS + fold)
             after = mean_error(network, others)
             if after > before:
                 network.load_state_dict(earlier)
@@ -152,6 +159,11 @@ class SceneRestorer:
         material.folder.mkdir(parents=True, exist_ok=True)
         replace_file(material.folder / f"scene_restorer_{material.step:07d}.safetensors", save(tensors))
 
+    def earlier(self, material: Material) -> list[Path]:
+        """Files of the run's events before this one, oldest first."""
+        files = sorted(material.folder.glob("scene_restorer_*.safetensors"))
+        return [path for path in files if int(path.stem.rpartition("_")[2]) < material.step]
+
     def recalled(self, material: Material) -> list[Residual]:
         """Networks as the run had them after its last event before this one, or new ones.
 
@@ -162,11 +174,7 @@ class SceneRestorer:
             Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
             for fold in range(FOLDS)
         ]
-        earlier = [
-            path
-            for path in sorted(material.folder.glob("scene_restorer_*.safetensors"))
-            if int(path.stem.rpartition("_")[2]) < material.step
-        ]
+        earlier = self.earlier(material)
         found = read_network(earlier[-1]) if earlier else None
         for fold, network in enumerate(networks if found else ()):
             own = {name.partition(".")[2]: value for name, value in found.items() if name.startswith(f"{fold}.")}  # type: ignore[union-attr]
@@ -184,13 +192,13 @@ Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, H, W] each."""
 
 
-def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, seed: int) -> None:
+def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, steps: int, seed: int) -> None:
     """Adam on crops, L1 and a tenth of the L1 of differences of neighbours."""
     generator = torch.Generator().manual_seed(seed)
     device = next(network.parameters()).device
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
-    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
-    for _ in range(options.steps):
+    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=options.rate / 100)
+    for _ in range(steps):
         render, photo = (part.to(device) for part in batch(pairs, options, generator))
         out = render + network(render)
         loss = (out - photo).abs().mean() + 0.1 * sum(
