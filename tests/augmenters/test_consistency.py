@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsx.augmenters.consistency import blocks, consistent_share, exactly_consistent, projected, repaired, unblocked
-from gsx.core.regenerator import box_average
+from gsx.augmenters.consistency import blocks, consistent_share, exactly_consistent, repaired, unblocked
+from gsx.core.regenerator import box_average, projected
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

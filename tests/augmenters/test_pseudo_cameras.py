@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsx.augmenters.cameras import (
-    Window,
     centred_window,
     grid_window,
     moved,
@@ -21,6 +20,7 @@ from gsx.augmenters.cameras import (
 from gsx.core.camera import Camera, look_at
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.splats import Splats
+from gsx.core.window import Window
 
 
 def camera(width: int = 1200, height: int = 800, focal: float = 1000.0) -> Camera:

@@ -18,7 +18,6 @@ from gsx.core.images import image_size, linear_from_display, read_image
 from gsx.core.lpips import LpipsOptions
 from gsx.core.metrics import bicubic, psnr, quantise
 from gsx.core.pictures import (
-    Window,
     colour_ramp,
     cropped,
     enlarged_window,
@@ -35,6 +34,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.run import Run, Sampler, TrainingOptions
 from gsx.core.scene import PointCloud, Scene, View
 from gsx.core.splats import Splats
+from gsx.core.window import Window
 
 WIDTH, HEIGHT = 80, 64
 

@@ -1,40 +1,17 @@
 """Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random (spec 1.5)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.shapes import Float
+from gsx.core.window import Window
 
 WINDOWS = ("center", "random", "grid", "error")
 NOISES = ("uniform", "normal")
 KEPT = ("t", "center")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """A part of a raster, px."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    def grown(self, margin: int, width: int, height: int) -> "Window":
-        """With up to `margin` more on each side, as far as a raster of that size reaches."""
-        left, top = max(0, self.left - margin), max(0, self.top - margin)
-        right, bottom = min(width, self.left + self.width + margin), min(height, self.top + self.height + margin)
-        return Window(left=left, top=top, width=right - left, height=bottom - top)
-
-    def of(self, camera: Camera) -> Camera:
-        """The camera through this window."""
-        return camera.crop(self.left, self.top, self.width, self.height)
-
-    def cut(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-        """The part of an image inside the window."""
-        return image[:, self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 def window_size(width: int, height: int, narrow: float, scale: int) -> tuple[int, int]:

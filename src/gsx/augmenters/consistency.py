@@ -4,19 +4,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.images import to_uint8
-from gsx.core.regenerator import box_average
+from gsx.core.regenerator import projected
 from gsx.core.shapes import Float, Int, UInt8
-
-ROUNDS = 5
-"""Of projection and clamping; each halves what clamping undid."""
-
-
-def projected(image: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"], factor: int) -> Float[Tensor, "3 H W"]:
-    """The nearest picture with that box average, clamped to [0, 1]: D D^T = I / a^2, so errors are spread evenly."""
-    for _ in range(ROUNDS):
-        missing = low - box_average(image, factor)
-        image = (image + missing.repeat_interleave(factor, 1).repeat_interleave(factor, 2)).clamp(0, 1)
-    return image
 
 
 def exactly_consistent(

@@ -7,7 +7,7 @@ regenerator redraw what is cut from the photograph or rendered there; compare wi
 import hashlib
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from gsx.augmenters.cameras import (
     KEPT,
     NOISES,
     WINDOWS,
-    Window,
     centred_window,
     grid_window,
     moved,
@@ -31,15 +30,17 @@ from gsx.augmenters.consistency import exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.augmenters.trust import agreeing, in_bytes, sampled_better
 from gsx.core.camera import Camera
+from gsx.core.checkpoint import sidecars, step_of
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import to_uint8, write_image
 from gsx.core.material import material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.regenerator import Checked, Request, colour_matched, complaint
+from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
 from gsx.core.shapes import Float, UInt8
+from gsx.core.window import Window
 
 logger = logging.getLogger(__name__)
 
@@ -292,12 +293,16 @@ class PseudoDetails:
         """Where the pseudo views of an event are kept while a checkpoint may need them."""
         return run.folder / "pseudo" / f"{self.setting.name}_{event:07d}.safetensors"
 
+    def files(self, run: Run) -> list[Path]:
+        """Those that there are, oldest first."""
+        return sorted((run.folder / "pseudo").glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"))
+
     def forget(self, run: Run, event: int) -> None:
         """Remove the files of events in whose windows no checkpoint lies, but for that of the current one."""
-        steps = [int(path.stem.removeprefix("step_")) for path in (run.folder / "checkpoints").glob("step_*.json")]
+        steps = map(step_of, sidecars(run.folder / "checkpoints"))
         needed = {event} | {event_at(step + 1, self.events, self.span) for step in steps}
         kept = {self.path(run, number) for number in needed if number is not None}
-        for path in (run.folder / "pseudo").glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"):
+        for path in self.files(run):
             if path not in kept:
                 path.unlink()
 
@@ -310,7 +315,7 @@ class PseudoDetails:
             InputError: the file is gone or damaged.
         """
         path = self.path(run, event)
-        others = sorted(path.parent.glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"))
+        others = self.files(run)
         if not path.is_file() and others and load_views(others[-1])[1]["iterations"] != self.setting.iterations:
             logger.info("%s rests until its next event: the run has become longer", self.setting.name)
             return []
@@ -527,7 +532,7 @@ class PseudoDetails:
 
     def show(self, folder: Path, sketch: Sketch, request: Request, view: PseudoView) -> None:
         """Keep a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
-        given = enlarged(sketch.inside.cut(request.image), sketch.scale)
+        given = as_blocks(sketch.inside.cut(request.image), sketch.scale)
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
@@ -536,8 +541,6 @@ class PseudoDetails:
 
 def again(request: Request, number: int) -> Request:
     """The request for its n-th sample."""
-    from dataclasses import replace
-
     return replace(request, seed=request.seed + number)
 
 
@@ -546,11 +549,6 @@ def reduced(window: Window, pose: Camera, scale: int) -> tuple[Window, Camera, C
     width, height = max(1, window.width // scale), max(1, window.height // scale)
     whole = Window(left=window.left, top=window.top, width=width * scale, height=height * scale).of(pose)
     return Window(left=0, top=0, width=width, height=height), whole.resize(width, height), whole
-
-
-def enlarged(image: Float[Tensor, "3 h w"], scale: int) -> Float[Tensor, "3 H W"]:
-    """Every pixel as a block."""
-    return image.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
 
 
 def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.regenerator import box_average
+from gsx.core.regenerator import as_blocks, box_average
 from gsx.core.shapes import Float, UInt8
 from gsx.core.splats import Splats
 
@@ -53,7 +53,7 @@ def agreeing(
 ) -> Float[Tensor, "H W"]:
     """1 where the result, box-averaged, is within `levels` of 255 of what it was made from in all channels, else 0."""
     off = (box_average(result.clamp(0, 1), scale) - given).abs().amax(0) * 255
-    return (off <= levels).float().repeat_interleave(scale, 0).repeat_interleave(scale, 1)
+    return as_blocks((off <= levels).float(), scale)
 
 
 def in_bytes(trust: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:

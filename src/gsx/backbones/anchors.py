@@ -41,7 +41,6 @@ from gsx.backbones.levels import (
     facts_of,
     initial_nodes,
     note_of,
-    unlocked,
     warnings_of,
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
@@ -316,7 +315,7 @@ class Anchors:
     def highest(self) -> int:
         """Highest level that takes part at this step (spec 3.6)."""
         assert self.levels is not None
-        return min(self.levels.count - 1, unlocked(self.levels.switches, self.levels.first, self.step))
+        return self.levels.highest(self.step)
 
     def regulariser(self) -> Float[Tensor, ""] | None:
         """Mean volume of the Gaussians drawn; 0 for none (spec 1.3)."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.levels import Levels, initial_nodes, kept, thresholds
 from gsx.backbones.sampling import sampled_means
-from gsx.core.density import Table
+from gsx.core.density import Table, within_room
 from gsx.core.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
 
@@ -122,11 +122,7 @@ def without_bias(rows: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def chosen_places(new: dict[str, Tensor], gradient: Float[Tensor, "M"], levels: Levels, room: int) -> Bool[Tensor, "M"]:
     """Of new Gaussians those that enough cameras would draw (spec 3.4), at most `room`: of the largest gradients."""
-    seen = kept(levels, new["means"], new["level"])
-    if int(seen.sum()) <= room:
-        return seen
-    ranked = torch.where(seen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
-    return torch.zeros_like(seen).index_fill_(0, ranked, True)
+    return within_room(kept(levels, new["means"], new["level"]), gradient, room)
 
 
 def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
-from gsx.core.density import Table, append_rows, keep_rows
+from gsx.core.density import Table, append_rows, keep_rows, within_room
 from gsx.core.shapes import Bool, Float, Int
 
 
@@ -182,10 +182,8 @@ def some(sprouts: Sprouts, keep: Bool[Tensor, "U"]) -> Sprouts:
 
 def strongest(sprouts: Sprouts, room: int) -> Sprouts:
     """At most `room` of them, those with the largest gradients."""
-    if len(sprouts.positions) <= room:
-        return sprouts
-    chosen = sprouts.strength.argsort(descending=True, stable=True)[: max(0, room)]
-    return some(sprouts, torch.zeros_like(sprouts.strength, dtype=torch.bool).index_fill_(0, chosen, True))
+    everyone = torch.ones_like(sprouts.strength, dtype=torch.bool)
+    return some(sprouts, within_room(everyone, sprouts.strength, max(0, room)))
 
 
 def offset_means(table: Table) -> Float[Tensor, "N k 3"]:

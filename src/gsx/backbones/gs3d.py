@@ -31,7 +31,6 @@ from gsx.backbones.levels import (
     facts_of,
     note_of,
     quantile,
-    unlocked,
     warnings_of,
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
@@ -47,6 +46,7 @@ from gsx.core.density import (
     reset_column,
     restored_table,
     table_tensors,
+    within_room,
 )
 from gsx.core.errors import InputError
 from gsx.core.export import columns_of
@@ -269,7 +269,7 @@ class GS3D:
     def highest(self) -> int:
         """Highest level that takes part at this step (spec 3.6)."""
         assert self.levels is not None
-        return min(self.levels.count - 1, unlocked(self.levels.switches, self.levels.first, self.step))
+        return self.levels.highest(self.step)
 
     def extents(self, shown: Shown) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
         """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
@@ -389,8 +389,7 @@ class GS3D:
         cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
         children_made = small_children(raw, split, levels, control.shrink, self.generator)
         new = stacked([clones(raw, cloned), children_made])
-        room = max(0, self.options.max_primitives - len(self.table))
-        keep = chosen_places(new, gradient[torch.cat([cloned, split])], levels, room)
+        keep = chosen_places(new, gradient[torch.cat([cloned, split])], levels, self.room())
         bias_levels(self.table, verdict.biased, control.bias_step)
         append_rows(self.table, {name: value[keep] for name, value in new.items()})
         pruned = self.prune(step)
@@ -411,11 +410,11 @@ class GS3D:
 
     def within_cap(self, gradient: Float[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Of the chosen, those with the largest gradients that fit under max_primitives (each adds one)."""
-        room = max(0, self.options.max_primitives - len(self.table))
-        if int(chosen.sum()) <= room:
-            return chosen
-        ranked = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
-        return torch.zeros_like(chosen).index_fill_(0, ranked, True)
+        return within_room(chosen, gradient, self.room())
+
+    def room(self) -> int:
+        """Primitives that may be added under max_primitives."""
+        return max(0, self.options.max_primitives - len(self.table))
 
     def clone_and_split(self, cloned: Bool[Tensor, "N"], split: Bool[Tensor, "N"]) -> None:
         """Rows become: survivors, clones, first children, second children."""

@@ -175,6 +175,10 @@ class Levels:
         """World positions of nodes, float32."""
         return (cells.double() * self.size(level) + self.origin).float()
 
+    def highest(self, step: int) -> int:
+        """Highest level that takes part at a step (spec 3.6)."""
+        return min(self.count - 1, unlocked(self.switches, self.first, step))
+
     def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
         """L* = log_f(D / (s d)), finite everywhere (spec 3.5)."""
         nearness = self.farthest / (coarseness * distances).clamp_min(LEAST_DISTANCE * self.farthest)

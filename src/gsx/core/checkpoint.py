@@ -75,6 +75,11 @@ def sidecars(folder: Path) -> list[Path]:
     return sorted(folder.glob("step_*.json"))
 
 
+def step_of(sidecar: Path) -> int:
+    """The step a checkpoint was written at."""
+    return int(sidecar.stem.removeprefix("step_"))
+
+
 def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Sidecar and tensors of one checkpoint.
 

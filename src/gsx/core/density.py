@@ -84,6 +84,14 @@ def keep_rows(table: Table, kept: Bool[Tensor, "N"]) -> None:
         table.columns[name] = column[kept]
 
 
+def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
+    """Of the chosen rows those with the largest gradients, at most `room`."""
+    if int(chosen.sum()) <= room:
+        return chosen
+    ranked = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
+    return torch.zeros_like(chosen).index_fill_(0, ranked, True)
+
+
 def reset_column(table: Table, name: str, values: Tensor) -> None:
     """Replace all values of one parameter and zero its moments."""
     edit(table, name, lambda old: values, torch.zeros_like)

@@ -21,6 +21,7 @@ from gsx.core.metrics import bicubic, psnr, quantise
 from gsx.core.run import Run
 from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.core.window import Window
 
 SHOWN = 6
 """Test views that are drawn."""
@@ -47,20 +48,6 @@ ERROR_COLOURS = (
     (1.00, (253, 250, 190)),
 )
 """Error divided by ERROR_FULL and its display RGB. CIE lightness rises evenly, so equal steps look equal."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """A rectangle of a raster, px."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    def cut(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-        """The part of an image inside the window."""
-        return image[:, self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -> None:
@@ -229,7 +216,7 @@ def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
 
 def cropped(view: View, window: Window) -> View:
     """The view through a window of its raster."""
-    return replace(view, camera=view.camera.crop(window.left, window.top, window.width, window.height))
+    return replace(view, camera=window.of(view.camera))
 
 
 def resized_window(

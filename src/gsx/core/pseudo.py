@@ -1,5 +1,6 @@
 """Pseudo details: pictures that nobody took, which training uses as truth for a while (spec 1.1-1.3)."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, Frame
+from gsx.core.files import replace_file
 from gsx.core.regenerator import Regenerator, box_average
 from gsx.core.scene import Scene
 from gsx.core.shapes import Float, UInt8
@@ -100,11 +102,7 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView) -> Float[Tensor
 
 def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
     """Write pseudo views and `facts` as one safetensors file, whole or not at all."""
-    import json
-
     from safetensors.torch import save
-
-    from gsx.core.files import replace_file
 
     tensors: dict[str, Tensor] = {}
     listed = []
@@ -135,8 +133,6 @@ def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
     Raises:
         OSError, ValueError: the file cannot be read.
     """
-    import json
-
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -151,8 +147,6 @@ def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
 
 def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> PseudoView:
     """One view of a file."""
-    from gsx.core.camera import Frame
-
     values = dict(entry["camera"])
     frame = values.pop("cut_from")
     corner = None if frame is None else Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])

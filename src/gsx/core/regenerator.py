@@ -18,6 +18,8 @@ LEAST_AGREEMENT = 30.0
 """Least PSNR between an upscaled picture, box-averaged, and what it was made from, dB (spec 6.4)."""
 LEAST_SLOPE = 1e-3
 """Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
+PROJECTIONS = 5
+"""Rounds of projection and clamping; each halves what clamping undid (spec 5.3)."""
 LARGEST_SHIFT = 0.25
 """Largest displacement, px of the input (spec 1.5)."""
 
@@ -87,6 +89,18 @@ class Checked(Protocol):
 def box_average(image: Float[Tensor, "C H W"], factor: int) -> Float[Tensor, "C h w"]:
     """Means over blocks of factor x factor pixels."""
     return torch.nn.functional.avg_pool2d(image[None], factor)[0] if factor > 1 else image
+
+
+def as_blocks(image: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
+    """Every pixel as a block of factor x factor."""
+    return image.repeat_interleave(factor, -2).repeat_interleave(factor, -1)
+
+
+def projected(image: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"], factor: int) -> Float[Tensor, "3 H W"]:
+    """The nearest picture with that box average, clamped to [0, 1]: D D^T = I / a^2, so errors are spread evenly."""
+    for _ in range(PROJECTIONS):
+        image = (image + as_blocks(low - box_average(image, factor), factor)).clamp(0, 1)
+    return image
 
 
 def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3"]:

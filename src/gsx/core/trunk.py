@@ -70,7 +70,7 @@ def sources() -> str:
 def adopt(run: Run, folder: Path) -> None:
     """Bring a new run to the latest state that it has in common with an earlier one, if there is any."""
     common = common_steps(run)
-    for sidecar in reversed([path for path in checkpoint.sidecars(folder) if step_of(path) <= common]):
+    for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
             checkpoint.read(sidecar)
         except CheckpointError as error:
@@ -90,11 +90,6 @@ def branch(run: Run, sidecar: Path) -> None:
     (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
     checkpoint.restore(run)
     logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
-
-
-def step_of(sidecar: Path) -> int:
-    """The step a checkpoint was written at."""
-    return int(sidecar.stem.removeprefix("step_"))
 
 
 def lines_of(sidecar: Path) -> list[dict[str, Any]]:
@@ -123,7 +118,7 @@ class TrunkKeeper:
     def keep(self, run: Run) -> None:
         """Write the state where other runs look for it."""
         folder = make_folder(self.folder)
-        if any(step_of(path) == run.step for path in checkpoint.sidecars(folder)):
+        if any(checkpoint.step_of(path) == run.step for path in checkpoint.sidecars(folder)):
             return
         write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
         checkpoint.write(run, folder)

@@ -1,7 +1,7 @@
 """Super-resolution learnt from the scene's own photographs (spec 5.3; the idea: ZSSR, Shocher et al. 2018).
 
 Photographs reduced by two, and themselves, are pairs of input and truth; textures that recur at several distances are
-what it learns. Every picture it gives back reduces to its input (`augmenters.consistency`), x4 and x8 by recursion.
+what it learns. Every picture it gives back reduces to its input (`core.regenerator.projected`), x4 and x8 by recursion.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from gsx.core.cache import cache_folder, content_key
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
-from gsx.core.regenerator import Material, Request, box_average
+from gsx.core.regenerator import Material, Request, projected
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 
@@ -29,8 +29,6 @@ logger = logging.getLogger(__name__)
 
 STEP = 2
 """Factor of one application."""
-ROUNDS = 5
-"""Of back-projection."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +91,6 @@ class SceneSR:
     def __init__(self, options: SceneSROptions) -> None:
         self.options = options
         self.network: Enlarger | None = None
-        self.figures: dict[str, float] = {}
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
         """It doubles, any number of times."""
@@ -115,11 +112,11 @@ class SceneSR:
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
         loss, whole = train(self.network, photos, self.options, material.seed)
-        self.figures = {"seconds": time.perf_counter() - begun, "loss": loss}
-        logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), self.figures["seconds"])
+        seconds = time.perf_counter() - begun
+        logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
         if whole:
             write_network(path, self.network)
-        return self.figures
+        return {"seconds": seconds, "loss": loss}
 
     @torch.no_grad()
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
@@ -132,16 +129,8 @@ def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
     """One picture, doubled until it is large enough."""
     image = request.image.to(next(network.parameters()).device)
     for _ in range(round(math.log2(request.scale))):
-        image = back_projected(network(image[None])[0], image)
+        image = projected(network(image[None])[0], image, STEP)
     return image
-
-
-def back_projected(large: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
-    """The nearest picture whose box average is `low`, in [0, 1]."""
-    for _ in range(ROUNDS):
-        missing = low - box_average(large, STEP)
-        large = (large + missing.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2)).clamp(0, 1)
-    return large
 
 
 # -- learning ----------------------------------------------------------------------------------------------------------
