@@ -255,7 +255,7 @@ def three_levels(*, farthest: float = 1e9, threshold: float = 0.0, count: int = 
     views = Viewpoints(centres=torch.zeros(1, 3), coarseness=torch.ones(1), focal=50.0)
     return Levels(
         count=count, fork=2, nearest=1.0, farthest=farthest, origin=origin, extent=16.0, base_layer=2, first=0,
-        switches=(), threshold=threshold, mode="round", half_cell=False, views=views,
+        switches=(), threshold=threshold, mode="round", half_cell=False, zoom="finer", views=views,
     )  # fmt: skip
 
 

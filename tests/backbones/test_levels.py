@@ -48,6 +48,7 @@ PUBLISHED = LevelOptions(
     visible_threshold=0.0,
     mode="round",
     half_cell=False,
+    zoom="finer",
     coarse_until=10000,
     coarse_factor=1.5,
 )
@@ -305,6 +306,15 @@ def test_zooming_in_four_times_draws_two_levels_more():
     levels, camera = single(count=9), camera_at(0, 0, 0)
     distances = [7.0, 3.0, 1.0]
     assert tops(levels, camera.zoom(4), distances) == [top + 2 for top in tops(levels, camera, distances)]
+
+
+def test_levels_can_end_with_those_of_the_finest_training_camera():
+    """Zoomed in it draws what training drew; a camera half as fine still draws a level less."""
+    levels, camera = replace(single(count=9), zoom="training"), camera_at(0, 0, 0)
+    distances = [7.0, 3.0, 1.0]
+    own = tops(levels, camera, distances)
+    assert tops(levels, camera.zoom(4), distances) == own
+    assert tops(levels, camera.zoom(0.5), distances) == [max(0, top - 1) for top in own]
 
 
 @pytest.mark.parametrize("farthest", [1e-3, 8.0, 1e4])

@@ -26,14 +26,14 @@ from gsx.augmenters.cameras import (
     window_size,
     worst_window,
 )
-from gsx.augmenters.consistency import exactly_consistent
+from gsx.augmenters.consistency import consistent_share, exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.augmenters.trust import agreeing, in_bytes, sampled_better
 from gsx.core.camera import Camera
 from gsx.core.checkpoint import sidecars, step_of
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import to_uint8, write_image
-from gsx.core.material import material_of, rendered
+from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
 from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint
@@ -50,6 +50,8 @@ LEAST_WINDOW = 4
 """Narrowest window that shows anything, px."""
 MOST_DROPPED = 0.5
 """An event that loses more than this share of its pictures is an error (spec 6.4)."""
+MOST_TRIES = 10
+"""Times that a place is drawn for a window until it shows enough of the scene (spec 1.7)."""
 SHOWN = 3
 """Pictures of an event that are kept to be looked at."""
 ZOOMS = ("intrinsics", "none")
@@ -141,6 +143,9 @@ class PseudoOptions:
     """Results averaged for each picture (row 34)."""
     context: int
     """Pixels around the window that the regenerator also sees."""
+    least_alpha: float
+    """Windows at random places, or of cameras moved at random, are drawn again, ten times at most, while the model's
+    mean alpha in them is lower: objects fill little of their pictures (spec 1.7). 0: the first is taken."""
     project: str
     """exact: the nearest picture whose box average is its input, to the last of 8 bits (spec 5.3)."""
     weight_map: str
@@ -169,6 +174,8 @@ class PseudoOptions:
                 raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
         if self.variants < 0 or self.first_cameras < 0 or self.samples < 1 or self.context < 0:
             raise ValueError(f"{where}: variants, first_cameras and context must be at least 0, samples at least 1")
+        if not 0 <= self.least_alpha <= 1:
+            raise ValueError(f"{where}.least_alpha is {self.least_alpha}; give a coverage from 0 to 1")
         if min(self.gate, self.coarse_weight, self.gain, self.direct_weight) < 0:
             raise ValueError(f"{where}: gate, coarse_weight, gain and direct_weight must be at least 0")
         if not self.base and self.variants == 0:
@@ -359,6 +366,10 @@ class PseudoDetails:
             "learnt": learnt,
         }
         trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
+        kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
+        if kept:
+            facts["consistent"] = sum(kept) / len(kept)
+            logger.info("%s: %.1f%% consistent pixels", self.setting.name, 100 * facts["consistent"])
         if trusted:
             masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
             facts["masked"] = masked
@@ -388,8 +399,7 @@ class PseudoDetails:
         )
         zoom = scale if options.zoom == "intrinsics" else 1
         size = window_size(own.width, own.height, options.narrow, zoom)
-        pose = own if variant == 0 else self.beside(own, scale, generator)
-        window = self.placed(run, parent, pose, size, event, variant, generator)
+        pose, window = self.looking(run, event, parent, scale, variant, size, generator)
         outer = window.grown(options.context, own.width, own.height)
         inside = Window(
             left=window.left - outer.left, top=window.top - outer.top, width=window.width, height=window.height
@@ -412,6 +422,26 @@ class PseudoDetails:
             if options.seeds == "fixed"
             else number_of(self.setting.seed, "noise", event, parent, scale, variant),
         )
+
+    def looking(
+        self,
+        run: Run,
+        event: int,
+        parent: int,
+        scale: int,
+        variant: int,
+        size: tuple[int, int],
+        generator: torch.Generator,
+    ) -> tuple[Camera, Window]:
+        """(camera, window) of a pseudo view; of those drawn at random the first that shows enough of the scene."""
+        own, options = run.scene.train[parent].camera, self.options
+        drawn = variant > 0 or options.window == "random"
+        for _ in range(MOST_TRIES if drawn and options.least_alpha else 1):
+            pose = own if variant == 0 else self.beside(own, scale, generator)
+            window = self.placed(run, parent, pose, size, event, variant, generator)
+            if not options.least_alpha or not drawn or coverage(run, window.of(pose)) >= options.least_alpha:
+                break
+        return pose, window
 
     def beside(self, camera: Camera, scale: int, generator: torch.Generator) -> Camera:
         """A camera near a training camera."""
@@ -495,6 +525,8 @@ class PseudoDetails:
             target = exactly_consistent(result, to_uint8(request.image), a)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
+        truth = inside.cut(to_uint8(request.image)) if request.photo and a > 1 else None
+        shares = {} if truth is None else {"consistent": consistent_share(kept, truth, a)}
         known = request.photo and a > 1 and self.options.coarse_weight > 0
         return PseudoView(
             camera=sketch.camera,
@@ -511,6 +543,7 @@ class PseudoDetails:
                 "source": "photo" if request.photo else "render",
                 "seed": request.seed,
                 "strength": request.strength,
+                **shares,
                 "sha256": hashlib.sha256(kept.numpy().tobytes()).hexdigest(),
             },
         )

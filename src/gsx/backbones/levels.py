@@ -21,6 +21,7 @@ from gsx.core.shapes import Bool, Float, Int
 
 MODES = ("round", "floor", "ceil", "progressive")
 EXTEND_RULES = ("reference", "sane")
+ZOOM_RULES = ("finer", "training")
 BELOW_ONE = 0.9999
 """Largest fading weight and largest fraction of a level in progressive mode (spec 3.7); largest adaptive threshold."""
 LEAST_DISTANCE = 1e-8
@@ -61,6 +62,9 @@ class LevelOptions:
     """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (spec 3.7)."""
     half_cell: bool
     """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5)."""
+    zoom: str
+    """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
+    reference does, trained there or not; training: none that the finest training camera would not draw."""
     coarse_until: int
     """Published step at which all levels take part in training (spec 3.6); 0: from the start."""
     coarse_factor: float
@@ -70,6 +74,7 @@ class LevelOptions:
         threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES)
         self.demand("mode", self.mode in MODES, f"choose {', '.join(MODES)}")
         self.demand("extend_rule", self.extend_rule in EXTEND_RULES, f"choose {rules}")
+        self.demand("zoom", self.zoom in ZOOM_RULES, f"choose {', '.join(ZOOM_RULES)}")
         self.demand("fork", self.fork >= 2, "give at least 2")
         self.demand("count", self.count == -1 or self.count >= 1, "give at least 1, or -1 to take it from the scene")
         self.demand("first", self.first >= -1, "give a level from 0, or -1 for half of them")
@@ -147,6 +152,7 @@ class Levels:
     """Least fraction of cameras that must draw a primitive; see `LevelOptions.visible_threshold`."""
     mode: str
     half_cell: bool
+    zoom: str
     views: Viewpoints
 
     @property
@@ -178,6 +184,11 @@ class Levels:
     def highest(self, step: int) -> int:
         """Highest level that takes part at a step (spec 3.6)."""
         return min(self.count - 1, unlocked(self.switches, self.first, step))
+
+    def coarseness(self, camera: Camera) -> float:
+        """Focal length of the finest training camera over this one's; at least 1 where levels end with training."""
+        ratio = self.views.focal / camera.fx
+        return max(1.0, ratio) if self.zoom == "training" else ratio
 
     def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
         """L* = log_f(D / (s d)), finite everywhere (spec 3.5)."""
@@ -212,6 +223,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         threshold=options.visible_threshold,
         mode=options.mode,
         half_cell=options.half_cell,
+        zoom=options.zoom,
         views=views,
     )
     return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_seen(points, levels))
@@ -343,7 +355,7 @@ def drawn(
     """
     shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
     distances = (positions.detach() + shift - camera.centre.to(positions)).norm(dim=1)
-    ideal = levels.ideal(distances, levels.views.focal / camera.fx)
+    ideal = levels.ideal(distances, levels.coarseness(camera))
     top, weight = whole_level(ideal + bias.detach(), levels.mode, highest)
     return of <= top, torch.where(of == top, weight, 1.0)
 

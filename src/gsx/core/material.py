@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.evaluate import render_tiled
+from gsx.core.rasterizer import rasterize
 from gsx.core.regenerator import Material
 from gsx.core.run import Run
 from gsx.core.shapes import Float
@@ -18,6 +19,13 @@ def rendered(run: Run, camera: Camera) -> Float[Tensor, "3 h w"]:
     """The model as it is now."""
     run.backbone.begin(max(1, run.step))
     return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, TILE_PIXELS).image
+
+
+@torch.no_grad()
+def coverage(run: Run, camera: Camera) -> float:
+    """Mean alpha of the model as it is now, 0 to 1: how much of the picture shows the scene."""
+    run.backbone.begin(max(1, run.step))
+    return float(rasterize(run.backbone.splats(camera), camera, run.raster).alpha.mean())
 
 
 def material_of(run: Run, seed: int) -> Material:
