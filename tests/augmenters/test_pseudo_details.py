@@ -17,7 +17,7 @@ from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import read_image
 from gsx.core.losses import photometric
-from gsx.core.material import rendered
+from gsx.core.material import coverage, rendered
 from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.rasterizer import rasterize
 from gsx.core.regenerator import Material
@@ -71,7 +71,7 @@ def own_loss(run: Run, view: int) -> Tensor:
 ])  # fmt: skip
 def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_path: Path) -> None:
     """(1 - lambda) L_o + lambda / M sum L1, or L_o + 1 / M sum L1, with its gradients."""
-    run = run_at(tmp_path / "run", 44, f"backbone={backbone}", "augmenter=upscale", f"augmenter.upscale.mode={mode}")
+    run = run_at(tmp_path / "run", 44, f"backbone={backbone}", "augmenter=upscale_paper", f"augmenter.upscale.mode={mode}")
     picked = run.sampler.count - 1
     run.sampler.order = [picked]
     step = backward(run)
@@ -96,7 +96,7 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
 
 def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Path) -> None:
     """(1 - lambda_b) L_o + L_b + sum L1 / M: only the upscaling term is added (spec 1.3)."""
-    run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale,bootstrap]")
+    run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
     run.backbone.discard()
@@ -105,7 +105,7 @@ def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Pa
 
 def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
     """Of the window's render, not of the whole zoomed canvas that it is cut from (spec 1.4, 28)."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     view = run.scene.train[0].camera.crop(18, 13, 12, 9).zoom(2)
     rendering = rasterize(run.backbone.splats(view), view, run.raster)
     places, depth = view.project(run.backbone.table["means"].detach())  # type: ignore[attr-defined]
@@ -118,7 +118,7 @@ def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
 
 
 def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale,bootstrap]")
+    run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
     run.backbone.discard()
@@ -145,7 +145,7 @@ def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_pat
 
 
 def test_freezing_for_half_of_a_window(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     half = by_options(run, freeze_shared="half")
     view = PseudoView(camera=run.scene.train[0].camera, target=torch.zeros(3, 36, 48, dtype=torch.uint8), parent=0)
     found = [half.weighted(run, [view], 0.0, place) for place in (0.0, 0.49, 0.5, 1.0)]
@@ -169,14 +169,14 @@ def compose_camera() -> Any:
 
 def test_pixels_of_small_windows_can_weigh_like_those_of_whole_pictures(tmp_path: Path) -> None:
     """48 x 36 px: windows of 12 x 9 seen at 24 x 18 are a quarter of the pixels."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.per_pixel=true")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.per_pixel=true")
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([0.25 / 3] * 3)
 
 
 def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.scales=[2,4]")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.scales=[2,4]")
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 6] * 6)
@@ -190,7 +190,7 @@ def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
 
 def test_views_of_an_event(tmp_path: Path) -> None:
     """One zoomed copy of every training camera and two moved ones; the copy shows the photograph's own window."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     augmenter_of(run).term(run, 45, 0)
     for parent, views in augmenter_of(run).views.items():
         own = run.scene.train[parent].camera
@@ -211,7 +211,7 @@ def test_views_of_an_event(tmp_path: Path) -> None:
 
 
 def test_exact_projection_gives_back_the_photograph(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.project=exact")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.project=exact")
     augmenter_of(run).term(run, 45, 0)
     for parent, views in augmenter_of(run).views.items():
         sums = views[0].target.long().view(3, 9, 2, 12, 2).sum((2, 4))
@@ -231,7 +231,7 @@ def test_restored_views_show_what_the_model_shows(tmp_path: Path) -> None:
 
 
 def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.zoom=none")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.zoom=none")
     augmenter_of(run).term(run, 45, 0)
     for views in augmenter_of(run).views.values():
         for view in views:
@@ -241,7 +241,7 @@ def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("window", ["center", "random", "grid", "error"])
 def test_windows_lie_inside_the_raster(window: str, tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", f"augmenter.upscale.window={window}")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", f"augmenter.upscale.window={window}")
     augmenter_of(run).term(run, 45, 0)
     places = set()
     for parent, views in augmenter_of(run).views.items():
@@ -254,14 +254,14 @@ def test_windows_lie_inside_the_raster(window: str, tmp_path: Path) -> None:
 
 
 def test_only_the_first_cameras(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.first_cameras=2")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.first_cameras=2")
     assert augmenter_of(run).term(run, 45, 5) is None
     assert sorted(augmenter_of(run).views) == [0, 1]
 
 
 def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     """Level of detail counts distances in focal lengths: at twice the focal length a level more is drawn (1.4)."""
-    run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "augmenter=upscale")
+    run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "augmenter=upscale_paper")
     own = run.scene.train[0].camera
     run.backbone.begin(80)
     levels = [int(run.backbone.drawn(c).rows.numel()) for c in (own, own.crop(18, 13, 12, 9).zoom(4))]  # type: ignore[attr-defined]
@@ -271,7 +271,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
 
 
 def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=[upscale,bootstrap]")
+    run = run_at(tmp_path / "run", 44, "augmenter=[upscale_paper,bootstrap]")
     held_out = {view.name for view in run.scene.test}
     run.sampler.order = [0]
     backward(run)
@@ -286,7 +286,7 @@ def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
 
 
 def test_scales_in_turn(tmp_path: Path) -> None:
-    words = ("augmenter=upscale", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true",
+    words = ("augmenter=upscale_paper", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true",
              "augmenter.upscale.narrow=1.0")  # fmt: skip
     augmenter = augmenter_of(run_at(tmp_path / "run", 44, *words))
     assert [augmenter.scales_of(event) for event in augmenter.events] == [[2]] * 3 + [[4]] * 3 + [[8]] * 3
@@ -294,7 +294,7 @@ def test_scales_in_turn(tmp_path: Path) -> None:
 
 def test_a_known_lower_resolution_enters_the_loss(tmp_path: Path) -> None:
     """Only where the photograph is known: the zoomed copy of the training camera."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "augmenter.upscale.coarse_weight=0.5")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.coarse_weight=0.5")
     augmenter_of(run).term(run, 45, 0)
     base, *moved = augmenter_of(run).views[0]
     assert all(view.coarse is None for view in moved)
@@ -310,13 +310,47 @@ def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path
     """At the training cameras' own density nothing is finer; zoomed in twice almost everything is."""
     shares = []
     for scale in (1, 2):
-        words = ("augmenter=upscale", "augmenter.upscale.weight_map=splatsure", f"augmenter.upscale.scales=[{scale}]")
+        words = ("augmenter=upscale_paper", "augmenter.upscale.weight_map=splatsure", f"augmenter.upscale.scales=[{scale}]")
         run = run_at(tmp_path / f"run{scale}", 44, *words)
         augmenter_of(run).term(run, 45, 0)
         views = [view for views in augmenter_of(run).views.values() for view in views]
         trust = [1.0 if view.trust is None else float(view.trust.float().mean()) / 255 for view in views]
         shares.append(sum(trust) / len(trust))
     assert shares[0] < 0.5 < shares[1]
+
+
+def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
+    """Of a scene of which nothing is left but what the left of each picture shows."""
+    words = ("augmenter=upscale_paper", "augmenter.upscale.variants=0", "augmenter.upscale.window=random")
+    run = run_at(tmp_path / "run", 44, *words, "augmenter.upscale.scales=[4]")
+    least = {}
+    for wanted in (0.0, 0.8):
+        alphas = []
+        for parent, view in enumerate(run.scene.train):
+            table = run.backbone.table  # type: ignore[attr-defined]
+            places, _ = view.camera.project(table["means"].detach())
+            kept = table["opacity_logits"].detach().clone()
+            table["opacity_logits"].data.copy_(torch.where(places[:, :1] > 16, -30.0, 0.0).view_as(kept))
+            augmenter = by_options(run, least_alpha=wanted)
+            sketch = augmenter.sketch(run, 44, parent, 4, 0)
+            alphas.append(coverage(run, sketch.inside.of(sketch.seen)))
+            table["opacity_logits"].data.copy_(kept)
+        least[wanted] = min(alphas)
+    assert least[0.0] < 0.5
+    assert least[0.8] >= 0.8
+
+
+@pytest.mark.parametrize(("words", "least"), [(("augmenter.upscale.project=exact",), 1.0), ((), 0.0)])
+def test_the_share_of_consistent_pixels_is_told(
+    words: tuple[str, ...], least: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Lanczos' filter does not give the photograph back when it is averaged; its exact projection does."""
+    caplog.set_level("INFO")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *words)
+    augmenter_of(run).term(run, 45, 0)
+    share = load_views(augmenter_of(run).path(run, 44))[1]["consistent"]
+    assert share == 1.0 if least else 0.0 < share < 0.9
+    assert f"{100 * share:.1f}% consistent pixels" in caplog.text
 
 
 # -- regenerators that fail --------------------------------------------------------------------------------------------
@@ -358,7 +392,7 @@ def with_regenerator(run: Run, regenerator: Any) -> PseudoDetails:
 def test_pictures_that_cannot_be_used_are_dropped_and_counted(
     reason: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     augmenter = with_regenerator(run, Spoiling(3, SPOILT[reason]))
     augmenter.term(run, 45, 0)
     assert sum(map(len, augmenter.views.values())) == 12
@@ -367,7 +401,7 @@ def test_pictures_that_cannot_be_used_are_dropped_and_counted(
 
 
 def test_an_event_that_loses_most_pictures_is_an_error(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at step 44.*regenerator/upscale"):
         with_regenerator(run, Spoiling(1, SPOILT["not finite"])).term(run, 45, 0)
 
@@ -380,7 +414,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
                 for image, request in zip(super().regenerate(requests), requests, strict=True)
             ]
 
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     plain = with_regenerator(run, Spoiling(10**9, None))
     plain.term(run, 45, 0)
     errors = []
@@ -399,7 +433,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
 RUN = (
     "iterations=40",
     *PLAIN,
-    "augmenter=[upscale,bootstrap]",
+    "augmenter=[upscale_paper,bootstrap]",
     "augmenter.upscale.timing.every=4000",
     "augmenter.bootstrap.timing.every=4000",
     "augmenter.upscale.timing.span=2000",  # two steps: a run can be stopped inside a window
@@ -543,10 +577,11 @@ def test_files_hold_everything(tmp_path: Path) -> None:
     ("augmenter.upscale.timing.span=2001", "windows would overlap"),
     ("augmenter.upscale.narow=0.5", "Did you mean"),
     ("augmenter.upscale.samples=0", "samples at least 1"),
+    ("augmenter.upscale.least_alpha=2", "give a coverage from 0 to 1"),
 ])  # fmt: skip
 def test_options_are_checked(word: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
-        compose(["augmenter=upscale", *word.split()], plugins())
+        compose(["augmenter=upscale_paper", *word.split()], plugins())
 
 
 def test_unknown_augmenters_get_the_nearest_name() -> None:
@@ -569,7 +604,7 @@ def term_of(run: Run) -> Term | None:
 
 def test_the_oracle_gives_the_true_pixels(tmp_path: Path) -> None:
     """The built-in scene has truth at any density; of cameras moved at random the untrained model shows another one."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale", "regenerator/upscale=oracle", "scene.samples=16",
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "regenerator/upscale=oracle", "scene.samples=16",
                  "augmenter.upscale.variants=0")  # fmt: skip
     assert term_of(run) is not None
     view = augmenter_of(run).views[0][0]
@@ -578,7 +613,7 @@ def test_the_oracle_gives_the_true_pixels(tmp_path: Path) -> None:
 
 
 def test_what_cannot_work_is_refused_before_training(tmp_path: Path) -> None:
-    up, boot = "augmenter=upscale", "augmenter=bootstrap"
+    up, boot = "augmenter=upscale_paper", "augmenter=bootstrap"
     for words, complaint in {
         (up, "augmenter.upscale.scales=[3]", "regenerator/upscale=scene_sr"): "x2, x4, x8, not x3",
         (boot, "augmenter.bootstrap.scales=[2]"): "identity cannot enlarge x2",

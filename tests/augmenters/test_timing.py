@@ -18,7 +18,7 @@ def schedule(iterations: int = 40000, published: int = 40000) -> Schedule:
 
 
 def test_the_shipped_options_are_the_papers() -> None:
-    found = compose(["augmenter=[upscale,bootstrap]"], plugins()).augmenters
+    found = compose(["augmenter=[upscale_paper,bootstrap]"], plugins()).augmenters
     up, boot = (found[name].options for name in ("upscale", "bootstrap"))
     assert (up.timing, boot.timing) == (UP, B)
     assert (up.weights, boot.weights) == ([0.1, 0.05], [0.15, 0.1])

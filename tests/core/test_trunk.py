@@ -25,7 +25,8 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def augmented(*names: str) -> tuple[str, ...]:
     """Few pseudo views of few events."""
     few = [(f"augmenter.{name}.first_cameras=2", f"augmenter.{name}.timing.every=8000") for name in names]
-    return (f"augmenter=[{','.join(names)}]", *(word for words in few for word in words))
+    files = {"upscale": "upscale_paper"}
+    return (f"augmenter=[{','.join(files.get(name, name) for name in names)}]", *(word for words in few for word in words))
 
 
 def final_tensors(folder: Path) -> dict[str, Tensor]:
@@ -43,7 +44,7 @@ def lines(folder: Path) -> list[dict]:
 
 
 def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The control trains all of it and leaves states at 10, 15, 20, 22; bootstrap branches at 20, upscale at 22."""
+    """The control trains all of it and leaves states at 10, 15, 20, 22, 30; bootstrap branches at 20, upscale at 22."""
     caplog.set_level("INFO")
     tiny_run(tmp_path / "control", (*RUN, "init=trunk"))
     assert "no earlier run" in caplog.text

@@ -57,6 +57,7 @@ SHOWN = 3
 ZOOMS = ("intrinsics", "none")
 MODES = ("auto", "hybrid", "direct")
 SOURCES = ("photo", "render")
+LOSSES = ("l1", "l2")
 REDUCTIONS = ("all", "per_scale")
 FROZEN = ("none", "half", "active")
 SEEDS = ("fixed", "per_view")
@@ -69,6 +70,7 @@ CHOICES = {
     "zoom": ZOOMS,
     "mode": MODES,
     "base_source": SOURCES,
+    "loss": LOSSES,
     "reduce": REDUCTIONS,
     "weight_split": SPLITS,
     "freeze_shared": FROZEN,
@@ -122,6 +124,9 @@ class PseudoOptions:
     """window: the first weight holds for half of each window; run: for half of the run; linear: in between (row 4)."""
     direct_weight: float
     """In direct mode, in place of lambda (row 25)."""
+    loss: str
+    """l1: mean |difference|, as in the paper; l2: mean square. Squares weigh the gaps that open between small splats;
+    |difference| weighs a softer enlargement everywhere as much."""
     gain: float
     """Of the pseudo loss, before it is weighted (row 29)."""
     per_pixel: bool
@@ -277,6 +282,7 @@ class PseudoDetails:
             taken=0.0 if direct else share,
             observed=options.densify,
             shared=not frozen,
+            squared=options.loss == "l2",
         )
 
     # -- events ----------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ class PseudoView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Term:
-    """What an augmenter adds to the loss of one step: the sum of weight times mean |render - target|."""
+    """What an augmenter adds to the loss of one step: the sum of weight times the mean difference."""
 
     name: str
     parts: Sequence[tuple[PseudoView, float]]
@@ -50,6 +50,8 @@ class Term:
     """Whether the renders count in density control (the authors' code does so)."""
     shared: bool
     """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
+    squared: bool = False
+    """Differences are (render - target)^2 instead of the paper's |render - target|."""
 
 
 @runtime_checkable
@@ -84,17 +86,18 @@ class Setting:
     """The regenerator of a role, `upscale` or `restore`."""
 
 
-def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView) -> Float[Tensor, ""]:
+def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
     """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3); that at a lower resolution
-    beside it where that is known (SRGS, spec 6.1)."""
-    difference = (image - view.target.to(image.device).float() / 255).abs()
+    beside it where that is known (SRGS, spec 6.1). `squared`: (render - target)^2 in both."""
+    size = torch.square if squared else torch.abs
+    difference = size(image - view.target.to(image.device).float() / 255)
     if view.trust is not None:
         difference = difference * (view.trust.to(image.device).float() / 255)
     if view.coarse is None:
         return difference.mean()
     reduced = box_average(image, view.camera.width // view.coarse.shape[2])
     known = view.coarse.to(image.device).float() / 255
-    return difference.mean() + view.coarse_weight * (reduced - known).abs().mean()
+    return difference.mean() + view.coarse_weight * size(reduced - known).mean()
 
 
 # -- files -------------------------------------------------------------------------------------------------------------

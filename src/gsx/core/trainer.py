@@ -98,7 +98,7 @@ def add_term(run: Run, term: Term, number: int) -> float:
             background=run.background,
             absolute_gradient=run.backbone.absolute_gradient,
         )
-        loss = weight * pseudo_loss(rendering.image, view)
+        loss = weight * pseudo_loss(rendering.image, view, term.squared)
         loss.backward()
         total += float(loss.detach())
         if term.observed and math.isfinite(total) and finite_shift(rendering):

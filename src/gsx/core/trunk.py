@@ -25,8 +25,9 @@ from gsx.core.run import Run, Step
 
 logger = logging.getLogger(__name__)
 
-SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40)
-"""Where the paper's variants begin, of a whole run: states are kept there (spec 1.8)."""
+SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
+"""Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
+(spec 1.8)."""
 BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init")
 """Keys of a composition that change nothing before the first pseudo views."""
 WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
