@@ -146,7 +146,7 @@ def make_run(folder: Path, views: int = 3, finest: float = math.inf) -> Run:
         iterations=10,
         device=torch.device("cpu"),
         generator=generator,
-        sampler=Sampler(views, generator),
+        sampler=Sampler(views, 0),
         step=10,
     )
 

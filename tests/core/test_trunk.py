@@ -26,7 +26,10 @@ def augmented(*names: str) -> tuple[str, ...]:
     """Few pseudo views of few events."""
     few = [(f"augmenter.{name}.first_cameras=2", f"augmenter.{name}.timing.every=8000") for name in names]
     files = {"upscale": "upscale_paper"}
-    return (f"augmenter=[{','.join(files.get(name, name) for name in names)}]", *(word for words in few for word in words))
+    return (
+        f"augmenter=[{','.join(files.get(name, name) for name in names)}]",
+        *(word for words in few for word in words),
+    )
 
 
 def final_tensors(folder: Path) -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ regenerator redraw what is cut from the photograph or rendered there; compare wi
 
 import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ MOST_DROPPED = 0.5
 MOST_TRIES = 10
 """Times that a place is drawn for a window until it shows enough of the scene (spec 1.7)."""
 SHOWN = 3
-"""Pictures of an event that are kept to be looked at."""
+"""Training views of an event whose pictures are kept to be looked at."""
 ZOOMS = ("intrinsics", "none")
 MODES = ("auto", "hybrid", "direct")
 SOURCES = ("photo", "render")
@@ -260,7 +260,7 @@ class PseudoDetails:
             self.views, self.event = {}, 0
             return None
         if event != self.event:
-            self.views, self.event = by_parent(self.of_event(run, event)), event
+            self.views, self.event = by_parent(self.of_event(run, event, view)), event
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
         return self.weighted(run, self.views.get(view, []), place, inside)
@@ -287,14 +287,17 @@ class PseudoDetails:
 
     # -- events ----------------------------------------------------------------------------------------------------
 
-    def of_event(self, run: Run, event: int) -> list[PseudoView]:
+    def of_event(self, run: Run, event: int, view: int) -> list[PseudoView]:
         """The pseudo views of an event: made now, or as the run made them before it was interrupted.
+
+        Only those that steps of its window will ask for, the first of them for `view`: the others are never looked at.
 
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
         if run.step == event:
-            views, facts = self.made(run, event)
+            steps = min(self.span, run.iterations - event)
+            views, facts = self.made(run, event, {view} | run.sampler.coming(steps - 1))
             path = self.path(run, event)
             path.parent.mkdir(parents=True, exist_ok=True)
             save_views(path, views, facts)
@@ -340,19 +343,20 @@ class PseudoDetails:
                 f"cannot go on at step {run.step}; restore the file, or train anew"
             ) from error
 
-    def made(self, run: Run, event: int) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views, facts) of an event, from the model as it is now.
+    def made(self, run: Run, event: int, parents: Set[int]) -> tuple[list[PseudoView], dict[str, Any]]:
+        """(pseudo views of some training views, facts) of an event, from the model as it is now.
 
         Raises:
             TrainingError: more than half of the pictures could not be used.
         """
         regenerator = self.setting.regenerator(self.options.role)
         learnt = regenerator.prepare(material_of(run, self.setting.seed))
-        sketches = list(self.sketches(run, event))
+        sketches = list(self.sketches(run, event, parents))
         views: list[PseudoView] = []
         dropped: list[str] = []
+        shown = sorted({sketch.parent for sketch in sketches})[:SHOWN]
         for first in range(0, len(sketches), BATCH):
-            for view, problem in self.drawn(run, event, sketches[first : first + BATCH]):
+            for view, problem in self.drawn(run, event, sketches[first : first + BATCH], shown):
                 (views if view else dropped).append(view or problem)  # type: ignore[arg-type]
             logger.info(
                 "%s at step %d: %d of %d pictures", self.setting.name, event, len(views) + len(dropped), len(sketches)
@@ -364,7 +368,7 @@ class PseudoDetails:
                 f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
                 f"{dropped[0]}; choose another regenerator/{self.options.role}"
             )
-        facts = {
+        facts: dict[str, Any] = {
             "event": event,
             "iterations": self.setting.iterations,
             "made": len(views),
@@ -374,18 +378,21 @@ class PseudoDetails:
         trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
         if kept:
-            facts["consistent"] = sum(kept) / len(kept)
-            logger.info("%s: %.1f%% consistent pixels", self.setting.name, 100 * facts["consistent"])
+            share = sum(kept) / len(kept)
+            facts["consistent"] = share
+            logger.info("%s: %.1f%% consistent pixels", self.setting.name, 100 * share)
         if trusted:
             masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
             facts["masked"] = masked
             logger.info("%s: %.1f%% of the pixels do not count", self.setting.name, 100 * masked)
         return views, facts
 
-    def sketches(self, run: Run, event: int) -> Iterator[Sketch]:
-        """Cameras of an event, in the order of the training views, base before random."""
-        options, train = self.options, run.scene.train
-        for parent in range(min(options.first_cameras or len(train), len(train))):
+    def sketches(self, run: Run, event: int, parents: Set[int]) -> Iterator[Sketch]:
+        """Cameras of an event beside some training views, in the order of these, base before random."""
+        options = self.options
+        for parent in sorted(parents):
+            if options.first_cameras and parent >= options.first_cameras:
+                continue
             for scale in self.scales_of(event):
                 variants = range(0 if options.base else 1, options.variants + 1)
                 yield from (self.sketch(run, event, parent, scale, variant) for variant in variants)
@@ -486,8 +493,10 @@ class PseudoDetails:
             return worst_window((rendered(run, pose).cpu() - view.image()).abs().mean(0), size)
         return centred_window(width, height, size)
 
-    def drawn(self, run: Run, event: int, sketches: Sequence[Sketch]) -> list[tuple[PseudoView | None, str]]:
-        """(pseudo view, "") of each sketch, or (None, what is wrong with its picture)."""
+    def drawn(
+        self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]
+    ) -> list[tuple[PseudoView | None, str]]:
+        """(pseudo view, "") of each sketch, or (None, what is wrong with its picture); pictures of `shown` are kept."""
         regenerator = self.setting.regenerator(self.options.role)
         requests = [self.request(run, event, sketch) for sketch in sketches]
         results = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
@@ -498,7 +507,7 @@ class PseudoDetails:
                 result = colour_matched(request, result)
             problem = complaint(request, result)
             view = None if problem else self.view(run, event, sketch, request, result)
-            if view is not None and sketch.parent < SHOWN:
+            if view is not None and sketch.parent in shown:
                 self.show(run.folder / "pseudo", sketch, request, view)
             out.append((view, problem and f"{run.scene.train[sketch.parent].name}: {problem}"))
         return out

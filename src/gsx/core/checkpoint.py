@@ -47,6 +47,7 @@ def write(run: Run, folder: Path) -> Path:
         "step": run.step,
         "seconds": run.seconds,
         "sampler": run.sampler.order,
+        "orders": run.sampler.begun,
         "views": names_of(run),
         "sha256": hashlib.sha256(data).hexdigest(),
     }
@@ -127,8 +128,9 @@ def restore(run: Run) -> None:
     refuse_other_views(run, meta["views"])
     run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     run.backbone.restore(tensors)
-    run.sampler.order = list(meta["sampler"])
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
+    run.sampler.order = list(meta["sampler"])
+    run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
     for sidecar in sidecars(run.folder / "checkpoints"):  # newer ones are damaged; they must not outlive good ones
         if sidecar.stem > f"step_{run.step:07d}":
             sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -1,7 +1,8 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
+import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +38,34 @@ class TrainingOptions:
 
 @dataclass(eq=False)
 class Sampler:
-    """Training views without replacement, reshuffled when all have been seen (spec 7)."""
+    """Training views without replacement, reshuffled when all have been seen (spec 7).
+
+    Each order comes from the seed and its number alone, so that those to come can be told.
+    """
 
     count: int
-    generator: torch.Generator
+    seed: int
     order: list[int] = field(default_factory=list)
+    """What is left of the current order, the next one last."""
+    begun: int = 0
+    """Orders begun so far."""
 
     def next(self) -> int:
         """Index of the next view."""
         if not self.order:
-            self.order = torch.randperm(self.count, generator=self.generator).tolist()
+            self.order, self.begun = self.shuffled(self.begun), self.begun + 1
         return self.order.pop()
+
+    def coming(self, steps: int) -> set[int]:
+        """Indices of the views of the next steps."""
+        ahead = replace(self, order=list(self.order))
+        return {ahead.next() for _ in range(steps)}
+
+    def shuffled(self, number: int) -> list[int]:
+        """The order of that number."""
+        digest = hashlib.sha256(repr(("views", self.seed, number)).encode()).digest()
+        generator = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+        return torch.randperm(self.count, generator=generator).tolist()
 
 
 @dataclass(eq=False, kw_only=True)

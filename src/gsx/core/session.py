@@ -127,7 +127,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         iterations=general.iterations,
         device=device,
         generator=generator,
-        sampler=Sampler(len(scene.train), generator),
+        sampler=Sampler(len(scene.train), general.seed),
         augmenters=build_augmenters(settings, scene),
     )
 
