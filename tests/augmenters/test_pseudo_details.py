@@ -219,6 +219,24 @@ def test_views_of_an_event(tmp_path: Path) -> None:
     assert sorted(augmenter_of(run).views) == list(range(6))
 
 
+def test_only_views_that_a_window_asks_for_are_made_and_they_are_as_if_all_were(tmp_path: Path) -> None:
+    """Two steps of six views; the same pictures as in an event that needs all of them."""
+    short = ("augmenter.upscale.timing.every=1000", "augmenter.upscale.timing.span=1000")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *short)
+    coming = [run.sampler.next(), *run.sampler.coming(1)]
+    augmenter_of(run).term(run, 45, coming[0])
+    few = augmenter_of(run).views
+    assert sorted(few) == sorted(set(coming))
+    assert run.sampler.next() == coming[1]
+    whole = run_at(tmp_path / "whole", 44, "augmenter=upscale_paper")
+    augmenter_of(whole).term(whole, 45, 0)
+    assert sorted(augmenter_of(whole).views) == list(range(6))
+    for parent, views in few.items():
+        for one, other in zip(views, augmenter_of(whole).views[parent], strict=True):
+            assert torch.equal(one.target, other.target)
+            assert torch.equal(one.camera.rotation, other.camera.rotation)
+
+
 def test_exact_projection_gives_back_the_photograph(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.project=exact")
     augmenter_of(run).term(run, 45, 0)
