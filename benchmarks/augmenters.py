@@ -31,6 +31,8 @@ SUBJECTS = {
     "fox": ("scene=colmap", "scene.downscale=8"),
 }
 ORACLE = ("augmenter=upscale", "regenerator/upscale=oracle")
+PHOTOGRAPHS = ("augmenter=upscale", "augmenter.upscale.scales=[1]", "augmenter.upscale.gain=16")
+"""Nothing zoomed: what squares do to the photographs themselves."""
 BOTH = "augmenter=[upscale,bootstrap]"
 
 
@@ -51,14 +53,15 @@ FAMILIES = {
             "upscale_paper": ("augmenter=upscale_paper",),
             "upscale": ("augmenter=upscale",),
             "upscale, lanczos": ("augmenter=upscale", "regenerator/upscale=lanczos"),
+            "upscale, scales=[1]": PHOTOGRAPHS,
             "upscale, oracle": ORACLE,
         },
-        once=("upscale, oracle",),
+        once=("upscale, scales=[1]", "upscale, oracle"),
     ),
     "mip_splatting": Family(
         control=("backbone=mip_splatting",),
         added={"upscale": ("augmenter=upscale",), "upscale, oracle": ORACLE},
-        once=("upscale, oracle",),
+        once=("upscale", "upscale, oracle"),
     ),
     "octree_scaffold": Family(
         control=("backbone=octree_scaffold",),
@@ -68,11 +71,12 @@ FAMILIES = {
             "upscale": ("augmenter=upscale",),
             "upscale, oracle": ORACLE,
         },
-        once=("upscale_paper + bootstrap", "upscale, oracle"),
+        once=("upscale_paper + bootstrap", "upscale", "upscale, oracle"),
     ),
     "octree_scaffold preset=octree_zoom": Family(
         control=("backbone=octree_scaffold", "preset=octree_zoom"),
         added={"upscale + bootstrap": (BOTH,)},
+        once=("upscale + bootstrap",),
     ),
 }
 
