@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, trim
 from gsx.core.errors import InputError
 
 
@@ -76,3 +76,19 @@ def test_folder_that_cannot_be_made_is_named_with_the_remedy(tmp_path: Path) -> 
 def test_folder_is_made_with_its_parents_and_may_exist(tmp_path: Path) -> None:
     assert make_folder(tmp_path / "a" / "b") == tmp_path / "a" / "b"
     assert make_folder(tmp_path / "a" / "b").is_dir()
+
+
+def test_what_was_used_longest_ago_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of five folders of 100 bytes, but never the one at hand, though it is the oldest."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path))
+    folders = [cache_folder("trunks", name) for name in "abcde"]
+    for age, folder in enumerate(folders):
+        make_folder(folder)
+        (folder / "state").write_bytes(bytes(100))
+        os.utime(folder, (1000 - age, 1000 - age))
+    make_folder(cache_folder("other", "z"))
+    assert trim("trunks", 500, folders[4]) == []
+    assert trim("trunks", 320, folders[4]) == [folders[3], folders[2]]
+    assert [folder.is_dir() for folder in folders] == [True, True, False, False, True]
+    assert trim("trunks", 0, folders[4]) == [folders[1], folders[0]]
+    assert cache_folder("other", "z").is_dir()

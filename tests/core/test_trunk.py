@@ -119,3 +119,12 @@ def test_a_cache_that_cannot_be_written_ends_no_run(
     monkeypatch.setattr("gsx.core.trunk.cache_folder", lambda kind, key: tmp_path / "blocked" / key)
     tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
     assert "the state of step 10 is not kept" in caplog.text
+
+
+def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room for one composition: the second makes the first go; a run's own states stay whatever their size."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    first = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=trunk", "trunk_gb=0"), stop_after=12)
+    folders = [trunk_folder(run, plugins().versions) for run in (first, second)]
+    assert [folder.is_dir() for folder in folders] == [False, True]

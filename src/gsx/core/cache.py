@@ -1,10 +1,14 @@
 """Where results that are dear to compute live between runs: undistorted photos, reconstructions."""
 
 import hashlib
+import logging
 import os
+import shutil
 from pathlib import Path
 
 from gsx.core.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 KEY_LETTERS = 16  # 64 bits of the digest: collisions are out of reach for any number of scenes on one machine
 
@@ -52,3 +56,28 @@ def make_folder(folder: Path) -> Path:
             "written to."
         ) from None
     return folder
+
+
+def bytes_of(folder: Path) -> int:
+    """Bytes of the files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*"))
+
+
+def trim(kind: str, budget: float, kept: Path) -> list[Path]:
+    """Remove those folders of a kind that were touched longest ago, until all hold `budget` bytes; `kept` stays.
+
+    Returns what was removed. Folders that cannot be removed stay as they are.
+
+    Raises:
+        OSError: the cache cannot be looked at.
+    """
+    folders = {path: bytes_of(path) for path in cache_folder(kind, "").glob("*") if path.is_dir()}
+    excess = sum(folders.values()) - budget
+    removed: list[Path] = []
+    for folder in sorted(folders, key=lambda path: path.stat().st_mtime_ns):
+        if excess > 0 and folder != kept:
+            shutil.rmtree(folder, ignore_errors=True)
+            logger.info("%s/%s made room in the cache (%.1f GB)", kind, folder.name, folders[folder] / 1e9)
+            excess -= folders[folder]
+            removed.append(folder)
+    return removed

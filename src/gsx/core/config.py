@@ -36,10 +36,14 @@ class GeneralOptions:
     folder: str
     init: str = "scratch"
     """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`core.trunk`)."""
+    trunk_gb: float = 10.0
+    """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
 
     def __post_init__(self) -> None:
         if self.init not in ("scratch", "trunk"):
             raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
+        if not self.trunk_gb >= 0:
+            raise ValueError(f"trunk_gb is {self.trunk_gb}; give 10^9 bytes from 0")
 
 
 @dataclass(frozen=True, kw_only=True)

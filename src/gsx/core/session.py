@@ -353,7 +353,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     log = MetricsLog(settings.evaluation)
     listeners: list[object] = [Guard(), log, Checkpointer(), Progress()]
     if run.trunk is not None:
-        listeners.append(trunk.TrunkKeeper(run.trunk))
+        listeners.append(trunk.TrunkKeeper(run.trunk, settings.general.trunk_gb * 1e9))
     try:
         with plugins.listening(listeners):
             train(run, plugins)

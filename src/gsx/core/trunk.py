@@ -16,7 +16,7 @@ import torch
 
 import gsx
 from gsx.core import checkpoint
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, trim
 from gsx.core.device import device_name
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 """Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
 (spec 1.8)."""
-BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init")
+BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init", "trunk_gb")
 """Keys of a composition that change nothing before the first pseudo views."""
 WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
 """Keys of `training` that change nothing at all."""
@@ -74,10 +74,11 @@ def adopt(run: Run, folder: Path) -> None:
     for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
             checkpoint.read(sidecar)
-        except CheckpointError as error:
+            folder.touch()  # the last to make room
+            branch(run, sidecar)
+        except (CheckpointError, OSError) as error:
             logger.warning("%s", error)
             continue
-        branch(run, sidecar)
         return
     logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
 
@@ -102,8 +103,8 @@ def lines_of(sidecar: Path) -> list[dict[str, Any]]:
 class TrunkKeeper:
     """Listener: keeps states that other runs can branch from."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, budget: float) -> None:
+        self.folder, self.budget = folder, budget
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
@@ -123,3 +124,4 @@ class TrunkKeeper:
             return
         write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
         checkpoint.write(run, folder)
+        trim("trunks", self.budget, folder)
