@@ -9,6 +9,7 @@ below --runs are not trained again. Takes one to two hours on two cores.
 
 import argparse
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -56,7 +57,7 @@ FAMILIES = {
             "upscale, scales=[1]": PHOTOGRAPHS,
             "upscale, oracle": ORACLE,
         },
-        once=("upscale, scales=[1]", "upscale, oracle"),
+        once=("upscale_paper", "upscale, lanczos", "upscale, scales=[1]", "upscale, oracle"),
     ),
     "mip_splatting": Family(
         control=("backbone=mip_splatting",),
@@ -95,10 +96,10 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def asked(family: Family, seed: int) -> dict[str, tuple[str, ...]]:
-    """What is trained with a seed, the control first: the others branch from it."""
-    added = {name: words for name, words in family.added.items() if seed == 0 or name not in family.once}
-    return {"control": (), **added}
+def asked(family: Family, once: bool) -> dict[str, tuple[str, ...]]:
+    """What is trained with every seed, the control first, for the others branch from it; or only with the first."""
+    added = {name: words for name, words in family.added.items() if (name in family.once) == once}
+    return added if once else {"control": (), **added}
 
 
 def folder_of(scene: str, family: str, name: str, seed: int, given: argparse.Namespace) -> Path:
@@ -107,16 +108,17 @@ def folder_of(scene: str, family: str, name: str, seed: int, given: argparse.Nam
     return given.runs / "".join(letter if letter.isalnum() or letter in "_-" else "-" for letter in words)
 
 
-def train_group(scene: str, family: str, seed: int, given: argparse.Namespace) -> None:
-    """A control and what branches from it, one after the other; those that are finished are left alone."""
+def train_group(scene: str, family: str, seed: int, once: bool, given: argparse.Namespace) -> None:
+    """What belongs together, one after the other; runs that are finished are left alone."""
     where = () if scene == "demo" else (f"scene.path={given.scenes / scene}",)
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    for name, words in asked(FAMILIES[family], seed).items():
+    for name, words in asked(FAMILIES[family], once).items():
         folder = folder_of(scene, family, name, seed, given)
         if (folder / "evaluation.json").is_file():
             continue
         common = (f"iterations={given.iterations}", f"seed={seed}", "init=trunk", "eval.zoom=[1,2,4]")
         command = [*SUBJECTS[scene], *where, *FAMILIES[family].control, *words, *common, f"folder={folder}"]
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
         print(time.strftime("%H:%M"), folder.name, flush=True)
         log = folder.with_suffix(".log")
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +136,7 @@ def rows_of(scene: str, family: str, given: argparse.Namespace) -> list[dict[str
     """The control's line, and those of what is added to it with their differences from it, seed by seed."""
     controls = {seed: read_evaluation(scene, family, "control", seed, given) for seed in range(given.seeds)}
     rows = []
-    for name in asked(FAMILIES[family], 0):
+    for name in ("control", *FAMILIES[family].added):
         found = {seed: read_evaluation(scene, family, name, seed, given) for seed in range(given.seeds)}
         pairs = [(own, controls[seed]) for seed, own in found.items() if own and controls[seed]]
         if pairs:
@@ -188,7 +190,8 @@ def main(words: Sequence[str]) -> None:
         print(f"the load is {load:.2f}: seconds will not be those of an idle machine", file=sys.stderr)
     scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
     families = given.families.split(",")
-    groups = [(scene, family, seed) for seed in range(given.seeds) for scene in scenes for family in families]
+    groups = [(scene, family, seed, False) for seed in range(given.seeds) for scene in scenes for family in families]
+    groups += [(scene, family, 0, True) for scene in scenes for family in families]
     with ThreadPoolExecutor(given.jobs) as pool:
         for future in [pool.submit(train_group, *group, given) for group in groups]:
             future.result()
