@@ -170,6 +170,27 @@ def test_trust_weighs_pixels() -> None:
     assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, trust=None))) == pytest.approx(0.5)
 
 
+def test_squares_in_place_of_absolute_values(tmp_path: Path) -> None:
+    """0.32 / 2 times the mean squares of two scales, by hand; what is known at a lower resolution by squares too."""
+    words = ("augmenter=upscale", "augmenter.upscale.gain=0.32")
+    run = run_at(tmp_path / "run", 60, *words)
+    run.sampler.order = [2]
+    step = backward(run)
+    run.backbone.discard()
+    views = augmenter_of(run).views[2]
+    assert [(view.provenance["scale"], view.camera.size) for view in views] == [(1, (48, 36)), (2, (48, 36))]
+    assert torch.equal(views[0].target.float() / 255, run.scene.train[2].image())
+    wanted = 0.0
+    for view in views:
+        image = rasterize(run.backbone.splats(view.camera), view.camera, run.raster, background=run.background).image
+        wanted += 0.16 * float((image.detach() - view.target.float() / 255).square().mean())
+    assert step.terms["upscale"] == pytest.approx(wanted, rel=1e-5)
+    coarse = replace(views[1], coarse=torch.zeros(3, 18, 24, dtype=torch.uint8), coarse_weight=2.0)
+    grey = views[1].target.float() / 255
+    low = torch.nn.functional.avg_pool2d(grey, 2)
+    assert float(pseudo_loss(grey, coarse, squared=True)) == pytest.approx(2 * float(low.square().mean()), rel=1e-5)
+
+
 def compose_camera() -> Any:
     from gsx.core.camera import look_at
 

@@ -325,18 +325,18 @@ class PseudoDetails:
     def recalled(self, run: Run, event: int) -> list[PseudoView]:
         """The pseudo views that the run had made before it was interrupted.
 
-        None where it was made longer since, so that its events lie elsewhere: the next one goes on.
+        None where it was made longer since, so that its events and windows lie elsewhere: the next one goes on.
 
         Raises:
             InputError: the file is gone or damaged.
         """
         path = self.path(run, event)
-        others = self.files(run)
-        if not path.is_file() and others and load_views(others[-1])[1]["iterations"] != self.setting.iterations:
-            logger.info("%s rests until its next event: the run has become longer", self.setting.name)
-            return []
+        latest = [path] if path.is_file() else self.files(run)[-1:]
         try:
-            return load_views(path)[0]
+            if latest and (found := load_views(latest[0]))[1]["iterations"] != self.setting.iterations:
+                logger.info("%s rests until its next event: the run has become longer", self.setting.name)
+                return []
+            return found[0] if latest == [path] else load_views(path)[0]
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "
