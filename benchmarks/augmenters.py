@@ -32,7 +32,7 @@ SUBJECTS = {
     "fox": ("scene=colmap", "scene.downscale=8"),
 }
 ORACLE = ("augmenter=upscale", "regenerator/upscale=oracle")
-PHOTOGRAPHS = ("augmenter=upscale", "augmenter.upscale.scales=[1]", "augmenter.upscale.gain=16")
+PHOTOGRAPHS = ("augmenter=upscale", "augmenter.upscale.scales=[1]", "augmenter.upscale.gain=3")
 """Nothing zoomed: what squares do to the photographs themselves."""
 BOTH = "augmenter=[upscale,bootstrap]"
 
