@@ -299,3 +299,31 @@ def test_eager_path_draws_what_the_naive_loop_draws() -> None:
     with torch.no_grad():
         pictures = [picture(path, splats_of(CASE, CPU), camera, settings) for path in ("eager", "naive")]
     assert torch.allclose(*pictures, atol=1e-5)
+
+
+def evaluation(psnr: float, seconds: float) -> dict:
+    zoom = {
+        factor: {"psnr": psnr - loss, "enlarged_psnr": psnr - 2} for factor, loss in zip("124", (0, 1, 3), strict=True)
+    }
+    return {"zoom": zoom, "primitives": 10, "train_seconds": seconds}
+
+
+def test_gains_of_pseudo_details_are_taken_seed_by_seed() -> None:
+    """31 and 35 against 30 and 33: gains of 1 and 2, though the means differ by more than any seed's spread."""
+    import augmenters
+
+    pairs = [(evaluation(31.0, 30.0), evaluation(30.0, 20.0)), (evaluation(35.0, 22.0), evaluation(33.0, 20.0))]
+    row = augmenters.line("gs3d", "upscale", pairs)
+    assert (row["x1"], row["gain1"]) == ("33.00", "+1.50 ± 0.50")
+    assert (row["x4"], row["gain4"], row["enlarged"]) == ("30.00", "+1.50 ± 0.50", "31.00")
+    assert (row["cost"], row["seconds"], row["seeds"]) == ("1.30", 26, 2)
+    assert "gain1" not in augmenters.line("gs3d", "control", pairs)
+
+
+def test_controls_are_trained_before_what_branches_from_them() -> None:
+    import augmenters
+
+    for family in augmenters.FAMILIES.values():
+        assert next(iter(augmenters.asked(family, False))) == "control"
+        both = {**augmenters.asked(family, False), **augmenters.asked(family, True)}
+        assert set(both) == {"control", *family.added}
