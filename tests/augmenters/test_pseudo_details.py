@@ -170,21 +170,39 @@ def test_trust_weighs_pixels() -> None:
     assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, trust=None))) == pytest.approx(0.5)
 
 
-def test_squares_in_place_of_absolute_values(tmp_path: Path) -> None:
-    """0.32 / 2 times the mean squares of two scales, by hand; what is known at a lower resolution by squares too."""
-    words = ("augmenter=upscale", "augmenter.upscale.gain=0.32")
+@pytest.mark.parametrize("background", ["false", "true"])
+def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """0.32 / 2 times the mean squares, by hand; the photograph's own scale is drawn once, unless backgrounds differ."""
+    words = ("augmenter=upscale", "augmenter.upscale.gain=0.32", f"training.random_background={background}")
     run = run_at(tmp_path / "run", 60, *words)
     run.sampler.order = [2]
+    renders = []
+    monkeypatch.setattr("gsx.core.trainer.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
     step = backward(run)
+    assert len(renders) == (3 if background == "true" else 2)
+    found = gradients(run)
     run.backbone.discard()
     views = augmenter_of(run).views[2]
     assert [(view.provenance["scale"], view.camera.size) for view in views] == [(1, (48, 36)), (2, (48, 36))]
     assert torch.equal(views[0].target.float() / 255, run.scene.train[2].image())
-    wanted = 0.0
+    pseudo = torch.zeros(())
     for view in views:
         image = rasterize(run.backbone.splats(view.camera), view.camera, run.raster, background=run.background).image
-        wanted += 0.16 * float((image.detach() - view.target.float() / 255).square().mean())
-    assert step.terms["upscale"] == pytest.approx(wanted, rel=1e-5)
+        pseudo = pseudo + 0.16 * (image - view.target.float() / 255).square().mean()
+    assert step.terms["upscale"] == pytest.approx(float(pseudo.detach()), rel=1e-5)
+    if background == "true":
+        return
+    whole = own_loss(run, 2) + pseudo
+    whole.backward()
+    assert float(step.loss) == pytest.approx(float(whole.detach()), rel=1e-5)
+    for name, gradient in run.backbone.gradients():
+        torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
+
+
+def test_what_is_known_at_a_lower_resolution_counts_by_squares_too(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 60, "augmenter=upscale")
+    augmenter_of(run).term(run, 61, 2)
+    views = augmenter_of(run).views[2]
     coarse = replace(views[1], coarse=torch.zeros(3, 18, 24, dtype=torch.uint8), coarse_weight=2.0)
     grey = views[1].target.float() / 255
     low = torch.nn.functional.avg_pool2d(grey, 2)

@@ -64,6 +64,12 @@ class Camera:
         """(width, height) in pixels."""
         return self.width, self.height
 
+    def draws_as(self, other: "Camera") -> bool:
+        """Whether both draw the same picture, bit for bit."""
+        numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")
+        alike = all(getattr(self, name) == getattr(other, name) for name in numbers)
+        return alike and torch.equal(self.rotation, other.rotation) and torch.equal(self.translation, other.translation)
+
     def resize(self, width: int, height: int) -> "Camera":
         """The same field of view on another raster; intrinsics scale per axis."""
         sx, sy = width / self.width, height / self.height

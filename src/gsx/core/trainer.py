@@ -3,13 +3,15 @@
 import logging
 import math
 import time
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from gsx.core.camera import Camera
 from gsx.core.losses import photometric
 from gsx.core.plugins import Plugins
-from gsx.core.pseudo import Term, pseudo_loss
+from gsx.core.pseudo import PseudoView, Term, pseudo_loss
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.run import Run, Step
 from gsx.core.shapes import Float
@@ -55,7 +57,8 @@ def backward(run: Run) -> Step:
     """Render the next view, and the pseudo views that go with it, and send the loss back (spec 1.3).
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
-    gathered from them is forgotten before anything else adds to it.
+    gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
+    compared with its own render.
     """
     number, picked = run.step + 1, run.sampler.next()
     view = run.scene.train[picked]
@@ -66,7 +69,10 @@ def backward(run: Run) -> Step:
         run.sampler.order.append(picked)
         raise
     run.backbone.begin(number)
-    parts = {term.name: add_term(run, term, number) for term in sorted(terms, key=lambda term: term.shared)}
+    here = {term.name: parts_here(run, term, view.camera) for term in terms}
+    parts = {
+        term.name: add_term(run, term, number, here[term.name]) for term in sorted(terms, key=lambda term: term.shared)
+    }
     own = 1 - sum(term.taken for term in terms)
     splats = run.backbone.splats(view.camera)
     rendering = rasterize(
@@ -81,16 +87,30 @@ def backward(run: Run) -> Step:
     if extra is not None:
         loss = loss + extra
     loss = loss if own == 1 else own * loss
-    loss.backward()
     named = {"own": float(loss.detach())} | parts if parts else {}
+    for term in terms:
+        for pseudo, weight in here[term.name]:
+            value = weight * pseudo_loss(rendering.image, pseudo, term.squared)
+            named[term.name] += float(value.detach())
+            loss = loss + value
+    loss.backward()
     whole = loss.detach() + sum(parts.values())
     return Step(number=number, view=view, target=target, rendering=rendering, loss=whole, terms=named)
 
 
-def add_term(run: Run, term: Term, number: int) -> float:
-    """Send an augmenter's term back; returns its value."""
+def parts_here(run: Run, term: Term, camera: Camera) -> list[tuple[PseudoView, float]]:
+    """Parts of a term that need no render of their own: the camera draws just what they see."""
+    if run.training.random_background or not term.shared:
+        return []
+    return [part for part in term.parts if part[0].camera.draws_as(camera)]
+
+
+def add_term(run: Run, term: Term, number: int, here: Sequence[tuple[PseudoView, float]]) -> float:
+    """Send an augmenter's term back but for the parts `here`; returns its value."""
     total = 0.0
     for view, weight in term.parts:
+        if any(view is other for other, _ in here):
+            continue
         rendering = rasterize(
             run.backbone.splats(view.camera),
             view.camera,
