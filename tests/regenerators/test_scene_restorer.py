@@ -16,7 +16,7 @@ from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOp
 
 
 def options(**changes: float) -> RestorerOptions:
-    values = {"channels": 8, "steps": 120, "later_steps": 10, "batch": 4, "crop": 32, "rate": 3e-3}
+    values = {"channels": 8, "steps": 120, "later_steps": 10, "again": 1.0, "batch": 4, "crop": 32, "rate": 3e-3}
     return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
 
 
@@ -104,6 +104,18 @@ def test_a_resumed_run_learns_on_from_the_event_before(tmp_path: Path) -> None:
         assert all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
     assert resumed.useful == whole.useful
     assert resumed.prepare(at_step(given, 44)) == {}
+
+
+def test_it_learns_again_when_the_run_has_become_much_longer(tmp_path: Path) -> None:
+    """From 40 by half more each time: at 40, 60 and 90, also for a run that was resumed in between."""
+    whole, given = SceneRestorer(options(steps=20, again=1.5)), material(tmp_path / "run")
+    learnt = [bool(whole.prepare(at_step(given, step))) for step in range(40, 100, 10)]
+    assert learnt == [True, False, True, False, False, True]
+    resumed = SceneRestorer(options(steps=20, again=1.5))
+    assert resumed.prepare(at_step(given, 70)) == {}
+    image = blurred(stripes(0).float() / 255)
+    assert not torch.equal(restored(resumed, image), image)
+    assert resumed.useful == [True, True]
 
 
 def test_networks_of_another_size_are_refused(tmp_path: Path) -> None:

@@ -37,7 +37,9 @@ class RestorerOptions:
     steps: int
     """At the first event of a run."""
     later_steps: int
-    """At each later one, which goes on from there."""
+    """At each later one at which it learns; it goes on from there."""
+    again: float
+    """It learns again at the first event by which the run has become so many times as long as at the last time."""
     batch: int
     crop: int
     """Edge of a training crop, px."""
@@ -48,8 +50,8 @@ class RestorerOptions:
             raise ValueError(
                 "regenerator.restore: channels, steps, later_steps, batch must be at least 1, crop at least 16"
             )
-        if not self.rate > 0:
-            raise ValueError("regenerator.restore: rate must be above 0")
+        if not self.rate > 0 or not self.again >= 1:
+            raise ValueError("regenerator.restore: rate must be above 0, again at least 1")
 
 
 class Residual(nn.Module):
@@ -86,7 +88,7 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class SceneRestorer:
-    """Learns at the first event of a run; later events go on from there."""
+    """Learns at the first event of a run, and at some later ones goes on from there."""
 
     def __init__(self, options: RestorerOptions) -> None:
         self.options = options
@@ -111,26 +113,29 @@ class SceneRestorer:
         """
         if self.prepared == material.step:  # another augmenter has asked at this event
             return {}
-        steps = self.options.later_steps if self.earlier(material) else self.options.steps
+        earlier = self.earlier(material)
         if not self.networks:
-            self.networks = self.recalled(material)
+            self.networks, self.useful = self.recalled(material)
+        self.prepared = material.step
+        if earlier and material.step < self.options.again * event_of(earlier[-1]):
+            return {}
+        steps = self.options.later_steps if earlier else self.options.steps
         pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
         figures: dict[str, float] = {}
         for fold, network in enumerate(self.networks):
             own = [pair for number, pair in enumerate(pairs) if number % FOLDS == fold]
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
             renders, before = mean_error(None, others), mean_error(network, others)
-            earlier = {name: value.clone() for name, value in network.state_dict().items()}
+            former = {name: value.clone() for name, value in network.state_dict().items()}
             learn(network, own, self.options, steps, material.seed * 1_000_003 + material.step * FOLDS + fold)
             after = mean_error(network, others)
             if after > before:
-                network.load_state_dict(earlier)
+                network.load_state_dict(former)
             self.useful[fold] = min(before, after) < renders
             figures |= {f"error_of_renders_{fold}": renders, f"error_restored_{fold}": min(before, after)}
         if not any(self.useful):
             logger.warning("scene_restorer brings unseen views no closer to their photographs: it changes nothing")
         self.keep(material)
-        self.prepared = material.step
         return figures
 
     @torch.no_grad()
@@ -148,24 +153,24 @@ class SceneRestorer:
         return (image + request.strength / request.strongest * network(image[None])[0]).clamp(0, 1)
 
     def keep(self, material: Material) -> None:
-        """Write both networks into the run's folder, as one file for each event."""
+        """Write both networks into the run's folder, as one file for each event at which they have learnt."""
         from safetensors.torch import save
 
         tensors = {
             f"{fold}.{name}": value.contiguous()
             for fold, network in enumerate(self.networks)
             for name, value in network.state_dict().items()
-        }
+        } | {"useful": torch.tensor(self.useful)}
         material.folder.mkdir(parents=True, exist_ok=True)
         replace_file(material.folder / f"scene_restorer_{material.step:07d}.safetensors", save(tensors))
 
     def earlier(self, material: Material) -> list[Path]:
         """Files of the run's events before this one, oldest first."""
         files = sorted(material.folder.glob("scene_restorer_*.safetensors"))
-        return [path for path in files if int(path.stem.rpartition("_")[2]) < material.step]
+        return [path for path in files if event_of(path) < material.step]
 
-    def recalled(self, material: Material) -> list[Residual]:
-        """Networks as the run had them after its last event before this one, or new ones.
+    def recalled(self, material: Material) -> tuple[list[Residual], list[bool]]:
+        """(networks, whether each is of use) as the run had them after its last event before this one, or new ones.
 
         Raises:
             InputError: they were of another size.
@@ -185,7 +190,13 @@ class SceneRestorer:
                     f"{earlier[-1]} holds networks of another size ({str(error).splitlines()[0]}): go on with the "
                     "regenerator.restore options that the run was begun with"
                 ) from error
-        return networks
+        useful = found.get("useful") if found else None
+        return networks, [False] * FOLDS if useful is None else useful.tolist()
+
+
+def event_of(path: Path) -> int:
+    """The event that a file of networks belongs to."""
+    return int(path.stem.rpartition("_")[2])
 
 
 Pair = tuple[Tensor, Tensor]
