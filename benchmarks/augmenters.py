@@ -23,8 +23,8 @@ from typing import Any
 import torch
 
 from gsx.core.files import read_json
-from measuring.machine import BUSY, commit, describe_machine, load_average, shown_command
-from measuring.results import Section, text_table, write_results
+from measuring.machine import describe_machine, shown_command, told_load
+from measuring.results import Section, stamped, text_table, write_results
 
 RESULTS = Path(__file__).parent / "results"
 SUBJECTS = {
@@ -166,7 +166,7 @@ def line(family: str, name: str, pairs: Sequence[tuple[dict[str, Any], dict[str,
     return values
 
 
-def section(scene: str, given: argparse.Namespace, rows: list[dict[str, Any]], **facts: Any) -> Section:
+def section(scene: str, given: argparse.Namespace, rows: list[dict[str, Any]], load: float, command: str) -> Section:
     """The table of one scene."""
     columns = [["backbone", "backbone"], ["added", "augmenters"], ["seeds", "seeds"]]
     for factor in ("1", "2", "4"):
@@ -178,16 +178,13 @@ def section(scene: str, given: argparse.Namespace, rows: list[dict[str, Any]], *
         "differences are taken seed by seed, ± half their range. Lines with oracle are ceilings: pseudo views are "
         "true pixels of the training photographs."
     )
-    facts = {"date": time.strftime("%Y-%m-%d %H:%M"), "commit": commit()} | facts
-    return {"title": f"Pseudo details on {scene}", "columns": columns, "rows": rows, "notes": [note], **facts}
+    return stamped(f"Pseudo details on {scene}", columns, rows, [note], load, command)
 
 
 def main(words: Sequence[str]) -> None:
     """Train everything, and write the tables."""
     given = arguments(words)
-    machine, load = describe_machine(torch.device("cpu")), load_average()
-    if load > BUSY:
-        print(f"the load is {load:.2f}: seconds will not be those of an idle machine", file=sys.stderr)
+    machine, load = describe_machine(torch.device("cpu")), told_load()
     scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
     families = given.families.split(",")
     groups = [(scene, family, seed, False) for seed in range(given.seeds) for scene in scenes for family in families]
@@ -197,7 +194,7 @@ def main(words: Sequence[str]) -> None:
             future.result()
     for scene in scenes:
         rows = [row for family in families for row in rows_of(scene, family, given)]
-        table = section(scene, given, rows, load=load, command=shown_command(words, "benchmarks/augmenters.py"))
+        table = section(scene, given, rows, load, shown_command(words, "benchmarks/augmenters.py"))
         write_results(given.to, "augmenters_cpu", machine, {f"{scene}_{given.iterations}": table})
         print(text_table(table))
 

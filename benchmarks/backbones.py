@@ -9,7 +9,6 @@ line; those found finished below --runs are not trained again. Takes one to two 
 import argparse
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from typing import Any
 import torch
 
 from gsx.core.files import read_json
-from measuring.machine import BUSY, commit, describe_machine, load_average, shown_command
-from measuring.results import Section, text_table, write_results
+from measuring.machine import describe_machine, shown_command, told_load
+from measuring.results import Section, stamped, text_table, write_results
 
 BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d")
 RESULTS = Path(__file__).parent / "results"
@@ -107,7 +106,7 @@ def shown(entry: dict[str, Any]) -> str:
     return f"{entry['psnr']:.2f} ({entry['enlarged_psnr']:.2f})"
 
 
-def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], **facts: Any) -> Section:
+def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], load: float, command: str) -> Section:
     """The table of one scene."""
     zooms = [factor for factor in SUBJECTS[name].zooms if factor != "1"]
     columns = [
@@ -123,22 +122,19 @@ def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], **
     changes = "; ".join(f"{backbone}: `{' '.join(words)}`" for backbone, words in subject.changes.items())
     note = f"`gsx {' '.join(subject.scene)}`, {given.iterations} iterations{'; ' * bool(changes)}{changes}."
     note += " In brackets: what the x1 render gives when it is resized."
-    facts = {"date": time.strftime("%Y-%m-%d %H:%M"), "commit": commit()} | facts
-    return {"title": f"Backbones on {name}", "columns": columns, "rows": rows, "notes": [note], **facts}
+    return stamped(f"Backbones on {name}", columns, rows, [note], load, command)
 
 
 def main(words: Sequence[str]) -> None:
     """Train, and write the table after every run."""
     given = arguments(words)
-    machine, load = describe_machine(torch.device("cpu")), load_average()
-    if load > BUSY:
-        print(f"the load is {load:.2f}: seconds will not be those of an idle machine", file=sys.stderr)
+    machine, load = describe_machine(torch.device("cpu")), told_load()
     command = shown_command(words, "benchmarks/backbones.py")
     for name in given.only.split(","):
         rows: list[dict[str, Any]] = []
         for backbone in given.backbones.split(","):
             rows.append(row(backbone, trained(name, backbone, given)))
-            table = section(name, given, rows, load=load, command=command)
+            table = section(name, given, rows, load, command)
             write_results(given.to, "backbones_cpu", machine, {f"{name}_{given.iterations}": table})
         print(text_table(table))
 

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,9 +12,8 @@ from gsx.core.rasterizer import RasterSettings
 from measuring import rival
 from measuring.adapter import settings_of
 from measuring.cases import Case, drawing, pairs_of
-from measuring.machine import commit
 from measuring.memory import peak_memory
-from measuring.results import Section
+from measuring.results import Section, stamped
 from measuring.watches import Patience, Timing, take_turns
 
 T = TypeVar("T")
@@ -121,16 +119,7 @@ COLUMNS = [
 
 def section(bench: Bench, title: str, columns: list[list[str]], rows: list[Row], *notes: str) -> Section:
     """A finished table with where and when it was measured."""
-    return {
-        "title": title,
-        "columns": columns,
-        "rows": rows,
-        "notes": [note for note in notes if note],
-        "date": datetime.now().strftime("%Y-%m-%d %H:%M"),
-        "commit": commit(),
-        "load": bench.load,
-        "command": bench.command,
-    }
+    return stamped(title, columns, rows, [note for note in notes if note], bench.load, bench.command)
 
 
 def about_gsplat(bench: Bench) -> str:

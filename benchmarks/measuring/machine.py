@@ -4,6 +4,7 @@ import os
 import platform
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -78,3 +79,11 @@ def without_folders(word: str) -> str:
     """`--to=/some/where` as `--to=where`."""
     option, equals, value = word.rpartition("=")
     return option + equals + (Path(value).name if "/" in value else value)
+
+
+def told_load() -> float:
+    """The load average; a warning where it disturbs the measurement."""
+    load = load_average()
+    if load > BUSY:
+        print(f"the load is {load:.2f}: seconds will not be those of an idle machine", file=sys.stderr)
+    return load

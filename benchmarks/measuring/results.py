@@ -4,11 +4,13 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from gsx.core.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis, Plot, Series, axis_of, curve
 from gsx.core.files import read_json, replace_file, write_json
+from measuring.machine import commit
 
 Section = dict[str, Any]
 """title, columns ([key, heading] each), rows, notes; and when, how and of what it was measured."""
@@ -17,6 +19,15 @@ STYLE = (
     "svg{font:11px system-ui,sans-serif;background:#fff}.grid{stroke:#ddd}.axis{stroke:#666}"
     ".curve{fill:none;stroke-width:2}circle{stroke:none}text{fill:#333}"
 )
+
+
+def stamped(
+    title: str, columns: list[list[str]], rows: list[dict[str, Any]], notes: list[str], load: float, command: str
+) -> Section:
+    """A finished table with when, at what load, of which revision and by which command it was measured."""
+    when = datetime.now().strftime("%Y-%m-%d %H:%M")
+    table = {"title": title, "columns": columns, "rows": rows, "notes": notes}
+    return table | {"date": when, "commit": commit(), "load": load, "command": command}
 
 
 def cell(value: Any) -> str:

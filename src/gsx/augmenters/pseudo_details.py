@@ -39,6 +39,7 @@ from gsx.core.pseudo_pictures import picture_name
 from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
+from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.window import Window
 
@@ -408,7 +409,7 @@ class PseudoDetails:
         """One camera; variant 0 is the training camera's own."""
         options, own = self.options, run.scene.train[parent].camera
         generator = torch.Generator().manual_seed(
-            number_of(self.setting.seed, self.setting.name, event, parent, scale, variant)
+            derived_seed(self.setting.seed, self.setting.name, event, parent, scale, variant)
         )
         zoom = scale if options.zoom == "intrinsics" else 1
         size = window_size(own.width, own.height, options.narrow, zoom)
@@ -433,7 +434,7 @@ class PseudoDetails:
             camera=result,
             seed=options.seed
             if options.seeds == "fixed"
-            else number_of(self.setting.seed, "noise", event, parent, scale, variant),
+            else derived_seed(self.setting.seed, "noise", event, parent, scale, variant),
         )
 
     def looking(
@@ -448,11 +449,11 @@ class PseudoDetails:
     ) -> tuple[Camera, Window]:
         """(camera, window) of a pseudo view; of those drawn at random the first that shows enough of the scene."""
         own, options = run.scene.train[parent].camera, self.options
-        drawn = variant > 0 or options.window == "random"
-        for _ in range(MOST_TRIES if drawn and options.least_alpha else 1):
+        checked = options.least_alpha > 0 and (variant > 0 or (options.window == "random" and size != own.size))
+        for _ in range(MOST_TRIES if checked else 1):
             pose = own if variant == 0 else self.beside(own, scale, generator)
             window = self.placed(run, parent, pose, size, event, variant, generator)
-            if not options.least_alpha or not drawn or coverage(run, window.of(pose)) >= options.least_alpha:
+            if not checked or coverage(run, window.of(pose)) >= options.least_alpha:
                 break
         return pose, window
 
@@ -610,8 +611,3 @@ def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
 def area_share(view: PseudoView, whole: Camera) -> float:
     """Pixels of a pseudo view per pixel of a training view."""
     return view.camera.width * view.camera.height / (whole.width * whole.height)
-
-
-def number_of(*parts: object) -> int:
-    """A seed that depends on all parts, the same on every machine."""
-    return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:7], "big")

@@ -1,6 +1,5 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from gsx.core.metrics import psnr
 from gsx.core.pseudo import Augmenter
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.scene import Scene, View
+from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 
 
@@ -63,8 +63,7 @@ class Sampler:
 
     def shuffled(self, number: int) -> list[int]:
         """The order of that number."""
-        digest = hashlib.sha256(repr(("views", self.seed, number)).encode()).digest()
-        generator = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+        generator = torch.Generator().manual_seed(derived_seed("views", self.seed, number))
         return torch.randperm(self.count, generator=generator).tolist()
 
 

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -69,10 +70,8 @@ def backward(run: Run) -> Step:
         run.sampler.order.append(picked)
         raise
     run.backbone.begin(number)
-    here = {term.name: parts_here(run, term, view.camera) for term in terms}
-    parts = {
-        term.name: add_term(run, term, number, here[term.name]) for term in sorted(terms, key=lambda term: term.shared)
-    }
+    divided = [divide(run, term, view.camera) for term in terms]
+    parts = {term.name: add_term(run, term, number) for term, _ in sorted(divided, key=lambda pair: pair[0].shared)}
     own = 1 - sum(term.taken for term in terms)
     splats = run.backbone.splats(view.camera)
     rendering = rasterize(
@@ -88,8 +87,8 @@ def backward(run: Run) -> Step:
         loss = loss + extra
     loss = loss if own == 1 else own * loss
     named = {"own": float(loss.detach())} | parts if parts else {}
-    for term in terms:
-        for pseudo, weight in here[term.name]:
+    for term, here in divided:
+        for pseudo, weight in here:
             value = weight * pseudo_loss(rendering.image, pseudo, term.squared)
             named[term.name] += float(value.detach())
             loss = loss + value
@@ -98,19 +97,18 @@ def backward(run: Run) -> Step:
     return Step(number=number, view=view, target=target, rendering=rendering, loss=whole, terms=named)
 
 
-def parts_here(run: Run, term: Term, camera: Camera) -> list[tuple[PseudoView, float]]:
-    """Parts of a term that need no render of their own: the camera draws just what they see."""
+def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
+    """(the term without them, its parts that need no render of their own): the camera draws just what these see."""
     if run.training.random_background or not term.shared:
-        return []
-    return [part for part in term.parts if part[0].camera.draws_as(camera)]
+        return term, ()
+    here = [part for part in term.parts if part[0].camera.draws_as(camera)]
+    return replace(term, parts=[part for part in term.parts if part not in here]), here
 
 
-def add_term(run: Run, term: Term, number: int, here: Sequence[tuple[PseudoView, float]]) -> float:
-    """Send an augmenter's term back but for the parts `here`; returns its value."""
+def add_term(run: Run, term: Term, number: int) -> float:
+    """Send an augmenter's term back; returns its value."""
     total = 0.0
     for view, weight in term.parts:
-        if any(view is other for other, _ in here):
-            continue
         rendering = rasterize(
             run.backbone.splats(view.camera),
             view.camera,

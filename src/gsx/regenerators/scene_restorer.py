@@ -115,7 +115,7 @@ class SceneRestorer:
             return {}
         earlier = self.earlier(material)
         if not self.networks:
-            self.networks, self.useful = self.recalled(material)
+            self.networks, self.useful = self.recalled(material, earlier)
         self.prepared = material.step
         if earlier and material.step < self.options.again * event_of(earlier[-1]):
             return {}
@@ -169,7 +169,7 @@ class SceneRestorer:
         files = sorted(material.folder.glob("scene_restorer_*.safetensors"))
         return [path for path in files if event_of(path) < material.step]
 
-    def recalled(self, material: Material) -> tuple[list[Residual], list[bool]]:
+    def recalled(self, material: Material, earlier: Sequence[Path]) -> tuple[list[Residual], list[bool]]:
         """(networks, whether each is of use) as the run had them after its last event before this one, or new ones.
 
         Raises:
@@ -179,7 +179,6 @@ class SceneRestorer:
             Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
             for fold in range(FOLDS)
         ]
-        earlier = self.earlier(material)
         found = read_network(earlier[-1]) if earlier else None
         for fold, network in enumerate(networks if found else ()):
             own = {name.partition(".")[2]: value for name, value in found.items() if name.startswith(f"{fold}.")}  # type: ignore[union-attr]
