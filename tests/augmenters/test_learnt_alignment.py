@@ -1,0 +1,106 @@
+"""What a regenerator gives is learnt where it belongs: true pixels pay the more the closer one looks, displaced ones less."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from torch import Tensor
+
+import gsx.augmenters.pseudo_details as pseudo_details
+from gsx.augmenters.pseudo_details import PseudoDetails
+from gsx.cli import plugins
+from gsx.core.config import compose
+from gsx.core.material import rendered
+from gsx.core.metrics import psnr
+from gsx.core.regenerator import Material, Request, displacement
+from gsx.core.run import Run
+from gsx.core.session import start
+from gsx.core.trainer import train
+
+CONTROL = (
+    "scene.width=64",
+    "scene.height=48",
+    "scene.train_views=10",
+    "scene.test_views=3",
+    "scene.points=3000",
+    "scene.samples=4",
+    "training.test_points=1",
+    "iterations=300",
+    "device=cpu",
+)
+AUGMENTED = (
+    *CONTROL,
+    "augmenter=upscale",
+    "augmenter.upscale.scales=[2,4]",
+    "augmenter.upscale.loss=l1",
+    "augmenter.upscale.gain=2",
+    "augmenter.upscale.timing.start=8000",
+    "augmenter.upscale.timing.every=4000",
+    "augmenter.upscale.timing.span=4000",
+)
+
+
+class Displaced:
+    """The true pixels of the built-in scene, so many pixels of the training views too far to the right."""
+
+    def __init__(self, pixels: float) -> None:
+        self.pixels = pixels
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        return {}
+
+    def regenerate(self, requests: list[Request]) -> list[Tensor]:
+        cameras = [(request, request.camera.zoom(request.scale)) for request in requests]
+        return [
+            request.view.source.image(replace(camera, cx=camera.cx + self.pixels * request.scale)).float() / 255
+            for request, camera in cameras
+        ]
+
+
+class Seen(NamedTuple):
+    """Of every third training view, by zoom factor: means of PSNR, dB, and of displacements from the truth, px."""
+
+    psnr: dict[int, float]
+    displacement: dict[int, float]
+
+
+def seen(run: Run) -> Seen:
+    """What a trained model shows where control and augmented runs have the same photographs, and finer."""
+    quality: dict[int, float] = {}
+    shift: dict[int, float] = {}
+    cameras = [(view.source, view.camera) for view in run.scene.train[::3]]
+    for factor in (1, 2, 4):
+        pairs = [(rendered(run, c.zoom(factor)), source.image(c.zoom(factor)).float() / 255) for source, c in cameras]
+        quality[factor] = sum(psnr(image, truth) for image, truth in pairs) / len(pairs)
+        shift[factor] = sum(displacement(image, truth) for image, truth in pairs) / len(pairs)
+    return Seen(quality, shift)
+
+
+def trained(folder: Path, pixels: float | None) -> Seen:
+    """A run with pseudo views displaced so far; None: without any."""
+    run = start(compose([*(CONTROL if pixels is None else AUGMENTED), f"folder={folder}"], plugins()), plugins())
+    if pixels is not None:
+        (augmenter,) = run.augmenters
+        assert isinstance(augmenter, PseudoDetails)
+        setting = replace(augmenter.setting, regenerator=lambda role: Displaced(pixels))
+        run = replace(run, augmenters=[PseudoDetails(augmenter.options, setting)])
+    train(run, plugins())
+    return seen(run)
+
+
+@pytest.mark.slow
+def test_true_pixels_help_the_more_the_closer_and_displaced_ones_less(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half a pixel of displacement, let through: the checks that would drop it have tests of their own."""
+    monkeypatch.setattr(pseudo_details, "complaint", lambda request, result: "")
+    control, perfect, displaced = (
+        trained(tmp_path / name, pixels) for name, pixels in (("control", None), ("perfect", 0.0), ("displaced", 0.5))
+    )
+    gain = {factor: perfect.psnr[factor] - control.psnr[factor] for factor in (1, 2, 4)}
+    assert gain[2] > 0.3
+    assert gain[4] > gain[2] + 0.2
+    for factor in (1, 2, 4):
+        assert displaced.psnr[factor] < perfect.psnr[factor] - 0.08
+    assert displaced.displacement[2] > 1.5 * perfect.displacement[2]
