@@ -1,5 +1,7 @@
 """The built-in plugin: what ships with gsx enters through the same hooks as third parties."""
 
+from functools import partial
+
 from gsx.core.plugins import Registry, hookimpl
 
 
@@ -11,7 +13,12 @@ def gsx_register(registry: Registry) -> None:
     from gsx.backbones.gs3d import GS3D, GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
     from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
+    from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.diffusion.options import PipelineOptions, UpscalerOptions
+    from gsx.regenerators.diffusion.options import RestorerOptions as DiffusionRestorerOptions
+    from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO
+    from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
 
@@ -34,3 +41,8 @@ def gsx_register(registry: Registry) -> None:
     registry.add("regenerator", "identity", Unchanged, PlainOptions)
     registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
+    registry.add("regenerator", "callable", Called, CalledOptions)
+    registry.add("regenerator", "diffusers_pipeline", any_pipeline, PipelineOptions)
+    registry.add("regenerator", "sd_x2_latent", partial(Diffusion, SD_X2_LATENT), UpscalerOptions)
+    registry.add("regenerator", "sd_x4", partial(Diffusion, SD_X4), UpscalerOptions)
+    registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)

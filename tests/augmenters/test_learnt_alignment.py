@@ -1,4 +1,4 @@
-"""What a regenerator gives is learnt where it belongs: true pixels pay the more the closer one looks, displaced ones less."""
+"""What a regenerator gives is learnt where it belongs: true pixels pay the more the closer one looks."""
 
 from dataclasses import replace
 from pathlib import Path

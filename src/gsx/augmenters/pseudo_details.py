@@ -36,7 +36,7 @@ from gsx.core.images import to_uint8, write_image
 from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint
+from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint, projected
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
 from gsx.core.seeds import derived_seed
@@ -142,6 +142,7 @@ class PseudoOptions:
     strength: list[float]
     """How much may change: at the first event and at the last."""
     prompt: str
+    """For regenerators that read; {scene} is the name of the scene."""
     seeds: str
     """fixed: `seed` for every picture; per_view: another for each (row 21)."""
     seed: int
@@ -367,7 +368,7 @@ class PseudoDetails:
         if len(dropped) > MOST_DROPPED * len(sketches):
             raise TrainingError(
                 f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
-                f"{dropped[0]}; choose another regenerator/{self.options.role}"
+                f"{dropped[0]}; choose another regenerator/{self.options.role}{self.remedy}"
             )
         facts: dict[str, Any] = {
             "event": event,
@@ -506,6 +507,8 @@ class PseudoDetails:
             result = torch.stack([sample[number].detach().cpu().float() for sample in results]).mean(0)
             if torch.isfinite(result).all() and result.shape[0] == 3:
                 result = colour_matched(request, result)
+            if self.to_be_exact(request) and result.shape[1:] == enlarged_size(request):
+                result = projected(result, request.image.cpu(), request.scale)
             problem = complaint(request, result)
             view = None if problem else self.view(run, event, sketch, request, result)
             if view is not None and sketch.parent in shown:
@@ -527,9 +530,19 @@ class PseudoDetails:
             seed=sketch.seed,
             strength=ramp(self.options.strength, event, self.options.timing, self.schedule),
             strongest=self.options.strength[0],
-            prompt=self.options.prompt,
+            prompt=self.options.prompt.replace("{scene}", run.scene.name),
             step=event,
         )
+
+    @property
+    def remedy(self) -> str:
+        """What else helps where a regenerator strays too far."""
+        enlarging = max(self.options.scales) > 1 and self.options.project == "none"
+        return f", or augmenter.{self.setting.name}.project=exact" if enlarging else ""
+
+    def to_be_exact(self, request: Request) -> bool:
+        """Whether the result must reduce to its input."""
+        return self.options.project == "exact" and request.scale > 1 and request.photo
 
     def view(
         self, run: Run, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]
@@ -537,7 +550,7 @@ class PseudoDetails:
         """The pseudo view of a result: its window, in 8 bits."""
         a, inside = sketch.scale, sketch.inside
         target = to_uint8(result.clamp(0, 1))
-        if self.options.project == "exact" and a > 1 and request.photo:
+        if self.to_be_exact(request):
             target = exactly_consistent(result, to_uint8(request.image), a)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
@@ -586,6 +599,12 @@ class PseudoDetails:
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.setting.name, view), torch.cat([given, result, difference], 2))
+
+
+def enlarged_size(request: Request) -> tuple[int, int]:
+    """(height, width) that a result should have."""
+    height, width = (side * request.scale for side in request.image.shape[1:])
+    return height, width
 
 
 def again(request: Request, number: int) -> Request:

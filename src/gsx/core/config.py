@@ -172,6 +172,8 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
         return f"the configuration cannot be composed: {first_line(error)}"
     key = (found.group(1) or found.group(2)).lstrip("+~")
     known = known_keys(overrides)
+    if key in known:  # a mapping that is open, such as arguments of a function
+        return f"'{key}' takes its entries one by one: '+{key}.NAME=VALUE'"
     return f"'{key}' is no configuration key.{nearest(key, known) or ' `gsx --cfg job` lists all keys.'}"
 
 

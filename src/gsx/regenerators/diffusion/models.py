@@ -1,0 +1,214 @@
+"""From a folder or an id to a pipeline in memory. Nothing asks the network unless `download=true`."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions
+from gsx.regenerators.diffusion.recipes import Recipe
+
+logger = logging.getLogger(__name__)
+
+INDEX = "model_index.json"
+PACKAGES = ("diffusers", "transformers", "accelerate")
+CHUNK = 1 << 24
+"""Bytes read at a time."""
+
+
+def require(name: str, packages: Sequence[str]) -> None:
+    """Raise ConfigError if a package is not installed."""
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise ConfigError(f"regenerator {name} needs {', '.join(missing)}: pip install 'gsx[diffusion]'")
+
+
+def located(options: DiffusionOptions, recipe: Recipe) -> Path:
+    """The folder of a model, fetched first if it may be.
+
+    Raises:
+        InputError: it is not on this machine, is another model, or damaged. The message says what to do.
+    """
+    folder = Path(options.model).expanduser()
+    if not folder.is_dir():
+        folder = snapshot(options, recipe)
+    inspect(folder, options, recipe)
+    return folder
+
+
+def snapshot(options: DiffusionOptions, recipe: Recipe) -> Path:
+    """The folder of a hub's id in the cache of huggingface_hub."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    try:
+        return Path(
+            snapshot_download(
+                options.model,
+                revision=options.revision,
+                allow_patterns=wanted(options),
+                ignore_patterns=unwanted(options),
+                local_files_only=not options.download,
+            )
+        )
+    except HFValidationError:
+        why = "it is no folder, and no id of the form owner/model"
+    except Exception as error:  # each version of the hub's client raises its own families of errors
+        why = first_line(error) if options.download else "it is no folder, and not in the cache of the hub's client"
+    raise InputError(f"regenerator {options.name} finds no model '{options.model}' ({why}). {remedy(options, recipe)}")
+
+
+def wanted(options: DiffusionOptions) -> list[str]:
+    """Patterns of the files of a model: the networks' folders, not the single files beside them."""
+    weights = f"*/*.{options.variant}.safetensors" if options.variant else "*/*.safetensors"
+    return [INDEX, "*/*.json", "*/*.txt", "*/*.model", weights]
+
+
+def unwanted(options: DiffusionOptions) -> list[str]:
+    """Patterns that `wanted` matches too many of."""
+    return [] if options.variant else ["*/*.fp16.safetensors", "*/*.non_ema.safetensors"]
+
+
+def remedy(options: DiffusionOptions, recipe: Recipe) -> str:
+    """Which files, how large, where to put them, and the command that does so."""
+    name = options.model if "/" in options.model and not Path(options.model).is_absolute() else recipe.hub
+    folder = f"models/{name.split('/')[-1]}"
+    patterns = " ".join(f"--include '{pattern}'" for pattern in wanted(options))
+    patterns += "".join(f" --exclude '{pattern}'" for pattern in unwanted(options))
+    folders = ", ".join((*recipe.networks, *recipe.others)) or "that it names"
+    size = f", about {recipe.gigabytes:g} GB" if recipe.gigabytes else ""
+    return (
+        f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {patterns} --local-dir {folder}; then "
+        f"regenerator.{recipe.role}.model={folder}. Or let gsx fetch it: regenerator.{recipe.role}.download=true"
+    )
+
+
+def inspect(folder: Path, options: DiffusionOptions, recipe: Recipe) -> None:
+    """Whether a folder holds what the recipe needs, as far as can be told without reading the weights.
+
+    Raises:
+        InputError: something is missing, of another architecture, or cut short.
+    """
+    pipeline = class_named(folder, options, recipe)
+    if recipe.accepted and pipeline not in recipe.accepted:
+        raise InputError(
+            f"regenerator {options.name}: {folder / INDEX} is that of a {pipeline}, and must be that of a "
+            f"{' or '.join(recipe.accepted)}: set regenerator.{recipe.role}.model to another folder"
+        )
+    missing = [part for part in (*recipe.networks, *recipe.others) if not (folder / part).is_dir()]
+    missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder, part, options)]
+    if missing:
+        raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, recipe)}")
+    if isinstance(options, PipelineOptions) and options.custom and not Path(options.custom).is_file():
+        raise InputError(f"regenerator {options.name}: there is no file custom={options.custom}")
+    for path in sorted(folder.glob(f"*/{weights_name(options)}")):
+        refuse_damaged(path, options)
+
+
+def class_named(folder: Path, options: DiffusionOptions, recipe: Recipe) -> str:
+    """The class of pipeline that a folder says it is."""
+    try:
+        return str(json.loads((folder / INDEX).read_text(encoding="utf-8"))["_class_name"])
+    except FileNotFoundError:
+        raise InputError(f"regenerator {options.name}: {folder} holds no {INDEX}. {remedy(options, recipe)}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"regenerator {options.name}: {folder / INDEX} cannot be read ({error}): fetch it again"
+        ) from error
+
+
+def weights_name(options: DiffusionOptions) -> str:
+    """What files of weights are called."""
+    return f"*.{options.variant}.safetensors" if options.variant else "*.safetensors"
+
+
+def weights_of(folder: Path, part: str, options: DiffusionOptions) -> list[Path]:
+    """Files of weights of a network."""
+    return sorted((folder / part).glob(weights_name(options)))
+
+
+def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
+    """Raise InputError if a file's header does not fit its length."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt"):
+            pass
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"regenerator {options.name}: {path} is damaged ({error}): fetch it again") from error
+
+
+def fingerprint(folder: Path, options: DiffusionOptions) -> str:
+    """SHA-256 of everything that decides what a model draws."""
+    digest = hashlib.sha256()
+    files = [path for path in folder.rglob("*") if path.suffix in (".json", ".txt", ".model", ".py")]
+    files += folder.glob(f"*/{weights_name(options)}")
+    for path in sorted(set(files)):
+        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+        with path.open("rb") as stream:
+            while piece := stream.read(CHUNK):
+                digest.update(piece)
+    return digest.hexdigest()
+
+
+def number_type(options: DiffusionOptions, device: torch.device) -> torch.dtype:
+    """What a model computes in."""
+    name = options.dtype
+    if name == "auto":
+        name = "bfloat16" if device.type == "cuda" else "float32"
+    return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
+
+
+def opened(folder: Path, options: DiffusionOptions, recipe: Recipe, dtype: torch.dtype) -> Any:
+    """The pipeline of a folder, in main memory.
+
+    Raises:
+        TrainingError: it cannot be loaded; the run keeps its checkpoint.
+    """
+    import diffusers
+
+    for library in ("diffusers", "transformers"):
+        logging.getLogger(library).setLevel(logging.ERROR)  # advice about packages that are not needed
+    try:
+        pipe = getattr(diffusers, recipe.loader).from_pretrained(
+            folder,
+            local_files_only=True,
+            use_safetensors=True,
+            variant=options.variant or None,
+            dtype=dtype,
+            **recipe.replaced,
+        )
+    except Exception as error:  # whatever the libraries raise, the run must end in one sentence
+        raise TrainingError(
+            f"regenerator {options.name}: {folder} cannot be loaded ({type(error).__name__}: {first_line(error)}); "
+            "fetch the model again, or choose another"
+        ) from error
+    pipe.set_progress_bar_config(disable=True)
+    if options.slicing:
+        pipe.vae.enable_slicing()
+    if options.tiling:
+        pipe.vae.enable_tiling()
+    return pipe
+
+
+def place(pipe: Any, options: DiffusionOptions, device: torch.device) -> None:
+    """Onto the device, or half-way."""
+    if options.offload != "none" and device.type == "cpu":
+        logger.warning("regenerator %s: offload=%s does nothing on the CPU", options.name, options.offload)
+    if options.offload == "none" or device.type == "cpu":
+        pipe.to(device)
+    elif options.offload == "model":
+        pipe.enable_model_cpu_offload(device=device)
+    else:
+        pipe.enable_sequential_cpu_offload(device=device)
+
+
+def first_line(error: Exception) -> str:
+    """First line of an error's message."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,140 @@
+"""Options of diffusion models; values in conf/regenerator, with their sources."""
+
+from dataclasses import dataclass
+from typing import Any
+
+DTYPES = ("auto", "float32", "bfloat16", "float16")
+OFFLOADS = ("none", "model", "sequential")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffusionOptions:
+    """Where a model comes from, how it fits into memory, and what every pipeline is told."""
+
+    name: str
+    model: str
+    """Folder that holds model_index.json, or an id on the Hugging Face hub."""
+    revision: str
+    """Of an id: branch, tag or commit."""
+    variant: str
+    """Part of the names of weight files, such as fp16; empty: none."""
+    download: bool
+    """Whether an id that is not on this machine is fetched; else nothing ever asks the network."""
+    dtype: str
+    """auto: bfloat16 on a GPU, float32 on the CPU."""
+    offload: str
+    """What stays in main memory while it is not needed: none, model (whole networks), sequential (layers; slow)."""
+    slicing: bool
+    """Encode and decode one picture of a batch at a time."""
+    tiling: bool
+    """Encode and decode large pictures in overlapping tiles; changes results slightly."""
+    batch_pixels: int
+    """Pixels of the results of one call; one picture at least."""
+    cache_gb: float
+    """Disk for results, which runs with the same pictures share, 10^9 bytes; 0: none are kept."""
+    guidance: float
+    """1: none (no second pass without the prompt)."""
+    steps: int
+    """Denoising steps; of a restorer 0: as many as make it execute exactly one."""
+
+    def __post_init__(self) -> None:
+        where = f"regenerator {self.name}"
+        if not self.model:
+            raise ValueError(f"{where}: model is empty; give a folder with model_index.json, or an id on the hub")
+        if self.dtype not in DTYPES:
+            raise ValueError(f"{where}: dtype is '{self.dtype}'; choose from {', '.join(DTYPES)}")
+        if self.offload not in OFFLOADS:
+            raise ValueError(f"{where}: offload is '{self.offload}'; choose from {', '.join(OFFLOADS)}")
+        if self.batch_pixels < 1 or self.steps < 0 or min(self.cache_gb, self.guidance) < 0:
+            raise ValueError(f"{where}: batch_pixels must be at least 1, steps, cache_gb and guidance at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpscalerOptions(DiffusionOptions):
+    """Of an upscaler."""
+
+    noise_level: int
+    """Noise on what is enlarged, as a step of the model's schedule (x4 alone)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps < 1 or self.noise_level < 0:
+            raise ValueError(f"regenerator {self.name}: steps must be at least 1, noise_level at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineOptions(DiffusionOptions):
+    """Of any other pipeline from picture to picture; `guidance` and `steps` are its guidance_scale and
+    num_inference_steps."""
+
+    custom: str
+    """File of a pipeline that is not in `diffusers`; empty: the class that model_index.json names."""
+    scale: int
+    """Its results are so many times as wide and high; 1: it restores."""
+    multiple: int
+    """Of which both sides of a picture must be a multiple, px."""
+    least: int
+    """Shortest side that it takes, px."""
+    prompt: str
+    """In place of the augmenter's; empty: that one."""
+    reference: str
+    """Argument that takes the photograph of the same training view, enlarged or reduced to the picture's size; empty:
+    none."""
+    arguments: dict[str, Any]
+    """What else it is called with."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scale < 1 or self.steps < 1 or min(self.multiple, self.least) < 1:
+            raise ValueError(f"regenerator {self.name}: scale, steps, multiple and least must be at least 1")
+        if self.custom and not self.custom.endswith(".py"):
+            raise ValueError(f"regenerator {self.name}: custom is '{self.custom}'; give a file ending in .py")
+        taken = set(self.arguments) & {"image", "prompt", "generator", "output_type", self.reference}
+        if taken:
+            raise ValueError(
+                f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives it"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningOptions:
+    """Per-scene LoRA on (render, photograph) pairs (spec 5.1)."""
+
+    steps: int
+    """0: the model is used as it is."""
+    rank: int
+    layers: list[str]
+    """Ends of the names of the layers that are adapted."""
+    rate: float
+    warm_up: int
+    """Steps in which the rate rises to `rate`."""
+    batch: int
+    crop: int
+    """Edge of a training crop, px."""
+    crops: int
+    """Crops that are encoded once and learnt from."""
+    held_out: float
+    """Share of the training views that is only measured on."""
+    strengths: list[float]
+    """Least and greatest of those that the model will be called with."""
+    prompt: str
+    seconds: float
+    """Learning ends after this time; 0: never. A run cut short by it cannot be repeated bit for bit."""
+    checkpointing: bool
+    """Compute activations twice to save memory."""
+
+    def __post_init__(self) -> None:
+        where = "regenerator.restore.tuning"
+        if self.steps < 0 or self.warm_up < 0 or min(self.rank, self.batch, self.crops, self.crop) < 1:
+            raise ValueError(f"{where}: rank, batch, crop and crops must be at least 1, steps and warm_up at least 0")
+        if not self.rate > 0 or not 0 < self.held_out < 1 or self.seconds < 0:
+            raise ValueError(f"{where}: rate must be above 0, held_out between 0 and 1, seconds at least 0")
+        if len(self.strengths) != 2 or not 0 < self.strengths[0] <= self.strengths[1] <= 1:
+            raise ValueError(f"{where}.strengths is {list(self.strengths)}; give the least and the greatest, up to 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestorerOptions(DiffusionOptions):
+    """Of a restorer by image-to-image."""
+
+    tuning: TuningOptions

@@ -1,0 +1,201 @@
+"""What is known of each model: where it is, what sizes it takes, how it is called (spec 4)."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.shapes import Float
+from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, UpscalerOptions
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Batch:
+    """Pictures of one size for one call."""
+
+    images: Float[Tensor, "B 3 h w"]
+    """Display values in [0, 1]."""
+    prompts: Sequence[str]
+    seeds: Sequence[int]
+    strength: float
+    """How much may change, the same for all."""
+    references: Float[Tensor, "B 3 h w"] | None = None
+    """Photographs of the training views they were made from."""
+
+    def __len__(self) -> int:
+        return len(self.prompts)
+
+    def generators(self) -> list[torch.Generator]:
+        """One for each picture, so that no result depends on its company; on the CPU, so that noise does not depend
+        on the device."""
+        return [torch.Generator().manual_seed(seed) for seed in self.seeds]
+
+    def part(self, first: int, last: int) -> "Batch":
+        """Pictures `first` up to `last`."""
+        return Batch(
+            images=self.images[first:last],
+            prompts=self.prompts[first:last],
+            seeds=self.seeds[first:last],
+            strength=self.strength,
+            references=None if self.references is None else self.references[first:last],
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recipe:
+    """A model and its pipeline."""
+
+    hub: str
+    """Where it is officially obtained."""
+    gigabytes: float
+    """Of what is fetched; 0: unknown."""
+    loader: str
+    """Class of `diffusers` that opens it."""
+    accepted: Sequence[str]
+    """Classes that its model_index.json may name."""
+    networks: Sequence[str]
+    """Folders with weights."""
+    others: Sequence[str]
+    """Folders without."""
+    factor: int
+    """Results are so many times as wide and high."""
+    multiple: int
+    """Of which both sides of a picture must be a multiple, px."""
+    least: int
+    """Shortest side, px."""
+    call: Callable[[Any, Batch, Any], Tensor]
+    """(pipeline, pictures, options) -> results, display values."""
+    reference: bool = False
+    """Whether it is shown photographs as well."""
+    replaced: dict[str, Any] = field(default_factory=dict)
+    """Parts that are not loaded, or set otherwise: no picture is marked or blackened."""
+
+    @property
+    def role(self) -> str:
+        """The role that it can play."""
+        return "upscale" if self.factor > 1 else "restore"
+
+
+def steps_for(strength: float, steps: int) -> int:
+    """The steps to ask for; 0: as many as let image-to-image, which executes int(steps * strength), execute one.
+
+    floor(1/s) + 1, the authors' rule; ceil(1/s) ends in none for some strengths (spec 4).
+    """
+    return steps or math.floor(1 / strength) + 1
+
+
+def upscale_latents(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
+    """StableDiffusionLatentUpscalePipeline."""
+    return pipe(
+        prompt=list(batch.prompts),
+        image=batch.images,
+        num_inference_steps=options.steps,
+        guidance_scale=options.guidance,
+        generator=batch.generators(),
+        output_type="pt",
+    ).images
+
+
+def upscale_pixels(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
+    """StableDiffusionUpscalePipeline."""
+    return pipe(
+        prompt=list(batch.prompts),
+        image=batch.images,
+        num_inference_steps=options.steps,
+        guidance_scale=options.guidance,
+        noise_level=options.noise_level,
+        generator=batch.generators(),
+        output_type="pt",
+    ).images
+
+
+def restore(pipe: Any, batch: Batch, options: DiffusionOptions) -> Tensor:
+    """StableDiffusionXLImg2ImgPipeline; a strength at which no step would be executed changes nothing."""
+    steps = steps_for(batch.strength, options.steps) if batch.strength > 0 else 0
+    if int(steps * batch.strength) < 1:
+        return batch.images
+    return pipe(
+        prompt=list(batch.prompts),
+        image=batch.images,
+        strength=batch.strength,
+        num_inference_steps=steps,
+        guidance_scale=options.guidance,
+        generator=batch.generators(),
+        output_type="pt",
+    ).images
+
+
+def redraw(pipe: Any, batch: Batch, options: PipelineOptions) -> Tensor:
+    """Any pipeline that takes `image` and `prompt`."""
+    references = {} if batch.references is None else {options.reference: batch.references}
+    return pipe(
+        image=batch.images,
+        prompt=[options.prompt or prompt for prompt in batch.prompts],
+        num_inference_steps=options.steps,
+        guidance_scale=options.guidance,
+        generator=batch.generators(),
+        output_type="pt",
+        **references,
+        **options.arguments,
+    ).images
+
+
+def recipe_of(options: PipelineOptions) -> Recipe:
+    """What the options say of a pipeline."""
+    return Recipe(
+        hub=options.model,
+        gigabytes=0,
+        loader="DiffusionPipeline",
+        accepted=(),
+        networks=(),
+        others=(),
+        factor=options.scale,
+        multiple=options.multiple,
+        least=options.least,
+        call=redraw,
+        reference=bool(options.reference),
+        replaced={"custom_pipeline": options.custom} if options.custom else {},
+    )
+
+
+SD_X2_LATENT = Recipe(
+    hub="stabilityai/sd-x2-latent-upscaler",
+    gigabytes=2.3,
+    loader="StableDiffusionLatentUpscalePipeline",
+    accepted=("StableDiffusionLatentUpscalePipeline",),
+    networks=("vae", "text_encoder", "unet"),
+    others=("tokenizer", "scheduler"),
+    factor=2,
+    multiple=32,
+    least=64,
+    call=upscale_latents,
+)
+SD_X4 = Recipe(
+    hub="stabilityai/stable-diffusion-x4-upscaler",
+    gigabytes=3.5,
+    loader="StableDiffusionUpscalePipeline",
+    accepted=("StableDiffusionUpscalePipeline",),
+    networks=("vae", "text_encoder", "unet"),
+    others=("tokenizer", "scheduler", "low_res_scheduler"),
+    factor=4,
+    multiple=8,
+    least=8,
+    call=upscale_pixels,
+    replaced={"safety_checker": None, "feature_extractor": None, "watermarker": None},
+)
+SDXL_TURBO = Recipe(
+    hub="stabilityai/sdxl-turbo",
+    gigabytes=6.9,
+    loader="StableDiffusionXLImg2ImgPipeline",
+    accepted=("StableDiffusionXLPipeline", "StableDiffusionXLImg2ImgPipeline"),
+    networks=("vae", "text_encoder", "text_encoder_2", "unet"),
+    others=("tokenizer", "tokenizer_2", "scheduler"),
+    factor=1,
+    multiple=8,
+    least=8,
+    call=restore,
+    replaced={"add_watermarker": False},
+)

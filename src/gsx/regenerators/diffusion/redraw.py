@@ -1,0 +1,263 @@
+"""Diffusion models as regenerators: batches under a budget, sizes that fit, results kept for later runs."""
+
+import hashlib
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.cache import cache_folder, content_key, make_folder, trim
+from gsx.core.device import device_name
+from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.images import read_image, resize, to_uint8, write_image
+from gsx.core.regenerator import Material, Request
+from gsx.core.scene import View
+from gsx.core.shapes import Float
+from gsx.core.window import Window
+from gsx.regenerators.diffusion.models import PACKAGES, fingerprint, located, number_type, opened, place, require
+from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
+from gsx.regenerators.diffusion.recipes import Batch, Recipe, recipe_of
+from gsx.regenerators.diffusion.sizes import enlarged, grown
+from gsx.regenerators.diffusion.tuning import Tuned, tuned
+
+logger = logging.getLogger(__name__)
+
+PICTURES = "diffusion_pictures"
+"""Kind of the results in the cache."""
+PATIENCE = 10.0
+"""Seconds between two lines of progress."""
+MEMORY = ("allocate memory", "out of memory")
+"""Words of errors that smaller batches may avoid."""
+IRRELEVANT = ("download", "offload", "cache_gb", "model", "revision")
+"""Options that do not change results; what the model is says its fingerprint."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fitted:
+    """A picture as the model takes it."""
+
+    number: int
+    """Of its request."""
+    image: Float[Tensor, "3 H W"]
+    inside: Window
+    """Where in it the given picture is."""
+    request: Request
+    reference: Float[Tensor, "3 H W"] | None
+    """The photograph of its training view, where the model is shown it."""
+
+
+class Diffusion:
+    """One pipeline, opened at the first event."""
+
+    def __init__(self, recipe: Recipe, options: DiffusionOptions) -> None:
+        self.recipe, self.options = recipe, options
+        self.pipe: Any = None
+        self.identity = ""
+        """Of everything but pictures, seeds, prompts and strengths that decides on a result."""
+
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """The packages and the model are there, the scales can be reached: all that can be known before training."""
+        for scale in scales:
+            rounds_to(scale, self.recipe, self.options)
+        tuning = self.options.tuning.steps if isinstance(self.options, RestorerOptions) else 0
+        require(self.options.name, (*PACKAGES, *(("peft",) if tuning else ())))
+        if tuning and len(views) < 2:
+            raise InputError(
+                f"regenerator {self.options.name} needs at least 2 training views to be tuned, there is {len(views)}: "
+                "choose regenerator/restore=sdxl_turbo_raw"
+            )
+        located(self.options, self.recipe)
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        """Open the pipeline, and tune it to the scene if it is to be; once per run."""
+        if self.pipe is not None:
+            return {}
+        begun = time.perf_counter()
+        options = self.options
+        folder = located(options, self.recipe)
+        files = fingerprint(folder, options)
+        dtype = number_type(options, material.device)
+        pipe = opened(folder, options, self.recipe, dtype)
+        found = Tuned()
+        if isinstance(options, RestorerOptions) and options.tuning.steps:
+            found = tuned(pipe.to(material.device), options, self.recipe, material, files)
+        place(pipe, options, material.device)
+        telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
+        machine = (torch.__version__, torch.get_num_threads(), device_name(material.device), str(dtype))
+        self.identity = content_key(files, found.digest, telling, machine)
+        self.pipe = pipe
+        if options.cache_gb:
+            trim(PICTURES, options.cache_gb * 1e9, kept=cache_folder(PICTURES, ""))
+        logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - begun, folder)
+        return found.figures
+
+    @torch.no_grad()
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
+        """Each picture, in order, in steps of 1/255, as it is kept; what is not finite is given back as it is."""
+        images = {number: request.image.cpu().float() for number, request in enumerate(requests)}
+        rounds = [rounds_to(request.scale, self.recipe, self.options) for request in requests]
+        for turn in range(max(rounds, default=0)):
+            asked = {n: replace(r, image=images[n]) for n, r in enumerate(requests) if rounds[n] > turn}
+            images |= self.redrawn(asked, turn)
+        return [images[number] for number in range(len(requests))]
+
+    def redrawn(self, asked: Mapping[int, Request], turn: int) -> dict[int, Float[Tensor, "3 H W"]]:
+        """Some of the pictures after one application more."""
+        recipe, progress = self.recipe, Pace(self.options.name, len(asked))
+        fitted = []
+        for number, request in asked.items():
+            image, inside = grown(request.image, recipe.multiple, recipe.least)
+            photo = photograph(request, image) if recipe.reference else None
+            fitted.append(Fitted(number=number, image=image, inside=inside, request=request, reference=photo))
+        out: dict[int, Tensor] = {}
+        for together in batches(fitted, self.options.batch_pixels // recipe.factor**2):
+            for part, result in zip(together, self.remembered(together, turn), strict=True):
+                out[part.number] = enlarged(part.inside, recipe.factor).cut(result)
+            progress.more(len(together))
+        return out
+
+    def remembered(self, together: Sequence[Fitted], turn: int) -> list[Float[Tensor, "3 H W"]]:
+        """Results of a batch, from the cache if it holds all of them: what is drawn may depend on the batch's size."""
+        paths = [self.path(part, turn) for part in together]
+        kept = [read_kept(path) for path in paths] if self.options.cache_gb else []
+        if kept and all(result is not None for result in kept):
+            return [result for result in kept if result is not None]
+        results = [rounded(result) for result in self.called(batch_of(together))]
+        for path, result in zip(paths, results, strict=True):
+            if self.options.cache_gb and bool(torch.isfinite(result).all()):
+                keep(path, result)
+        return results
+
+    def called(self, batch: Batch) -> Float[Tensor, "B 3 H W"]:
+        """Results of one call, in halves where memory does not suffice.
+
+        Raises:
+            TrainingError: a single picture does not fit, or the pipeline fails; the run keeps its checkpoint.
+        """
+        try:
+            return self.recipe.call(self.pipe, batch, self.options).detach().cpu().float()
+        except (RuntimeError, ValueError, TypeError) as error:
+            if not any(words in str(error).lower() for words in MEMORY):
+                raise TrainingError(
+                    f"regenerator {self.options.name} failed: {type(error).__name__}: {error}"
+                ) from error
+            if len(batch) == 1:
+                where, (height, width) = f"regenerator.{self.recipe.role}", batch.images.shape[2:]
+                raise TrainingError(
+                    f"regenerator {self.options.name} runs out of memory at one picture of {width} x {height} px: set "
+                    f"{where}.tiling=true, {where}.offload=model or a smaller dtype, or narrow the augmenter's windows"
+                ) from error
+        logger.warning("%s: %d pictures at a time are too many for the memory", self.options.name, len(batch))
+        half = len(batch) // 2
+        return torch.cat([self.called(batch.part(0, half)), self.called(batch.part(half, len(batch)))])
+
+    def path(self, part: Fitted, turn: int) -> Path:
+        """Where the result of a picture is kept."""
+        request = part.request
+        exact = hashlib.sha256(part.image.numpy().tobytes())
+        if part.reference is not None:
+            exact.update(part.reference.numpy().tobytes())
+        key = content_key(self.identity, exact.hexdigest(), request.seed, request.strength, request.prompt, turn)
+        return cache_folder(PICTURES, key) / "picture.png"
+
+
+def any_pipeline(options: PipelineOptions) -> Diffusion:
+    """One that its options alone describe."""
+    return Diffusion(recipe_of(options), options)
+
+
+def rounds_to(scale: int, recipe: Recipe, options: DiffusionOptions) -> int:
+    """How often a model is applied to reach a scale.
+
+    Raises:
+        ConfigError: it never gets there.
+    """
+    if recipe.factor == 1:
+        if scale > 1:
+            raise ConfigError(
+                f"regenerator {options.name} cannot enlarge x{scale}: choose another for that role, or augmenter "
+                "scales=[1]"
+            )
+        return 1
+    rounds, reached = 0, 1
+    while reached < scale:
+        rounds, reached = rounds + 1, reached * recipe.factor
+    if reached != scale:
+        ladder = ", ".join(f"x{recipe.factor**power}" for power in (1, 2, 3))
+        raise ConfigError(f"regenerator {options.name} enlarges {ladder}, not x{scale}: change the augmenter's scales")
+    return rounds
+
+
+def batches(fitted: Sequence[Fitted], pixels: int) -> list[list[Fitted]]:
+    """Pictures of one size and strength together, so many pixels at a time, one picture at least."""
+    alike: dict[tuple[object, ...], list[Fitted]] = {}
+    for part in fitted:
+        alike.setdefault((*part.image.shape, part.request.strength), []).append(part)
+    out = []
+    for group in alike.values():
+        count = max(1, pixels // group[0].image[0].numel())
+        out += [group[first : first + count] for first in range(0, len(group), count)]
+    return out
+
+
+def photograph(request: Request, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """That of the training view which a picture was made from, at the picture's size."""
+    whole = to_uint8(request.view.image().float())
+    return resize(whole, image.shape[2], image.shape[1], "bicubic").float() / 255
+
+
+def batch_of(together: Sequence[Fitted]) -> Batch:
+    """One call's worth."""
+    references = [part.reference for part in together if part.reference is not None]
+    return Batch(
+        references=torch.stack(references) if references else None,
+        images=torch.stack([part.image for part in together]),
+        prompts=[part.request.prompt for part in together],
+        seeds=[part.request.seed for part in together],
+        strength=together[0].request.strength,
+    )
+
+
+def rounded(result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """In steps of 1/255, if it is finite."""
+    return to_uint8(result.clamp(0, 1)).float() / 255 if bool(torch.isfinite(result).all()) else result
+
+
+def read_kept(path: Path) -> Float[Tensor, "3 H W"] | None:
+    """A result as `keep` left it; None if it is not there."""
+    try:
+        return read_image(path).float() / 255 if path.is_file() else None
+    except InputError as error:
+        logger.warning("%s; it is drawn again", error)
+        return None
+
+
+def keep(path: Path, result: Float[Tensor, "3 H W"]) -> None:
+    """Keep a result; a cache that cannot be written is no error."""
+    try:
+        write_image(make_folder(path.parent) / path.name, result)
+    except InputError as error:
+        logger.warning("%s: it will be drawn again", error)
+
+
+class Pace:
+    """Says how far a batch of work is, and how long it will take."""
+
+    def __init__(self, name: str, whole: int) -> None:
+        self.name, self.whole, self.done = name, whole, 0
+        self.begun = self.told = time.perf_counter()
+
+    def more(self, count: int) -> None:
+        """So many more are done."""
+        self.done += count
+        now = time.perf_counter()
+        if now - self.told > PATIENCE and self.done < self.whole:
+            each = (now - self.begun) / self.done
+            left = each * (self.whole - self.done)
+            logger.info("%s: %d of %d, %.1f s each, %.0f s left", self.name, self.done, self.whole, each, left)
+            self.told = now

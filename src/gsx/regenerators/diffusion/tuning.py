@@ -1,0 +1,364 @@
+"""A LoRA for one scene: the model learns to take renders of this run to their photographs (spec 5.1).
+
+It is trained as it will be called: the render's latent, noised as little as the strengths of the run allow, is to
+become the photograph's in the one step that image-to-image executes.
+"""
+
+import hashlib
+import json
+import logging
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.cache import cache_folder, content_key, make_folder
+from gsx.core.device import device_name
+from gsx.core.errors import TrainingError
+from gsx.core.files import replace_file, write_json
+from gsx.core.regenerator import Material
+from gsx.core.shapes import Float, Int
+from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
+from gsx.regenerators.diffusion.recipes import Batch, Recipe, steps_for
+from gsx.regenerators.diffusion.sizes import grown
+
+logger = logging.getLogger(__name__)
+
+WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
+WEIGHT_DECAY = 1e-2
+LARGEST_NORM = 1.0
+"""To which gradients are clipped (spec 5.1)."""
+PATIENCE = 30.0
+"""Seconds between two lines of progress."""
+
+Pair = tuple[Tensor, Tensor]
+"""(render, photograph), [3, h, w] each, display values."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tuned:
+    """What has become of a model."""
+
+    digest: str = ""
+    """Of the adapter that was merged into it; empty: none."""
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, material: Material, files: str) -> Tuned:
+    """Merge the adapter of this scene into a model: the run's own, one from the cache, or a new one.
+
+    An adapter that brings held-out renders no closer to their photographs than the model as it was is not used.
+
+    Raises:
+        TrainingError: it cannot be learnt or read; the run keeps its checkpoint.
+    """
+    own = material.folder / options.name
+    if not (own / FACTS).is_file():
+        pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
+        shared = cache_folder("lora", key_of(pairs, options, material, files))
+        if not (shared / FACTS).is_file():
+            new_adapter(pipe, options, recipe, material, pairs, files, shared)
+        copy_adapter(shared, own)
+    facts = read_facts(own)
+    if not facts["used"]:
+        return Tuned(figures=facts["figures"])
+    merge(pipe, own)
+    return Tuned(digest=facts["sha256"], figures=facts["figures"])
+
+
+def key_of(pairs: Sequence[Pair], options: RestorerOptions, material: Material, files: str) -> str:
+    """Of everything that decides what is learnt."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for part in (image for pair in pairs for image in pair):
+        digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
+    machine = (torch.__version__, torch.get_num_threads(), device_name(material.device))
+    telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
+    return content_key(files, telling, digest.hexdigest(), material.seed, machine)
+
+
+def new_adapter(
+    pipe: Any,
+    options: RestorerOptions,
+    recipe: Recipe,
+    material: Material,
+    pairs: Sequence[Pair],
+    files: str,
+    folder: Path,
+) -> None:
+    """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder."""
+    own, others = divided(pairs, options.tuning)
+    renders = sum(float((render - photo).square().mean()) for render, photo in others) / len(others)
+    figures = {"error_of_renders": renders, "error_raw": error_of(pipe, options, recipe, others)}
+    begun = time.perf_counter()
+    try:
+        whole = learn(pipe, options, recipe, own, material.seed)
+    except (RuntimeError, ValueError) as error:
+        raise TrainingError(
+            f"regenerator {options.name} cannot be tuned ({type(error).__name__}: {error}): lower "
+            "regenerator.restore.tuning.batch or .crop, set .checkpointing=true, or choose sdxl_turbo_raw"
+        ) from error
+    figures["seconds"] = time.perf_counter() - begun
+    figures["error_tuned"] = error_of(pipe, options, recipe, others)
+    weights = adapter_bytes(pipe)
+    pipe.unet.delete_adapters("default")
+    used = figures["error_tuned"] < figures["error_raw"]
+    if not used:
+        logger.warning("%s: tuning does not help on held-out views, the model stays as it is", options.name)
+    if figures["error_tuned"] >= figures["error_of_renders"]:
+        logger.warning("%s takes held-out renders further from their photographs", options.name)
+    make_folder(folder)
+    replace_file(folder / WEIGHTS, weights)
+    write_json(
+        folder / FACTS,
+        {
+            "used": used,
+            "whole": whole,
+            "figures": figures,
+            "sha256": hashlib.sha256(weights).hexdigest(),
+            "model": options.model,
+            "model_sha256": files,
+            "tuning": asdict(options.tuning),
+            "views": [view.name for view in material.views],
+            "step": material.step,
+            "seed": material.seed,
+        },
+    )
+
+
+# -- pairs -------------------------------------------------------------------------------------------------------------
+
+
+def divided(pairs: Sequence[Pair], options: TuningOptions) -> tuple[list[Pair], list[Pair]]:
+    """(pairs to learn from, the middles of pairs to measure on), the latter spread evenly over the views."""
+    every = max(2, round(1 / options.held_out))
+    first = min(every, len(pairs)) // 2
+    held = set(range(first, len(pairs), every))
+    own = [pair for number, pair in enumerate(pairs) if number not in held]
+    return own, [middle(pairs[number], options.crop) for number in sorted(held)]
+
+
+def middle(pair: Pair, crop: int) -> Pair:
+    """The same part of both, `crop` px wide at most."""
+    height, width = (min(crop, side) for side in pair[0].shape[1:])
+    top, left = (pair[0].shape[1] - height) // 2, (pair[0].shape[2] - width) // 2
+    render, photo = (image[:, top : top + height, left : left + width] for image in pair)
+    return render, photo
+
+
+@torch.no_grad()
+def error_of(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[Pair]) -> float:
+    """Mean squared error of restored renders, by the call that the run makes, half-way between its strengths."""
+    strength, total = sum(options.tuning.strengths) / 2, 0.0
+    for number, (render, photo) in enumerate(pairs):
+        image, inside = grown(render, recipe.multiple, recipe.least)
+        batch = Batch(images=image[None], prompts=[options.tuning.prompt], seeds=[number], strength=strength)
+        result = inside.cut(recipe.call(pipe, batch, options)[0].cpu().float().clamp(0, 1))
+        total += float((result - photo).square().mean())
+    return total / len(pairs)
+
+
+def cropped(
+    pairs: Sequence[Pair], options: TuningOptions, recipe: Recipe, generator: torch.Generator
+) -> tuple[Float[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"]]:
+    """Crops at the same places of renders and photographs, mirrored at random, of sides that the model takes."""
+    height, width = (min(options.crop, *(pair[0].shape[axis] for pair in pairs)) for axis in (1, 2))
+    renders, photos = [], []
+    for _ in range(options.crops):
+        pair = pairs[int(torch.randint(len(pairs), (), generator=generator))]
+        top = int(torch.randint(pair[0].shape[1] - height + 1, (), generator=generator))
+        left = int(torch.randint(pair[0].shape[2] - width + 1, (), generator=generator))
+        flips = [2] if bool(torch.randint(2, (), generator=generator)) else []
+        parts = [image[:, top : top + height, left : left + width].flip(flips) for image in pair]
+        render, photo = (grown(part, recipe.multiple, recipe.least)[0] for part in parts)
+        renders.append(render)
+        photos.append(photo)
+    return torch.stack(renders), torch.stack(photos)
+
+
+# -- learning ----------------------------------------------------------------------------------------------------------
+
+
+def learn(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[Pair], seed: int) -> bool:
+    """Give the model an adapter and train it; whether all steps were taken."""
+    generator, tuning = torch.Generator().manual_seed(seed), options.tuning
+    adapted = add_adapter(pipe, tuning, seed)
+    optimiser = torch.optim.AdamW(adapted, lr=tuning.rate, weight_decay=WEIGHT_DECAY)
+    rates = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: rate_at(step, tuning))
+    crops = cropped(pairs, tuning, recipe, generator)
+    conditions = conditions_of(pipe, tuning.prompt, crops[0].shape[2:])
+    renders, photos = (encoded(pipe, images) for images in crops)
+    least, greatest = noise_steps(pipe, options)
+    begun = told = time.perf_counter()
+    with as_trained(pipe.unet, tuning.checkpointing):
+        for step in range(tuning.steps):
+            now = time.perf_counter()
+            if tuning.seconds and now - begun > tuning.seconds:
+                logger.warning("%s is tuned for %d of %d steps: tuning.seconds", options.name, step, tuning.steps)
+                return False
+            if now - told > PATIENCE:
+                left = (now - begun) / step * (tuning.steps - step)
+                logger.info("%s: tuning step %d of %d, %.0f s left", options.name, step, tuning.steps, left)
+                told = now
+            picked = torch.randint(len(renders), (tuning.batch,), generator=generator)
+            when = torch.randint(least, greatest + 1, (tuning.batch,), generator=generator)
+            noise = torch.randn(renders[picked].shape, generator=generator)
+            loss = (one_step(pipe, renders[picked], when, noise, conditions) - photos[picked]).square().mean()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(adapted, LARGEST_NORM)
+            optimiser.step()
+            rates.step()
+    return True
+
+
+def add_adapter(pipe: Any, tuning: TuningOptions, seed: int) -> list[torch.nn.Parameter]:
+    """What is trained: low-rank changes of some layers, zero at first, in float32; everything else is frozen."""
+    from peft import LoraConfig
+
+    for network in (pipe.unet, pipe.vae, pipe.text_encoder, pipe.text_encoder_2):
+        network.requires_grad_(False)
+    with torch.random.fork_rng():  # peft draws from the global generator
+        torch.manual_seed(seed)
+        pipe.unet.add_adapter(
+            LoraConfig(
+                r=tuning.rank,
+                lora_alpha=tuning.rank,
+                init_lora_weights="gaussian",
+                target_modules=list(tuning.layers),
+            )
+        )
+    adapted = [parameter for parameter in pipe.unet.parameters() if parameter.requires_grad]
+    for parameter in adapted:
+        parameter.data = parameter.data.float()
+    return adapted
+
+
+def rate_at(step: int, tuning: TuningOptions) -> float:
+    """Share of the rate: it rises, then falls as a cosine."""
+    rising = min(1.0, (step + 1) / max(1, tuning.warm_up))
+    return rising * 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
+
+
+def noise_steps(pipe: Any, options: RestorerOptions) -> tuple[int, int]:
+    """First and last step of the noise schedule at which image-to-image begins with the strengths of the run.
+
+    Raises:
+        ValueError: the model does not predict noise.
+    """
+    schedule = pipe.scheduler
+    if schedule.config.prediction_type != "epsilon":
+        raise ValueError(f"the model predicts {schedule.config.prediction_type}; only epsilon can be tuned")
+    begins = []
+    for strength in options.tuning.strengths:
+        steps = steps_for(strength, options.steps)
+        schedule.set_timesteps(steps)
+        begins.append(int(schedule.timesteps[steps - max(1, int(steps * strength))]))
+    return min(begins), max(begins)
+
+
+def conditions_of(pipe: Any, prompt: str, size: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
+    """(embedded prompt, what else the network is told) for one picture."""
+    with torch.no_grad():
+        words, _, pooled, _ = pipe.encode_prompt(prompt, do_classifier_free_guidance=False)
+    height, width = size
+    times = torch.tensor([[height, width, 0, 0, height, width]], dtype=words.dtype, device=words.device)
+    return words, {"text_embeds": pooled, "time_ids": times}
+
+
+@torch.no_grad()
+def encoded(pipe: Any, images: Float[Tensor, "N 3 h w"]) -> Float[Tensor, "N C u v"]:
+    """Latents, one picture at a time, in float32 and in main memory."""
+    vae = pipe.vae
+    dtype = next(vae.parameters()).dtype
+    if vae.config.force_upcast:
+        vae.float()
+    own = next(vae.parameters())
+    latents = [vae.encode((2 * image[None] - 1).to(own)).latent_dist.mean.float().cpu() for image in images]
+    vae.to(dtype)
+    return torch.cat(latents) * vae.config.scaling_factor
+
+
+def one_step(
+    pipe: Any,
+    latents: Float[Tensor, "B C u v"],
+    when: Int[Tensor, "B"],
+    noise: Float[Tensor, "B C u v"],
+    conditions: tuple[Tensor, dict[str, Tensor]],
+) -> Float[Tensor, "B C u v"]:
+    """Latents, noised as at steps of the schedule, a step of the model later: x - sigma eps(x / sqrt(1 + sigma^2))."""
+    words, others = conditions
+    device, dtype, count = words.device, words.dtype, len(latents)
+    kept = pipe.scheduler.alphas_cumprod[when]
+    sigma = ((1 - kept) / kept).sqrt().view(-1, 1, 1, 1).float()
+    noisy = latents + sigma * noise
+    with torch.autocast(device.type, dtype=dtype, enabled=dtype != torch.float32):
+        predicted = pipe.unet(
+            (noisy / (sigma.square() + 1).sqrt()).to(device, dtype),
+            when.to(device),
+            words.expand(count, -1, -1),
+            added_cond_kwargs={key: value.expand(count, -1) for key, value in others.items()},
+        ).sample
+    return noisy - sigma * predicted.float().cpu()
+
+
+@contextmanager
+def as_trained(unet: Any, checkpointing: bool) -> Iterator[None]:
+    """A network in its state for training, afterwards in that for use."""
+    unet.train()
+    if checkpointing:
+        unet.enable_gradient_checkpointing()
+    try:
+        yield
+    finally:
+        if checkpointing:
+            unet.disable_gradient_checkpointing()
+        unet.eval()
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def adapter_bytes(pipe: Any) -> bytes:
+    """The adapter as `diffusers` writes it."""
+    from peft.utils import get_peft_model_state_dict
+
+    with TemporaryDirectory() as folder:
+        pipe.save_lora_weights(folder, unet_lora_layers=get_peft_model_state_dict(pipe.unet), weight_name=WEIGHTS)
+        return (Path(folder) / WEIGHTS).read_bytes()
+
+
+def copy_adapter(source: Path, target: Path) -> None:
+    """Into the run's folder; what tells that it is whole comes last."""
+    target.mkdir(parents=True, exist_ok=True)
+    for name in (WEIGHTS, FACTS):
+        replace_file(target / name, (source / name).read_bytes())
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """What is known of the adapter in a folder.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
+    try:
+        facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
+        if hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest() == facts["sha256"]:
+            return facts
+        problem = f"{WEIGHTS} is not the file that was written"
+    except (OSError, ValueError, KeyError) as error:
+        problem = str(error)
+    raise TrainingError(f"the adapter in {folder} is damaged ({problem}): remove the folder, and it is learnt again")
+
+
+def merge(pipe: Any, folder: Path) -> None:
+    """Add an adapter to the weights of a model."""
+    pipe.load_lora_weights(folder, weight_name=WEIGHTS, local_files_only=True)
+    pipe.fuse_lora()
+    pipe.unload_lora_weights()

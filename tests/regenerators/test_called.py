@@ -1,0 +1,49 @@
+"""A function as a regenerator."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny import tiny_run, tiny_settings
+from torch import Tensor
+
+from gsx.core.errors import ConfigError
+from gsx.core.regenerator import as_blocks
+from gsx.regenerators.called import Called, CalledOptions
+
+PROMPTS: list[str] = []
+
+
+def blocks(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float, level: float = 0) -> Tensor:
+    """Every pixel as a block."""
+    PROMPTS.append(prompt)
+    return as_blocks(image, scale) + level
+
+
+def test_a_function_redraws_the_views_of_a_run(tmp_path: Path) -> None:
+    """It is told the prompt, with the name of the scene."""
+    PROMPTS.clear()
+    words = ["augmenter=upscale", "iterations=12", "augmenter.upscale.prompt='{scene}, sharp'"]
+    words += ["regenerator/upscale=callable", "regenerator.upscale.function=test_called:blocks"]
+    tiny_run(tmp_path / "run", words)
+    assert set(PROMPTS) == {"demo, sharp"}
+    made = json.loads((tmp_path / "run" / "pseudo" / "index.json").read_text())["views"]
+    assert made
+    assert all(view["consistent"] == 1 for view in made if view["scale"] == 2)
+
+
+@pytest.mark.parametrize("function", ["", "os", "os:no_such", "no_such_module:f", "os:name"])
+def test_what_is_no_function_is_refused(function: str) -> None:
+    """Before training."""
+    with pytest.raises(ConfigError, match=f"function(=| is ').*{function}"):
+        Called(CalledOptions(name="callable", function=function, arguments={})).check([], [2], False)
+
+
+def test_arguments_are_passed_on(tmp_path: Path) -> None:
+    """As they stand in the configuration."""
+    words = ["augmenter=upscale", "regenerator/upscale=callable", "regenerator.upscale.function=test_called:blocks"]
+    options: Any = tiny_settings(tmp_path, *words, "+regenerator.upscale.arguments.level=0.5")
+    assert options.regenerators["upscale"].options.arguments == {"level": 0.5}
+    with pytest.raises(ConfigError, match=r"one by one: '\+regenerator.upscale.arguments.NAME=VALUE'"):
+        tiny_settings(tmp_path, *words, "regenerator.upscale.arguments={level: 0.5}")
