@@ -15,6 +15,7 @@ def gsx_register(registry: Registry) -> None:
     from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.diffusion.ladder import Ladder, LadderOptions
     from gsx.regenerators.diffusion.options import PipelineOptions, UpscalerOptions
     from gsx.regenerators.diffusion.options import RestorerOptions as DiffusionRestorerOptions
     from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO
@@ -43,6 +44,7 @@ def gsx_register(registry: Registry) -> None:
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
     registry.add("regenerator", "callable", Called, CalledOptions)
     registry.add("regenerator", "diffusers_pipeline", any_pipeline, PipelineOptions)
+    registry.add("regenerator", "sd_by_scale", Ladder, LadderOptions)
     registry.add("regenerator", "sd_x2_latent", partial(Diffusion, SD_X2_LATENT), UpscalerOptions)
     registry.add("regenerator", "sd_x4", partial(Diffusion, SD_X4), UpscalerOptions)
     registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)

@@ -20,6 +20,7 @@ from gsx.core.camera import Camera
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.regenerator import Material, Request, as_blocks, displacement
+from gsx.regenerators.diffusion.ladder import Ladder
 from gsx.regenerators.diffusion.options import DiffusionOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
@@ -55,9 +56,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return tiny_models.save_models(tmp_path_factory.mktemp("models"))
 
 
+def role_of(name: str) -> str:
+    """upscale or restore."""
+    return RECIPES[name].where.split(".")[1]
+
+
 def options_of(name: str, *more: str, model: Path | str = "nowhere") -> DiffusionOptions:
     """Options as the command line gives them."""
-    role = RECIPES[name].role
+    role = role_of(name)
     words = [f"regenerator/{role}={name}", f"regenerator.{role}.model={model}"]
     if name.startswith("sdxl"):
         words.append("regenerator.restore.variant=''")
@@ -184,7 +190,7 @@ def test_results_lie_where_their_pictures_do(name: str, size: tuple[int, int]) -
     if name == "sd_x4" and max(size) > 1000:
         size = (size[0] // 4, size[1] // 4)
     recipe = RECIPES[name]
-    (result,) = with_call(name, Blocks(recipe), "regenerator." + recipe.role + ".cache_gb=0").regenerate(
+    (result,) = with_call(name, Blocks(recipe), f"regenerator.{role_of(name)}.cache_gb=0").regenerate(
         [request(noise(*size), recipe.factor)]
     )
     assert torch.equal(result, as_blocks(noise(*size), recipe.factor))
@@ -240,9 +246,9 @@ def test_results_do_not_depend_on_company_or_order(name: str, models: dict[str, 
     """To a level of 8 bits; and the same call again gives the same bits."""
     recipe = RECIPES[name]
     model = models[name.removesuffix("_raw")]
-    off = f"regenerator.{recipe.role}.cache_gb=0"
+    off = f"regenerator.{role_of(name)}.cache_gb=0"
     together = ready(name, tmp_path, off, model=model)
-    alone = ready(name, tmp_path, off, f"regenerator.{recipe.role}.batch_pixels=1", model=model)
+    alone = ready(name, tmp_path, off, f"regenerator.{role_of(name)}.batch_pixels=1", model=model)
     asked = [request(noise(20, 30, n), recipe.factor, seed=n) for n in range(3)]
     asked.insert(1, request(noise(9, 70), recipe.factor))
     first, second = together.regenerate(asked), alone.regenerate(asked[::-1])[::-1]
@@ -267,6 +273,33 @@ def test_scales_that_differ_are_reached_by_so_many_rounds() -> None:
     results = upscaler.regenerate([request(noise(5, 6), 2), request(noise(5, 6), 4)])
     assert torch.equal(results[0], as_blocks(noise(5, 6), 2))
     assert torch.equal(results[1], as_blocks(noise(5, 6), 4))
+
+
+def test_the_ladder_reaches_every_scale_by_the_model_for_it(models: dict[str, Path], tmp_path: Path) -> None:
+    """x2 and x4 as these models alone, x8 as x4 then x2; models that no scale needs are not looked for."""
+    words = ["regenerator/upscale=sd_by_scale", f"regenerator.upscale.x2.model={models['sd_x2_latent']}"]
+    views = small_scene(spread(4)).train
+    half = Ladder(compose(words, plugins()).regenerators["upscale"].options)
+    half.check(views, [2], False)
+    with pytest.raises(InputError, match=r"regenerator.upscale.x4.model="):
+        half.check(views, [4], False)
+    whole = Ladder(
+        compose([*words, f"regenerator.upscale.x4.model={models['sd_x4']}"], plugins()).regenerators["upscale"].options
+    )
+    whole.check(views, [1, 2, 4, 8], False)
+    whole.prepare(material(tmp_path))
+    image = noise(9, 13)
+    two, eight, one, four = whole.regenerate([request(image, scale) for scale in (2, 8, 1, 4)])
+    assert torch.equal(one, image)
+    (alone,) = ready("sd_x2_latent", tmp_path, model=models["sd_x2_latent"]).regenerate([request(image, 2)])
+    x4 = ready("sd_x4", tmp_path, model=models["sd_x4"])
+    (fourfold,) = x4.regenerate([request(image, 4)])
+    (after,) = ready("sd_x2_latent", tmp_path, model=models["sd_x2_latent"]).regenerate([request(fourfold, 2)])
+    for found, expected in ((two, alone), (four, fourfold), (eight, after)):
+        assert found.shape == expected.shape
+        assert float((found - expected).abs().max()) <= 1.01 / 255
+    with pytest.raises(ConfigError, match="x2, x4, x8, not x6"):
+        whole.check(views, [6], False)
 
 
 @pytest.mark.parametrize(
@@ -415,7 +448,7 @@ def test_a_model_that_is_not_here_is_named_with_the_command_that_fetches_it() ->
 def test_the_network_is_asked_only_when_told_to() -> None:
     """The socket that fails above is reached, and the failure is one sentence."""
     told = refused("sdxl_turbo", "stabilityai/sdxl-turbo", "regenerator.restore.download=true")
-    assert "finds no model" in told
+    assert "the network was asked" in told
 
 
 @pytest.fixture

@@ -353,6 +353,9 @@ class PseudoDetails:
         """
         regenerator = self.setting.regenerator(self.options.role)
         learnt = regenerator.prepare(material_of(run, self.setting.seed))
+        if learnt:
+            told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
+            logger.info("%s, regenerator at step %d: %s", self.setting.name, event, told)
         sketches = list(self.sketches(run, event, parents))
         views: list[PseudoView] = []
         dropped: list[str] = []

@@ -85,7 +85,7 @@ def remedy(options: DiffusionOptions, recipe: Recipe) -> str:
     size = f", about {recipe.gigabytes:g} GB" if recipe.gigabytes else ""
     return (
         f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {patterns} --local-dir {folder}; then "
-        f"regenerator.{recipe.role}.model={folder}. Or let gsx fetch it: regenerator.{recipe.role}.download=true"
+        f"{recipe.where}.model={folder}. Or let gsx fetch it: {recipe.where}.download=true"
     )
 
 
@@ -99,7 +99,7 @@ def inspect(folder: Path, options: DiffusionOptions, recipe: Recipe) -> None:
     if recipe.accepted and pipeline not in recipe.accepted:
         raise InputError(
             f"regenerator {options.name}: {folder / INDEX} is that of a {pipeline}, and must be that of a "
-            f"{' or '.join(recipe.accepted)}: set regenerator.{recipe.role}.model to another folder"
+            f"{' or '.join(recipe.accepted)}: set {recipe.where}.model to another folder"
         )
     missing = [part for part in (*recipe.networks, *recipe.others) if not (folder / part).is_dir()]
     missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder, part, options)]

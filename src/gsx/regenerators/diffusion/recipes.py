@@ -73,10 +73,14 @@ class Recipe:
     replaced: dict[str, Any] = field(default_factory=dict)
     """Parts that are not loaded, or set otherwise: no picture is marked or blackened."""
 
+    part: str = ""
+    """Key of its options where a regenerator has several models."""
+
     @property
-    def role(self) -> str:
-        """The role that it can play."""
-        return "upscale" if self.factor > 1 else "restore"
+    def where(self) -> str:
+        """Key of its options."""
+        role = "upscale" if self.factor > 1 else "restore"
+        return ".".join(key for key in ("regenerator", role, self.part) if key)
 
 
 def steps_for(strength: float, steps: int) -> int:

@@ -147,7 +147,7 @@ class Diffusion:
                     f"regenerator {self.options.name} failed: {type(error).__name__}: {error}"
                 ) from error
             if len(batch) == 1:
-                where, (height, width) = f"regenerator.{self.recipe.role}", batch.images.shape[2:]
+                where, (height, width) = self.recipe.where, batch.images.shape[2:]
                 raise TrainingError(
                     f"regenerator {self.options.name} runs out of memory at one picture of {width} x {height} px: set "
                     f"{where}.tiling=true, {where}.offload=model or a smaller dtype, or narrow the augmenter's windows"
