@@ -546,7 +546,7 @@ def test_the_report_shows_pseudo_views_and_what_became_of_them(finished: Path) -
 @pytest.mark.parametrize("stop", [21, 25])
 def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=stop)
-    run, settings = open_run(tmp_path / "run", plugins(), ())
+    run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
     execute(run, settings, plugins())
     whole, parts = final_tensors(finished), final_tensors(tmp_path / "run")
     assert whole.keys() == parts.keys()
@@ -561,7 +561,7 @@ def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_wi
     tiny_run(folder, (*RUN, "training.checkpoint_every=7"), stop_after=27)
     for path in (folder / "checkpoints").glob("step_0000027*"):
         path.unlink()
-    run, settings = open_run(folder, plugins(), ())
+    run, settings = open_run(folder, plugins(), (), training=True)
     assert run.step == 21
     execute(run, settings, plugins())
     whole, parts = final_tensors(finished), final_tensors(folder)
@@ -581,7 +581,7 @@ def test_a_longer_run_waits_for_its_next_event(tmp_path: Path, caplog: pytest.Lo
         tmp_path / "run",
         (*words, "augmenter=bootstrap", "augmenter.bootstrap.timing.span=1500", "augmenter.bootstrap.first_cameras=1"),
     )
-    run, settings = open_run(tmp_path / "run", plugins(), ["iterations=60"])
+    run, settings = open_run(tmp_path / "run", plugins(), ["iterations=60"], training=True)
     assert augmenter_of(run).events[:5] == [30, 33, 36, 39, 42]
     execute(run, settings, plugins())
     assert run.complete
@@ -600,7 +600,7 @@ def test_a_lost_file_of_pseudo_views_is_named(tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=21)
     path = tmp_path / "run" / "pseudo" / "bootstrap_0000020.safetensors"
     path.unlink()
-    run, settings = open_run(tmp_path / "run", plugins(), ())
+    run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
     with pytest.raises(InputError, match=r"bootstrap_0000020.safetensors cannot be read.*step 20.*train anew"):
         execute(run, settings, plugins())
 

@@ -8,6 +8,7 @@ import pytest
 from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
+from gsx.cli import main
 from gsx.core.errors import ConfigError
 from gsx.core.regenerator import as_blocks
 from gsx.regenerators.called import Called, CalledOptions
@@ -31,6 +32,16 @@ def test_a_function_redraws_the_views_of_a_run(tmp_path: Path) -> None:
     made = json.loads((tmp_path / "run" / "pseudo" / "index.json").read_text())["views"]
     assert made
     assert all(view["consistent"] == 1 for view in made if view["scale"] == 2)
+
+
+def test_a_finished_run_is_looked_at_without_its_regenerator(tmp_path: Path) -> None:
+    """It may have been trained elsewhere; going on with it is refused."""
+    words = ["augmenter=upscale", "iterations=12", "regenerator/upscale=callable"]
+    run = tiny_run(tmp_path / "run", [*words, "regenerator.upscale.function=test_called:blocks"])
+    config = run.folder / "config.yaml"
+    config.write_text(config.read_text().replace("test_called:blocks", "no_longer:there"))
+    assert main(["eval", str(run.folder)]) == 0
+    assert main(["resume", str(run.folder), "iterations=14"]) == 2
 
 
 @pytest.mark.parametrize("function", ["", "os", "os:no_such", "no_such_module:f", "os:name"])

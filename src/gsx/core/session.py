@@ -108,7 +108,8 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
 
 
 def build(settings: Settings, scene: Scene, folder: Path, training: bool = False) -> Run:
-    """Everything of a run in memory, at step 0; `training` decides what path=auto of the rasterizer means."""
+    """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
+    rasterizer that suits training. Looking at a run needs none of what its regenerators need."""
     general = settings.general
     device = choose_device(general.device)
     torch.manual_seed(general.seed)
@@ -128,7 +129,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         device=device,
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed),
-        augmenters=build_augmenters(settings, scene),
+        augmenters=build_augmenters(settings, scene) if training else [],
     )
 
 
