@@ -1,6 +1,7 @@
 """A function as a regenerator."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,16 @@ def test_what_is_no_function_is_refused(function: str) -> None:
     """Before training."""
     with pytest.raises(ConfigError, match=f"function(=| is ').*{function}"):
         Called(CalledOptions(name="callable", function=function, arguments={})).check([], [2], False)
+
+
+def test_a_function_beside_the_user_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the working directory, which an installed command does not look into by itself."""
+    (tmp_path / "beside_me.py").write_text("def same(image, **more):\n    return image\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry])
+    called = Called(CalledOptions(name="callable", function="beside_me:same", arguments={}))
+    assert called.function()(3) == 3
+    assert str(tmp_path) not in sys.path
 
 
 def test_arguments_are_passed_on(tmp_path: Path) -> None:

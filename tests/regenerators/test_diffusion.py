@@ -20,6 +20,7 @@ from gsx.core.camera import Camera
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.regenerator import Material, Request, as_blocks, displacement
+from gsx.core.session import open_run
 from gsx.regenerators.diffusion.ladder import Ladder
 from gsx.regenerators.diffusion.options import DiffusionOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, Recipe, steps_for
@@ -376,6 +377,35 @@ def test_any_pipeline_is_called_as_its_options_say(models: dict[str, Path], tmp_
     assert torch.equal(general.regenerate(asked)[0], named.regenerate(asked)[0])
 
 
+def test_a_pipeline_of_ones_own_is_opened_from_its_file(models: dict[str, Path], tmp_path: Path) -> None:
+    """A subclass that turns pictures to grey."""
+    file = tmp_path / "greying.py"
+    file.write_text(
+        "from diffusers import StableDiffusionXLImg2ImgPipeline\n\n\n"
+        "class Greying(StableDiffusionXLImg2ImgPipeline):\n"
+        "    def __call__(self, image, **more):\n"
+        "        from types import SimpleNamespace\n\n"
+        "        return SimpleNamespace(images=image.mean(1, keepdim=True).expand(-1, 3, -1, -1))\n"
+    )
+    words = ["regenerator/restore=diffusers_pipeline", f"regenerator.restore.model={models['sdxl_turbo']}"]
+    words.append(f"regenerator.restore.custom={file}")
+    general = any_pipeline(compose(words, plugins()).regenerators["restore"].options)
+    general.check(small_scene(spread(4)).train, [1], True)
+    general.prepare(material(tmp_path))
+    (result,) = general.regenerate([request(noise(9, 13), 1)])
+    assert float((result - noise(9, 13).mean(0)).abs().max()) <= 0.51 / 255
+
+
+def test_a_pipeline_that_gives_something_else_is_an_error() -> None:
+    """Another size, or pictures that are no tensor."""
+    larger = with_call("sd_x2_latent", lambda pipe, batch, options: as_blocks(batch.images, 4))
+    with pytest.raises(TrainingError, match=r"its results are \(1, 3, 256, 256\) and should be \(1, 3, 128, 128\)"):
+        larger.regenerate([request(noise(64, 64, 31), 2)])
+    listed = with_call("sd_x2_latent", lambda pipe, batch, options: ["picture"])
+    with pytest.raises(TrainingError, match="regenerator sd_x2_latent failed: AttributeError"):
+        listed.regenerate([request(noise(64, 64, 32), 2)])
+
+
 def test_a_pipeline_is_shown_the_photograph_of_the_training_view() -> None:
     """Of the size of the picture, and by its own argument; a prompt of its own takes the place of the augmenter's."""
     words = ["regenerator/restore=diffusers_pipeline", "regenerator.restore.model=x/y"]
@@ -480,6 +510,21 @@ def test_missing_and_damaged_files_are_named(copied: Path) -> None:
     assert "holds no model_index.json" in refused("sdxl_turbo", copied)
 
 
+def test_weights_of_a_variant_are_not_those_without(copied: Path) -> None:
+    """A folder with one kind is refused where the other is asked for."""
+    for path in copied.glob("*/*.safetensors"):
+        path.rename(path.with_name(f"{path.stem}.fp16.safetensors"))
+    assert "lacks vae/*.safetensors" in refused("sdxl_turbo", copied)
+    fine = options_of("sdxl_turbo", "regenerator.restore.variant=fp16", model=copied)
+    Diffusion(SDXL_TURBO, fine).check(small_scene(spread(4)).train, [1], False)
+
+
+def test_a_folder_that_is_not_there_is_no_id(tmp_path: Path) -> None:
+    """The command names the model's own id."""
+    told = refused("sd_x4", "models/stable-diffusion-x4-upscaler")
+    assert "hf download stabilityai/stable-diffusion-x4-upscaler" in told
+
+
 def test_a_model_that_passes_the_look_and_cannot_be_loaded_is_one_sentence(copied: Path, tmp_path: Path) -> None:
     """A configuration that does not fit its weights."""
     path = copied / "unet" / "config.json"
@@ -516,12 +561,13 @@ def pairs() -> list[tuple[Tensor, Tensor]]:
     return worn(tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1)))
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_tuning_lowers_the_error_on_views_it_has_not_seen(
-    pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path
+    dtype: str, pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path
 ) -> None:
     """Below that of the model as it was, and below that of the renders; a second run of the scene learns nothing anew,
     and both restore alike."""
-    options = options_of("sdxl_turbo", *TUNING, model=models["useful"])
+    options = options_of("sdxl_turbo", *TUNING, f"regenerator.restore.dtype={dtype}", model=models["useful"])
     first = Diffusion(SDXL_TURBO, options)
     figures = first.prepare(material(tmp_path / "first", pairs))
     assert figures["error_tuned"] < 0.5 * figures["error_raw"]
@@ -539,14 +585,20 @@ def test_tuning_lowers_the_error_on_views_it_has_not_seen(
         assert float((one - photo).square().mean()) < 0.5 * float((render - photo).square().mean())
 
 
+@pytest.mark.parametrize("rate", ["10", "1e20"])
 def test_an_adapter_that_does_harm_is_not_used(
-    pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    rate: str,
+    pairs: list[tuple[Tensor, Tensor]],
+    models: dict[str, Path],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Learnt at a rate that ruins it; restored pictures are those of the model as it was."""
-    ruined = [*TUNING, "regenerator.restore.tuning.rate=10", "regenerator.restore.tuning.steps=4"]
+    """Learnt at a rate that ruins it, or ends in no number; restored pictures are those of the model as it was."""
+    ruined = [*TUNING, f"regenerator.restore.tuning.rate={rate}", "regenerator.restore.tuning.steps=4"]
     tuned = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *ruined, model=models["useful"]))
     figures = tuned.prepare(material(tmp_path, pairs))
-    assert figures["error_tuned"] > figures["error_raw"]
+    assert not figures["error_tuned"] <= figures["error_raw"]
+    assert all(isinstance(value, float) for value in figures.values())
     assert "tuning does not help" in caplog.text
     raw = ready("sdxl_turbo_raw", tmp_path / "raw", model=models["useful"])
     asked = [request(pairs[0][0], 1)]
@@ -562,6 +614,45 @@ def test_a_damaged_adapter_is_named(
     (tmp_path / "sdxl_turbo" / "adapter.safetensors").write_bytes(b"nothing")
     with pytest.raises(TrainingError, match="is damaged"):
         Diffusion(SDXL_TURBO, options).prepare(material(tmp_path, pairs))
+
+
+def test_an_adapter_of_another_model_is_not_merged(
+    pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path
+) -> None:
+    """A run goes on with what it was begun with."""
+    few = [*TUNING, "regenerator.restore.tuning.steps=2"]
+    Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *few, model=models["useful"])).prepare(material(tmp_path, pairs))
+    for other in (
+        options_of("sdxl_turbo", *few, model=models["still"]),
+        options_of("sdxl_turbo", *few, "regenerator.restore.tuning.rank=2", model=models["useful"]),
+    ):
+        with pytest.raises(TrainingError, match="go on with those that the run was begun with"):
+            Diffusion(SDXL_TURBO, other).prepare(material(tmp_path, pairs))
+
+
+def test_a_damaged_adapter_in_the_cache_is_learnt_again(
+    pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a cache that cannot be written costs nothing but the sharing."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    options = options_of("sdxl_turbo", *TUNING, "regenerator.restore.tuning.steps=2", model=models["useful"])
+    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "first", pairs))
+    (kept,) = (tmp_path / "cache" / "lora").glob("*/adapter.safetensors")
+    content = kept.read_bytes()
+    kept.write_bytes(b"nothing")
+    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "second", pairs))
+    assert (tmp_path / "second" / "sdxl_turbo" / "adapter.safetensors").read_bytes() == content == kept.read_bytes()
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "file"))
+    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "third", pairs))
+    assert (tmp_path / "third" / "sdxl_turbo" / "adapter.safetensors").read_bytes() == content
+
+
+def test_half_precision_is_not_tuned() -> None:
+    """Its gradients vanish."""
+    with pytest.raises(ConfigError, match="gradients vanish in dtype=float16"):
+        options_of("sdxl_turbo", "regenerator.restore.dtype=float16")
+    options_of("sdxl_turbo_raw", "regenerator.restore.dtype=float16")
 
 
 # -- the whole ---------------------------------------------------------------------------------------------------------
@@ -585,13 +676,18 @@ def whole(models: dict[str, Path]) -> list[str]:
     ]
 
 
-def test_the_whole_run_end_to_end(whole: list[str], tmp_path: Path) -> None:
-    """Interrupted inside the windows and resumed it gives the same bits as in one go."""
+def test_the_whole_run_end_to_end(whole: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted inside the windows and resumed it gives the same bits as in one go; neither finds anything kept."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "one"))
     run = tiny_run(tmp_path / "whole", whole)
-    made = json.loads((tmp_path / "whole" / "pseudo" / "index.json").read_text())
-    assert {entry["augmenter"] for entry in made["views"]} == {"upscale", "bootstrap"}
+    assert run.complete
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "other"))
     tiny_run(tmp_path / "halves", whole, stop_after=33)
     assert main(["resume", str(tmp_path / "halves")]) == 0
-    one, other = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("whole", "halves"))
-    assert one["psnr"] == other["psnr"]
-    assert run.complete
+    resumed, _ = open_run(tmp_path / "halves", plugins())
+    assert all(torch.equal(value, resumed.backbone.tensors()[name]) for name, value in run.backbone.tensors().items())
+    one, other = (
+        json.loads((tmp_path / name / "pseudo" / "index.json").read_text())["views"] for name in ("whole", "halves")
+    )
+    assert {view["augmenter"] for view in one} == {"upscale", "bootstrap"}
+    assert [view["sha256"] for view in one] == [view["sha256"] for view in other]

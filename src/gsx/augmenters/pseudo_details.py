@@ -154,7 +154,7 @@ class PseudoOptions:
     """Windows at random places, or of cameras moved at random, are drawn again, ten times at most, while the model's
     mean alpha in them is lower: objects fill little of their pictures (spec 1.7). 0: the first is taken."""
     project: str
-    """exact: the nearest picture whose box average is its input, to the last of 8 bits (spec 5.3)."""
+    """exact: the nearest picture whose box average is its input, of photographs to the last of 8 bits (spec 5.3)."""
     weight_map: str
     """none, or splatsure: only pixels count whose surface no photograph shows as finely (spec 6.1)."""
     gate: float
@@ -510,7 +510,7 @@ class PseudoDetails:
             result = torch.stack([sample[number].detach().cpu().float() for sample in results]).mean(0)
             if torch.isfinite(result).all() and result.shape[0] == 3:
                 result = colour_matched(request, result)
-            if self.to_be_exact(request) and result.shape[1:] == enlarged_size(request):
+            if self.options.project == "exact" and request.scale > 1 and result.shape == enlarged_shape(request):
                 result = projected(result, request.image.cpu(), request.scale)
             problem = complaint(request, result)
             view = None if problem else self.view(run, event, sketch, request, result)
@@ -543,17 +543,13 @@ class PseudoDetails:
         enlarging = max(self.options.scales) > 1 and self.options.project == "none"
         return f", or augmenter.{self.setting.name}.project=exact" if enlarging else ""
 
-    def to_be_exact(self, request: Request) -> bool:
-        """Whether the result must reduce to its input."""
-        return self.options.project == "exact" and request.scale > 1 and request.photo
-
     def view(
         self, run: Run, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]
     ) -> PseudoView:
         """The pseudo view of a result: its window, in 8 bits."""
         a, inside = sketch.scale, sketch.inside
         target = to_uint8(result.clamp(0, 1))
-        if self.to_be_exact(request):
+        if self.options.project == "exact" and a > 1 and request.photo:
             target = exactly_consistent(result, to_uint8(request.image), a)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
@@ -604,10 +600,10 @@ class PseudoDetails:
         write_image(folder / picture_name(self.setting.name, view), torch.cat([given, result, difference], 2))
 
 
-def enlarged_size(request: Request) -> tuple[int, int]:
-    """(height, width) that a result should have."""
+def enlarged_shape(request: Request) -> tuple[int, int, int]:
+    """What a result should have."""
     height, width = (side * request.scale for side in request.image.shape[1:])
-    return height, width
+    return 3, height, width
 
 
 def again(request: Request, number: int) -> Request:

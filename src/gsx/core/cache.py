@@ -77,7 +77,17 @@ def trim(kind: str, budget: float, kept: Path) -> list[Path]:
     for folder in sorted(folders, key=lambda path: path.stat().st_mtime_ns):
         if excess > 0 and folder != kept:
             shutil.rmtree(folder, ignore_errors=True)
-            logger.info("%s/%s made room in the cache (%.1f GB)", kind, folder.name, folders[folder] / 1e9)
             excess -= folders[folder]
             removed.append(folder)
+    if removed:
+        freed = sum(folders[folder] for folder in removed) / 1e9
+        logger.info("%d of %s made room in the cache (%.1f GB)", len(removed), kind, freed)
     return removed
+
+
+def make_room(kind: str, gigabytes: float) -> None:
+    """`trim` to so many 10^9 bytes; a cache that cannot be looked at, or changes meanwhile, is no error."""
+    try:
+        trim(kind, gigabytes * 1e9, kept=cache_folder(kind, ""))
+    except OSError as error:
+        logger.warning("the cache of %s could not be trimmed (%s)", kind, error)

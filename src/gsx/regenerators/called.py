@@ -1,6 +1,9 @@
 """Any function of a picture as a regenerator: the shortest way to try one."""
 
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -11,6 +14,16 @@ from gsx.core.errors import ConfigError
 from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
 from gsx.core.shapes import Float
+
+
+@contextmanager
+def beside_the_user() -> Iterator[None]:
+    """Modules of the working directory can be imported, as with `python -m`."""
+    sys.path.insert(0, os.getcwd())
+    try:
+        yield
+    finally:
+        sys.path.remove(os.getcwd())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +59,8 @@ class Called:
         """
         module, colon, name = self.options.function.partition(":")
         try:
-            found = getattr(import_module(module), name) if colon else None
+            with beside_the_user():
+                found = getattr(import_module(module), name) if colon else None
         except Exception as error:  # whatever a user's module raises
             raise ConfigError(
                 f"regenerator callable: function={self.options.function} cannot be imported ({error})"

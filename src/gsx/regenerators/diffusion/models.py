@@ -4,12 +4,15 @@ import hashlib
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gsx.core.cache import content_key
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions
 from gsx.regenerators.diffusion.recipes import Recipe
@@ -60,25 +63,26 @@ def snapshot(options: DiffusionOptions, recipe: Recipe) -> Path:
     except HFValidationError:
         why = "it is no folder, and no id of the form owner/model"
     except Exception as error:  # each version of the hub's client raises its own families of errors
+        if partial := getattr(error, "snapshot_path", None):  # something is there: what is missing is told below
+            return Path(partial)
         why = first_line(error) if options.download else "it is no folder, and not in the cache of the hub's client"
     raise InputError(f"regenerator {options.name} finds no model '{options.model}' ({why}). {remedy(options, recipe)}")
 
 
 def wanted(options: DiffusionOptions) -> list[str]:
     """Patterns of the files of a model: the networks' folders, not the single files beside them."""
-    weights = f"*/*.{options.variant}.safetensors" if options.variant else "*/*.safetensors"
+    weights = f"*/*.{options.variant}*.safetensors" if options.variant else "*/*.safetensors"
     return [INDEX, "*/*.json", "*/*.txt", "*/*.model", weights]
 
 
 def unwanted(options: DiffusionOptions) -> list[str]:
     """Patterns that `wanted` matches too many of."""
-    return [] if options.variant else ["*/*.fp16.safetensors", "*/*.non_ema.safetensors"]
+    return [] if options.variant else ["*/*.*.safetensors"]
 
 
 def remedy(options: DiffusionOptions, recipe: Recipe) -> str:
     """Which files, how large, where to put them, and the command that does so."""
-    name = options.model if "/" in options.model and not Path(options.model).is_absolute() else recipe.hub
-    folder = f"models/{name.split('/')[-1]}"
+    name, folder = recipe.hub, f"models/{recipe.hub.split('/')[-1]}"
     patterns = " ".join(f"--include '{pattern}'" for pattern in wanted(options))
     patterns += "".join(f" --exclude '{pattern}'" for pattern in unwanted(options))
     folders = ", ".join((*recipe.networks, *recipe.others)) or "that it names"
@@ -102,12 +106,12 @@ def inspect(folder: Path, options: DiffusionOptions, recipe: Recipe) -> None:
             f"{' or '.join(recipe.accepted)}: set {recipe.where}.model to another folder"
         )
     missing = [part for part in (*recipe.networks, *recipe.others) if not (folder / part).is_dir()]
-    missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder, part, options)]
+    missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder / part, options)]
     if missing:
         raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, recipe)}")
     if isinstance(options, PipelineOptions) and options.custom and not Path(options.custom).is_file():
         raise InputError(f"regenerator {options.name}: there is no file custom={options.custom}")
-    for path in sorted(folder.glob(f"*/{weights_name(options)}")):
+    for path in all_weights(folder, options):
         refuse_damaged(path, options)
 
 
@@ -128,9 +132,19 @@ def weights_name(options: DiffusionOptions) -> str:
     return f"*.{options.variant}.safetensors" if options.variant else "*.safetensors"
 
 
-def weights_of(folder: Path, part: str, options: DiffusionOptions) -> list[Path]:
-    """Files of weights of a network."""
-    return sorted((folder / part).glob(weights_name(options)))
+def weights_of(folder: Path, options: DiffusionOptions) -> list[Path]:
+    """Files of weights of a network: NAME.safetensors, or NAME.VARIANT.safetensors, either in numbered pieces."""
+    files = sorted(folder.glob("*.safetensors"))
+    if options.variant:
+        return [path for path in files if path.stem.partition(".")[2].partition("-")[0] == options.variant]
+    return [path for path in files if "." not in path.stem]
+
+
+def all_weights(folder: Path, options: DiffusionOptions) -> list[Path]:
+    """Those that `diffusers` reads: of each network the variant's, or, where there are none, the plain ones."""
+    plain = replace(options, variant="")
+    parts = sorted(part for part in folder.iterdir() if part.is_dir())
+    return [path for part in parts for path in weights_of(part, options) or weights_of(part, plain)]
 
 
 def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
@@ -145,16 +159,26 @@ def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
 
 
 def fingerprint(folder: Path, options: DiffusionOptions) -> str:
-    """SHA-256 of everything that decides what a model draws."""
+    """SHA-256 of everything in files that decides what a model draws."""
     digest = hashlib.sha256()
     files = [path for path in folder.rglob("*") if path.suffix in (".json", ".txt", ".model", ".py")]
-    files += folder.glob(f"*/{weights_name(options)}")
+    files += all_weights(folder, options)
+    if isinstance(options, PipelineOptions) and options.custom:
+        files.append(Path(options.custom))
     for path in sorted(set(files)):
-        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+        digest.update(f"{path.name} {path.parent.name} {path.stat().st_size}\n".encode())
         with path.open("rb") as stream:
             while piece := stream.read(CHUNK):
                 digest.update(piece)
     return digest.hexdigest()
+
+
+def code_stamp() -> str:
+    """Of this package and the libraries it calls: what they draw may change with them."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return content_key(digest.hexdigest(), *(version(package) for package in ("torch", *PACKAGES, "safetensors")))
 
 
 def number_type(options: DiffusionOptions, device: torch.device) -> torch.dtype:
@@ -190,10 +214,11 @@ def opened(folder: Path, options: DiffusionOptions, recipe: Recipe, dtype: torch
             "fetch the model again, or choose another"
         ) from error
     pipe.set_progress_bar_config(disable=True)
-    if options.slicing:
-        pipe.vae.enable_slicing()
-    if options.tiling:
-        pipe.vae.enable_tiling()
+    autoencoder: Any = getattr(pipe, "vae", None)
+    if options.slicing and hasattr(autoencoder, "enable_slicing"):
+        autoencoder.enable_slicing()
+    if options.tiling and hasattr(autoencoder, "enable_tiling"):
+        autoencoder.enable_tiling()
     return pipe
 
 

@@ -138,3 +138,10 @@ class RestorerOptions(DiffusionOptions):
     """Of a restorer by image-to-image."""
 
     tuning: TuningOptions
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.tuning.steps and self.dtype == "float16":
+            raise ValueError(
+                f"regenerator {self.name}: gradients vanish in dtype=float16; take bfloat16, float32 or tuning.steps=0"
+            )

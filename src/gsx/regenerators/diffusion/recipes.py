@@ -161,7 +161,7 @@ def recipe_of(options: PipelineOptions) -> Recipe:
         least=options.least,
         call=redraw,
         reference=bool(options.reference),
-        replaced={"custom_pipeline": options.custom} if options.custom else {},
+        replaced={"custom_pipeline": options.custom, "trust_remote_code": True} if options.custom else {},
     )
 
 

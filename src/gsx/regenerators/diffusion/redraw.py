@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key, make_folder, trim
+from gsx.core.cache import cache_folder, content_key, make_folder, make_room
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import read_image, resize, to_uint8, write_image
@@ -19,7 +20,16 @@ from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 from gsx.core.window import Window
-from gsx.regenerators.diffusion.models import PACKAGES, fingerprint, located, number_type, opened, place, require
+from gsx.regenerators.diffusion.models import (
+    PACKAGES,
+    code_stamp,
+    fingerprint,
+    located,
+    number_type,
+    opened,
+    place,
+    require,
+)
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
 from gsx.regenerators.diffusion.recipes import Batch, Recipe, recipe_of
 from gsx.regenerators.diffusion.sizes import enlarged, grown
@@ -74,7 +84,13 @@ class Diffusion:
         located(self.options, self.recipe)
 
     def prepare(self, material: Material) -> dict[str, float]:
-        """Open the pipeline, and tune it to the scene if it is to be; once per run."""
+        """Open the pipeline, and tune it to the scene if it is to be; once per run.
+
+        Raises:
+            TrainingError: it cannot be loaded or does not fit into memory; the run keeps its checkpoint.
+        """
+        if self.options.cache_gb:
+            make_room(PICTURES, self.options.cache_gb)
         if self.pipe is not None:
             return {}
         begun = time.perf_counter()
@@ -84,15 +100,19 @@ class Diffusion:
         dtype = number_type(options, material.device)
         pipe = opened(folder, options, self.recipe, dtype)
         found = Tuned()
-        if isinstance(options, RestorerOptions) and options.tuning.steps:
-            found = tuned(pipe.to(material.device), options, self.recipe, material, files)
-        place(pipe, options, material.device)
+        try:
+            if isinstance(options, RestorerOptions) and options.tuning.steps:
+                found = tuned(pipe, options, self.recipe, material, files)
+            place(pipe, options, material.device)
+        except (RuntimeError, ValueError) as error:
+            raise TrainingError(
+                f"regenerator {options.name} cannot be made ready ({type(error).__name__}: {error}): if memory is "
+                f"short, set {self.recipe.where}.offload=model or a smaller dtype"
+            ) from error
         telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
-        machine = (torch.__version__, torch.get_num_threads(), device_name(material.device), str(dtype))
+        machine = (code_stamp(), torch.get_num_threads(), device_name(material.device), str(dtype))
         self.identity = content_key(files, found.digest, telling, machine)
         self.pipe = pipe
-        if options.cache_gb:
-            trim(PICTURES, options.cache_gb * 1e9, kept=cache_folder(PICTURES, ""))
         logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - begun, folder)
         return found.figures
 
@@ -122,8 +142,9 @@ class Diffusion:
         return out
 
     def remembered(self, together: Sequence[Fitted], turn: int) -> list[Float[Tensor, "3 H W"]]:
-        """Results of a batch, from the cache if it holds all of them: what is drawn may depend on the batch's size."""
-        paths = [self.path(part, turn) for part in together]
+        """Results of a batch, from the cache if it holds this batch: what is drawn may depend on the company."""
+        contents = [content_of(part) for part in together]
+        paths = [self.path(contents, number, turn) for number in range(len(together))]
         kept = [read_kept(path) for path in paths] if self.options.cache_gb else []
         if kept and all(result is not None for result in kept):
             return [result for result in kept if result is not None]
@@ -140,8 +161,10 @@ class Diffusion:
             TrainingError: a single picture does not fit, or the pipeline fails; the run keeps its checkpoint.
         """
         try:
-            return self.recipe.call(self.pipe, batch, self.options).detach().cpu().float()
-        except (RuntimeError, ValueError, TypeError) as error:
+            return self.of_the_right_size(
+                batch, self.recipe.call(self.pipe, batch, self.options).detach().cpu().float()
+            )
+        except Exception as error:  # whatever a library or a custom pipeline raises, the run must end in one sentence
             if not any(words in str(error).lower() for words in MEMORY):
                 raise TrainingError(
                     f"regenerator {self.options.name} failed: {type(error).__name__}: {error}"
@@ -156,14 +179,17 @@ class Diffusion:
         half = len(batch) // 2
         return torch.cat([self.called(batch.part(0, half)), self.called(batch.part(half, len(batch)))])
 
-    def path(self, part: Fitted, turn: int) -> Path:
-        """Where the result of a picture is kept."""
-        request = part.request
-        exact = hashlib.sha256(part.image.numpy().tobytes())
-        if part.reference is not None:
-            exact.update(part.reference.numpy().tobytes())
-        key = content_key(self.identity, exact.hexdigest(), request.seed, request.strength, request.prompt, turn)
-        return cache_folder(PICTURES, key) / "picture.png"
+    def of_the_right_size(self, batch: Batch, results: Tensor) -> Float[Tensor, "B 3 H W"]:
+        """The results, or ValueError if the pipeline has made something else of its pictures."""
+        count, channels, height, width = batch.images.shape
+        expected = (count, channels, height * self.recipe.factor, width * self.recipe.factor)
+        if tuple(results.shape) != expected:
+            raise ValueError(f"its results are {tuple(results.shape)} and should be {expected}")
+        return results
+
+    def path(self, contents: Sequence[str], number: int, turn: int) -> Path:
+        """Where the result of one picture of a batch is kept."""
+        return cache_folder(PICTURES, content_key(self.identity, contents, number, turn)) / "picture.png"
 
 
 def any_pipeline(options: PipelineOptions) -> Diffusion:
@@ -223,6 +249,14 @@ def batch_of(together: Sequence[Fitted]) -> Batch:
     )
 
 
+def content_of(part: Fitted) -> str:
+    """Of all that a picture's result depends on, but for its company."""
+    request, exact = part.request, hashlib.sha256(part.image.numpy().tobytes())
+    if part.reference is not None:
+        exact.update(part.reference.numpy().tobytes())
+    return content_key(exact.hexdigest(), request.seed, request.strength, request.prompt)
+
+
 def rounded(result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """In steps of 1/255, if it is finite."""
     return to_uint8(result.clamp(0, 1)).float() / 255 if bool(torch.isfinite(result).all()) else result
@@ -231,8 +265,11 @@ def rounded(result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
 def read_kept(path: Path) -> Float[Tensor, "3 H W"] | None:
     """A result as `keep` left it; None if it is not there."""
     try:
-        return read_image(path).float() / 255 if path.is_file() else None
-    except InputError as error:
+        if not path.is_file():
+            return None
+        os.utime(path.parent)  # what is used stays longest
+        return read_image(path).float() / 255
+    except (OSError, InputError) as error:
         logger.warning("%s; it is drawn again", error)
         return None
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,18 +20,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key, make_folder
+from gsx.core.cache import cache_folder, content_key, make_folder, make_room
 from gsx.core.device import device_name
-from gsx.core.errors import TrainingError
+from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.regenerator import Material
 from gsx.core.shapes import Float, Int
+from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
 from gsx.regenerators.diffusion.recipes import Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.sizes import grown
 
 logger = logging.getLogger(__name__)
 
+ADAPTERS = "lora"
+"""Kind of the adapters in the cache."""
 WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
 WEIGHT_DECAY = 1e-2
 LARGEST_NORM = 1.0
@@ -62,23 +66,34 @@ def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, material: Materia
     own = material.folder / options.name
     if not (own / FACTS).is_file():
         pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
-        shared = cache_folder("lora", key_of(pairs, options, material, files))
-        if not (shared / FACTS).is_file():
-            new_adapter(pipe, options, recipe, material, pairs, files, shared)
-        copy_adapter(shared, own)
+        shared = cache_folder(ADAPTERS, key_of(pairs, options, material, files))
+        if not adopted(shared, own):
+            new_adapter(pipe.to(material.device), options, recipe, material, pairs, files, own)
+            share(own, shared, options.cache_gb)
     facts = read_facts(own)
+    refuse_another(facts, own, options, files)
+    figures = {name: math.nan if value is None else value for name, value in facts["figures"].items()}
     if not facts["used"]:
-        return Tuned(figures=facts["figures"])
+        return Tuned(figures=figures)
     merge(pipe, own)
-    return Tuned(digest=facts["sha256"], figures=facts["figures"])
+    return Tuned(digest=facts["sha256"], figures=figures)
+
+
+def refuse_another(facts: dict[str, Any], folder: Path, options: RestorerOptions, files: str) -> None:
+    """Raise TrainingError if an adapter was learnt for another model, or otherwise."""
+    if facts.get("model_sha256") != files or facts.get("tuning") != asdict(options.tuning):
+        raise TrainingError(
+            f"the adapter in {folder} was learnt with other files of the model, or other tuning options: go on with "
+            "those that the run was begun with, or remove the folder to learn anew"
+        )
 
 
 def key_of(pairs: Sequence[Pair], options: RestorerOptions, material: Material, files: str) -> str:
     """Of everything that decides what is learnt."""
-    digest = hashlib.sha256(Path(__file__).read_bytes())
+    digest = hashlib.sha256()
     for part in (image for pair in pairs for image in pair):
         digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
-    machine = (torch.__version__, torch.get_num_threads(), device_name(material.device))
+    machine = (code_stamp(), version("peft"), torch.get_num_threads(), device_name(material.device))
     telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
     return content_key(files, telling, digest.hexdigest(), material.seed, machine)
 
@@ -113,7 +128,7 @@ def new_adapter(
         logger.warning("%s: tuning does not help on held-out views, the model stays as it is", options.name)
     if figures["error_tuned"] >= figures["error_of_renders"]:
         logger.warning("%s takes held-out renders further from their photographs", options.name)
-    make_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     replace_file(folder / WEIGHTS, weights)
     write_json(
         folder / FACTS,
@@ -334,8 +349,32 @@ def adapter_bytes(pipe: Any) -> bytes:
         return (Path(folder) / WEIGHTS).read_bytes()
 
 
+def adopted(shared: Path, own: Path) -> bool:
+    """Whether the cache had the adapter; it is then in the run's folder too."""
+    if not (shared / FACTS).is_file():
+        return False
+    try:
+        read_facts(shared)
+        copy_adapter(shared, own)
+    except (OSError, TrainingError) as error:
+        logger.warning("%s; it is learnt again", error)
+        return False
+    return True
+
+
+def share(own: Path, shared: Path, cache_gb: float) -> None:
+    """Let later runs have the adapter; a cache that cannot be written is no error."""
+    if not cache_gb:
+        return
+    try:
+        copy_adapter(own, make_folder(shared))
+        make_room(ADAPTERS, cache_gb)
+    except (OSError, InputError) as error:
+        logger.warning("%s: later runs will learn again", error)
+
+
 def copy_adapter(source: Path, target: Path) -> None:
-    """Into the run's folder; what tells that it is whole comes last."""
+    """From folder to folder; what tells that it is whole comes last."""
     target.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, FACTS):
         replace_file(target / name, (source / name).read_bytes())
