@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.cli import main
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.regenerator import as_blocks
 from gsx.regenerators.called import Called, CalledOptions
 
@@ -33,6 +34,24 @@ def test_a_function_redraws_the_views_of_a_run(tmp_path: Path) -> None:
     made = json.loads((tmp_path / "run" / "pseudo" / "index.json").read_text())["views"]
     assert made
     assert all(view["consistent"] == 1 for view in made if view["scale"] == 2)
+
+
+def stray(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float) -> Tensor:
+    """An upscaler that invents too much: its box average is far from its input."""
+    noise = torch.rand(3, *(scale * side for side in image.shape[1:]), generator=torch.Generator().manual_seed(seed))
+    return as_blocks(image, scale) + 0.4 * (noise - 0.5)
+
+
+def test_projection_saves_pictures_of_an_upscaler_that_strays(tmp_path: Path) -> None:
+    """Of photographs and of renders; without it the run ends, and says what to set."""
+    words = ["augmenter=upscale_paper", "iterations=12", "regenerator/upscale=callable"]
+    words += ["regenerator.upscale.function=test_called:stray"]
+    with pytest.raises(TrainingError, match=r"differs from its input.*augmenter.upscale.project=exact"):
+        tiny_run(tmp_path / "strays", words)
+    tiny_run(tmp_path / "projected", [*words, "augmenter.upscale.project=exact"])
+    made = json.loads((tmp_path / "projected" / "pseudo" / "index.json").read_text())["views"]
+    assert {view["source"] for view in made} == {"photo", "render"}
+    assert all(view["consistent"] == 1 for view in made if view["source"] == "photo")
 
 
 def test_a_finished_run_is_looked_at_without_its_regenerator(tmp_path: Path) -> None:
