@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from small_scene import small_scene, spread
-from tiny import tiny_run
+from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 
 from gsx.cli import main, plugins
@@ -139,6 +139,22 @@ def noise(height: int, width: int, seed: int = 0) -> Tensor:
     return (values * 255).round() / 255
 
 
+def phase_shift(image: Tensor, reference: Tensor) -> tuple[int, int]:
+    """(down, right) by which a picture is displaced, px: where the phases of its spectrum and the other's agree."""
+    one, other = (torch.fft.fft2(picture.double().mean(0)) for picture in (image, reference))
+    product = one * other.conj()
+    peaks = torch.fft.ifft2(product / product.abs().clamp_min(1e-12)).real
+    row, column = divmod(int(peaks.argmax()), peaks.shape[1])
+    height, width = peaks.shape
+    return (row + height // 2) % height - height // 2, (column + width // 2) % width - width // 2
+
+
+def test_the_check_of_phases_sees_a_pixel() -> None:
+    """And its direction."""
+    image = tiny_models.pictures(1, 45, 71, torch.Generator().manual_seed(3))[0]
+    assert phase_shift(image.roll((1, -2), (1, 2)), image) == (1, -2)
+
+
 # -- sizes -------------------------------------------------------------------------------------------------------------
 
 
@@ -205,6 +221,7 @@ def test_a_model_that_changes_nothing_gives_its_input_back(
     turbo = ready("sdxl_turbo_raw", tmp_path, model=models["still"])
     (result,) = turbo.regenerate([request(noise(*size), 1)])
     assert float((result - noise(*size)).abs().max()) <= 1.01 / 255
+    assert phase_shift(result, noise(*size)) == (0, 0)
 
 
 def test_zero_strength_changes_nothing(models: dict[str, Path], tmp_path: Path) -> None:
@@ -237,6 +254,7 @@ def test_the_latent_upscaler_does_not_shift(models: dict[str, Path], tmp_path: P
     (result,) = upscaler.regenerate([request(image, 2)])
     assert float((result - as_blocks(image, 2)).abs().max()) <= 1.5 / 255
     assert displacement(result, as_blocks(image, 2)) < 0.01
+    assert phase_shift(result, as_blocks(image, 2)) == (0, 0)
 
 
 # -- calls -------------------------------------------------------------------------------------------------------------
@@ -691,3 +709,23 @@ def test_the_whole_run_end_to_end(whole: list[str], tmp_path: Path, monkeypatch:
     )
     assert {view["augmenter"] for view in one} == {"upscale", "bootstrap"}
     assert [view["sha256"] for view in one] == [view["sha256"] for view in other]
+
+
+def test_a_model_that_cannot_be_loaded_costs_no_training(
+    whole: list[str], copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run ends at its first event in one message, keeps its state, and goes on once the model is mended."""
+    path = copied / "unet" / "config.json"
+    sound = path.read_text()
+    path.write_text(json.dumps(json.loads(sound) | {"in_channels": 9}))
+    words = [word for word in whole if "restore" not in word and "tuning" not in word]
+    words += ["augmenter=bootstrap", "regenerator/restore=sdxl_turbo_raw", f"regenerator.restore.model={copied}"]
+    words += ["regenerator.restore.variant=''", "augmenter.bootstrap.strength=[0,0]", "backbone=gs3d"]
+    words = [word for word in words if "upscale" not in word and "octree" not in word]
+    folder = tmp_path / "run"
+    assert main([*OVERRIDES, *words, f"folder={folder}"]) == 2
+    assert "cannot be loaded" in capsys.readouterr().err
+    assert json.loads((folder / "status.json").read_text())["step"] == 20
+    path.write_text(sound)
+    assert main(["resume", str(folder)]) == 0
+    assert json.loads((folder / "status.json").read_text()) == {"state": "ok", "reason": "", "step": 40}
