@@ -510,7 +510,7 @@ class PseudoDetails:
             result = torch.stack([sample[number].detach().cpu().float() for sample in results]).mean(0)
             if torch.isfinite(result).all() and result.shape[0] == 3:
                 result = colour_matched(request, result)
-            if self.options.project == "exact" and request.scale > 1 and result.shape == enlarged_shape(request):
+            if self.options.project == "exact" and request.scale > 1 and result.shape == (3, *request.result_size):
                 result = projected(result, request.image.cpu(), request.scale)
             problem = complaint(request, result)
             view = None if problem else self.view(run, event, sketch, request, result)
@@ -598,12 +598,6 @@ class PseudoDetails:
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.setting.name, view), torch.cat([given, result, difference], 2))
-
-
-def enlarged_shape(request: Request) -> tuple[int, int, int]:
-    """What a result should have."""
-    height, width = (side * request.scale for side in request.image.shape[1:])
-    return 3, height, width
 
 
 def again(request: Request, number: int) -> Request:

@@ -32,6 +32,14 @@ def content_key(*parts: object) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:KEY_LETTERS]
 
 
+def source_digest(folder: Path) -> str:
+    """A digest of the Python files below a folder: other code may give other results."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
 def file_stamp(path: Path) -> tuple[str, int, int]:
     """Name, size in bytes and modification time in ns: enough to notice that a file was replaced.
 

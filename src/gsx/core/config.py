@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsx.core.errors import ConfigError, nearest
+from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.evaluate import EvalOptions
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -195,11 +195,6 @@ def dotted(node: Any, prefix: str = "") -> Iterator[str]:
     for key, value in node.items() if isinstance(node, dict) else ():
         yield f"{prefix}{key}"
         yield from dotted(value, f"{prefix}{key}.")
-
-
-def first_line(error: Exception) -> str:
-    """First line of an error's message."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Settings:

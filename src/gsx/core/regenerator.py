@@ -48,6 +48,12 @@ class Request:
     prompt: str
     step: int
 
+    @property
+    def result_size(self) -> tuple[int, int]:
+        """(height, width) of the result."""
+        height, width = self.image.shape[1:]
+        return height * self.scale, width * self.scale
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Material:
@@ -116,9 +122,9 @@ def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Te
 
 def complaint(request: Request, result: Tensor) -> str:
     """Why a result cannot be used; empty for a sound one (spec 6.4)."""
-    height, width = (side * request.scale for side in request.image.shape[1:])
-    if tuple(result.shape) != (3, height, width):
-        return f"it is {tuple(result.shape)} and should be {(3, height, width)}"
+    expected = (3, *request.result_size)
+    if tuple(result.shape) != expected:
+        return f"it is {tuple(result.shape)} and should be {expected}"
     if not bool(torch.isfinite(result).all()):
         return "it holds values that are not finite"
     low = box_average(result.cpu().float().clamp(0, 1), request.scale)

@@ -12,12 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 import gsx
 from gsx.core import checkpoint
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, trim
-from gsx.core.device import device_name
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_digest, trim
+from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
 from gsx.core.plugins import hookimpl
@@ -43,8 +41,14 @@ def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
     """Where states of runs like this one are kept; `plugins`: versions of those installed."""
     config: dict[str, Any] = {key: value for key, value in run.config.items() if key not in BESIDE}
     config["training"] = {key: value for key, value in config["training"].items() if key not in WATCHING}
-    machine = (device_name(run.device), torch.get_num_threads(), torch.__version__, run.raster.path)
-    parts = (json.dumps(config, sort_keys=True, default=str), seen_by(run), sources(), sorted(plugins.items()), machine)
+    machine = (*machine_stamp(run.device), run.raster.path)
+    parts = (
+        json.dumps(config, sort_keys=True, default=str),
+        seen_by(run),
+        source_digest(Path(gsx.__file__).parent),
+        sorted(plugins.items()),
+        machine,
+    )
     return cache_folder("trunks", content_key(*parts))
 
 
@@ -57,14 +61,6 @@ def seen_by(run: Run) -> str:
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
         digest.update(repr(file_stamp(Path(path)) if path is not None else "").encode())
-    return digest.hexdigest()
-
-
-def sources() -> str:
-    """A digest of this gsx: another one may train otherwise."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(gsx.__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

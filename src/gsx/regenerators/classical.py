@@ -37,7 +37,7 @@ class Resampled:
 
 def enlarged(request: Request) -> Float[Tensor, "3 H W"]:
     """By Lanczos, through 8 bits."""
-    height, width = (side * request.scale for side in request.image.shape[1:])
+    height, width = request.result_size
     return resize(to_uint8(request.image), width, height, "lanczos").float() / 255
 
 
@@ -99,5 +99,5 @@ class Oracle:
 
 def truth(request: Request) -> Float[Tensor, "3 H W"]:
     """The truth that the camera of a request sees at `scale` times the density."""
-    height, width = (side * request.scale for side in request.image.shape[1:])
+    height, width = request.result_size
     return request.view.source.image(request.camera.resize(width, height)).float() / 255

@@ -19,6 +19,7 @@ from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 from gsx.regenerators.classical import refuse_enlarging
+from gsx.regenerators.pairs import Pair, mean_square, random_part
 from gsx.regenerators.scene_sr import begin, read_network
 
 logger = logging.getLogger(__name__)
@@ -125,7 +126,7 @@ class SceneRestorer:
         for fold, network in enumerate(self.networks):
             own = [pair for number, pair in enumerate(pairs) if number % FOLDS == fold]
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
-            renders, before = mean_error(None, others), mean_error(network, others)
+            renders, before = mean_square(others), mean_error(network, others)
             former = {name: value.clone() for name, value in network.state_dict().items()}
             learn(network, own, self.options, steps, material.seed * 1_000_003 + material.step * FOLDS + fold)
             after = mean_error(network, others)
@@ -198,10 +199,6 @@ def event_of(path: Path) -> int:
     return int(path.stem.rpartition("_")[2])
 
 
-Pair = tuple[Tensor, Tensor]
-"""(render, photograph), [3, H, W] each."""
-
-
 def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, steps: int, seed: int) -> None:
     """Adam on crops, L1 and a tenth of the L1 of differences of neighbours."""
     generator = torch.Generator().manual_seed(seed)
@@ -223,24 +220,14 @@ def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, st
 def batch(pairs: Sequence[Pair], options: RestorerOptions, generator: torch.Generator) -> Pair:
     """Crops at the same places of renders and photographs, mirrored at random."""
     edge = min(options.crop, *(min(photo.shape[1:]) for _, photo in pairs))
-    renders, photos = [], []
-    for _ in range(options.batch):
-        render, photo = pairs[int(torch.randint(len(pairs), (), generator=generator))]
-        top, left = (int(torch.randint(whole - edge + 1, (), generator=generator)) for whole in photo.shape[1:])
-        flips = [2] if bool(torch.randint(2, (), generator=generator)) else []
-        renders.append(render[:, top : top + edge, left : left + edge].flip(flips))
-        photos.append(photo[:, top : top + edge, left : left + edge].flip(flips))
+    parts = [random_part(pairs, (edge, edge), generator) for _ in range(options.batch)]
+    renders, photos = zip(*parts, strict=True)
     return torch.stack(renders), torch.stack(photos)
 
 
 @torch.no_grad()
-def mean_error(network: Residual | None, pairs: Sequence[Pair]) -> float:
-    """Mean squared error against the photographs, of renders as they are (None) or restored."""
-    total = 0.0
-    for render, photo in pairs:
-        out = render
-        if network is not None:
-            image = render.to(next(network.parameters()).device)
-            out = (image + network(image[None])[0]).clamp(0, 1).cpu()
-        total += float((out - photo).square().mean())
-    return total / len(pairs)
+def mean_error(network: Residual, pairs: Sequence[Pair]) -> float:
+    """Mean squared error of restored renders."""
+    device = next(network.parameters()).device
+    given = ((render.to(device), photo) for render, photo in pairs)
+    return mean_square(((image + network(image[None])[0]).clamp(0, 1).cpu(), photo) for image, photo in given)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.cache import cache_folder, content_key
-from gsx.core.device import device_name
+from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
 from gsx.core.regenerator import Material, Request, projected
@@ -186,8 +186,7 @@ def kept_at(options: SceneSROptions, photos: Sequence[Tensor], seed: int, device
     for photo in photos:
         digest.update(repr(tuple(photo.shape)).encode())
         digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
-    machine = (torch.__version__, torch.get_num_threads(), device_name(device))
-    key = content_key(asdict(options), digest.hexdigest(), seed, machine)
+    key = content_key(asdict(options), digest.hexdigest(), seed, machine_stamp(device))
     return cache_folder("scene_sr", key) / "network.safetensors"
 
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from gsx.core.cache import content_key
-from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions
+from gsx.core.cache import content_key, source_digest
+from gsx.core.errors import ConfigError, InputError, TrainingError, first_line
+from gsx.regenerators.diffusion.options import DiffusionOptions
 from gsx.regenerators.diffusion.recipes import Recipe
 
 logger = logging.getLogger(__name__)
@@ -109,8 +109,8 @@ def inspect(folder: Path, options: DiffusionOptions, recipe: Recipe) -> None:
     missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder / part, options)]
     if missing:
         raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, recipe)}")
-    if isinstance(options, PipelineOptions) and options.custom and not Path(options.custom).is_file():
-        raise InputError(f"regenerator {options.name}: there is no file custom={options.custom}")
+    if recipe.code is not None and not recipe.code.is_file():
+        raise InputError(f"regenerator {options.name}: there is no file custom={recipe.code}")
     for path in all_weights(folder, options):
         refuse_damaged(path, options)
 
@@ -158,13 +158,12 @@ def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
         raise InputError(f"regenerator {options.name}: {path} is damaged ({error}): fetch it again") from error
 
 
-def fingerprint(folder: Path, options: DiffusionOptions) -> str:
+def fingerprint(folder: Path, options: DiffusionOptions, recipe: Recipe) -> str:
     """SHA-256 of everything in files that decides what a model draws."""
     digest = hashlib.sha256()
     files = [path for path in folder.rglob("*") if path.suffix in (".json", ".txt", ".model", ".py")]
     files += all_weights(folder, options)
-    if isinstance(options, PipelineOptions) and options.custom:
-        files.append(Path(options.custom))
+    files += [recipe.code] if recipe.code is not None else []
     for path in sorted(set(files)):
         digest.update(f"{path.name} {path.parent.name} {path.stat().st_size}\n".encode())
         with path.open("rb") as stream:
@@ -175,10 +174,9 @@ def fingerprint(folder: Path, options: DiffusionOptions) -> str:
 
 def code_stamp() -> str:
     """Of this package and the libraries it calls: what they draw may change with them."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return content_key(digest.hexdigest(), *(version(package) for package in ("torch", *PACKAGES, "safetensors")))
+    return content_key(
+        source_digest(Path(__file__).parent), *(version(package) for package in ("torch", *PACKAGES, "safetensors"))
+    )
 
 
 def number_type(options: DiffusionOptions, device: torch.device) -> torch.dtype:
@@ -232,8 +230,3 @@ def place(pipe: Any, options: DiffusionOptions, device: torch.device) -> None:
         pipe.enable_model_cpu_offload(device=device)
     else:
         pipe.enable_sequential_cpu_offload(device=device)
-
-
-def first_line(error: Exception) -> str:
-    """First line of an error's message."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

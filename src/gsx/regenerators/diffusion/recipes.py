@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -72,7 +73,8 @@ class Recipe:
     """Whether it is shown photographs as well."""
     replaced: dict[str, Any] = field(default_factory=dict)
     """Parts that are not loaded, or set otherwise: no picture is marked or blackened."""
-
+    code: Path | None = None
+    """File of a pipeline that is not in `diffusers`."""
     part: str = ""
     """Key of its options where a regenerator has several models."""
 
@@ -91,29 +93,20 @@ def steps_for(strength: float, steps: int) -> int:
     return steps or math.floor(1 / strength) + 1
 
 
+def pictures_of(pipe: Any, batch: Batch, steps: int, guidance: float, **more: Any) -> Tensor:
+    """What a pipeline makes of a batch, unrounded."""
+    told = {"prompt": list(batch.prompts), "image": batch.images, "generator": batch.generators()}
+    return pipe(**(told | more), num_inference_steps=steps, guidance_scale=guidance, output_type="pt").images
+
+
 def upscale_latents(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
     """StableDiffusionLatentUpscalePipeline."""
-    return pipe(
-        prompt=list(batch.prompts),
-        image=batch.images,
-        num_inference_steps=options.steps,
-        guidance_scale=options.guidance,
-        generator=batch.generators(),
-        output_type="pt",
-    ).images
+    return pictures_of(pipe, batch, options.steps, options.guidance)
 
 
 def upscale_pixels(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
     """StableDiffusionUpscalePipeline."""
-    return pipe(
-        prompt=list(batch.prompts),
-        image=batch.images,
-        num_inference_steps=options.steps,
-        guidance_scale=options.guidance,
-        noise_level=options.noise_level,
-        generator=batch.generators(),
-        output_type="pt",
-    ).images
+    return pictures_of(pipe, batch, options.steps, options.guidance, noise_level=options.noise_level)
 
 
 def restore(pipe: Any, batch: Batch, options: DiffusionOptions) -> Tensor:
@@ -121,30 +114,17 @@ def restore(pipe: Any, batch: Batch, options: DiffusionOptions) -> Tensor:
     steps = steps_for(batch.strength, options.steps) if batch.strength > 0 else 0
     if int(steps * batch.strength) < 1:
         return batch.images
-    return pipe(
-        prompt=list(batch.prompts),
-        image=batch.images,
-        strength=batch.strength,
-        num_inference_steps=steps,
-        guidance_scale=options.guidance,
-        generator=batch.generators(),
-        output_type="pt",
-    ).images
+    return pictures_of(pipe, batch, steps, options.guidance, strength=batch.strength)
 
 
 def redraw(pipe: Any, batch: Batch, options: PipelineOptions) -> Tensor:
     """Any pipeline that takes `image` and `prompt`."""
-    references = {} if batch.references is None else {options.reference: batch.references}
-    return pipe(
-        image=batch.images,
-        prompt=[options.prompt or prompt for prompt in batch.prompts],
-        num_inference_steps=options.steps,
-        guidance_scale=options.guidance,
-        generator=batch.generators(),
-        output_type="pt",
-        **references,
-        **options.arguments,
-    ).images
+    more = dict(options.arguments)
+    if options.prompt:
+        more["prompt"] = [options.prompt] * len(batch)
+    if batch.references is not None:
+        more[options.reference] = batch.references
+    return pictures_of(pipe, batch, options.steps, options.guidance, **more)
 
 
 def recipe_of(options: PipelineOptions) -> Recipe:
@@ -161,6 +141,7 @@ def recipe_of(options: PipelineOptions) -> Recipe:
         least=options.least,
         call=redraw,
         reference=bool(options.reference),
+        code=Path(options.custom) if options.custom else None,
         replaced={"custom_pipeline": options.custom, "trust_remote_code": True} if options.custom else {},
     )
 

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, make_folder, make_room
-from gsx.core.device import device_name
+from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.images import read_image, resize, to_uint8, write_image
 from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 from gsx.core.window import Window
+from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.diffusion.models import (
     PACKAGES,
     code_stamp,
@@ -31,6 +32,7 @@ from gsx.regenerators.diffusion.models import (
     require,
 )
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
+from gsx.regenerators.diffusion.pace import Pace
 from gsx.regenerators.diffusion.recipes import Batch, Recipe, recipe_of
 from gsx.regenerators.diffusion.sizes import enlarged, grown
 from gsx.regenerators.diffusion.tuning import Tuned, tuned
@@ -39,8 +41,6 @@ logger = logging.getLogger(__name__)
 
 PICTURES = "diffusion_pictures"
 """Kind of the results in the cache."""
-PATIENCE = 10.0
-"""Seconds between two lines of progress."""
 MEMORY = ("allocate memory", "out of memory")
 """Words of errors that smaller batches may avoid."""
 IRRELEVANT = ("download", "offload", "cache_gb", "model", "revision")
@@ -66,6 +66,7 @@ class Diffusion:
 
     def __init__(self, recipe: Recipe, options: DiffusionOptions) -> None:
         self.recipe, self.options = recipe, options
+        self.folder: Path | None = None
         self.pipe: Any = None
         self.identity = ""
         """Of everything but pictures, seeds, prompts and strengths that decides on a result."""
@@ -81,7 +82,7 @@ class Diffusion:
                 f"regenerator {self.options.name} needs at least 2 training views to be tuned, there is {len(views)}: "
                 "choose regenerator/restore=sdxl_turbo_raw"
             )
-        located(self.options, self.recipe)
+        self.folder = located(self.options, self.recipe)
 
     def prepare(self, material: Material) -> dict[str, float]:
         """Open the pipeline, and tune it to the scene if it is to be; once per run.
@@ -95,8 +96,8 @@ class Diffusion:
             return {}
         begun = time.perf_counter()
         options = self.options
-        folder = located(options, self.recipe)
-        files = fingerprint(folder, options)
+        folder = self.folder or located(options, self.recipe)
+        files = fingerprint(folder, options, self.recipe)
         dtype = number_type(options, material.device)
         pipe = opened(folder, options, self.recipe, dtype)
         found = Tuned()
@@ -110,7 +111,7 @@ class Diffusion:
                 f"short, set {self.recipe.where}.offload=model or a smaller dtype"
             ) from error
         telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
-        machine = (code_stamp(), torch.get_num_threads(), device_name(material.device), str(dtype))
+        machine = (code_stamp(), *machine_stamp(material.device), str(dtype))
         self.identity = content_key(files, found.digest, telling, machine)
         self.pipe = pipe
         logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - begun, folder)
@@ -204,11 +205,7 @@ def rounds_to(scale: int, recipe: Recipe, options: DiffusionOptions) -> int:
         ConfigError: it never gets there.
     """
     if recipe.factor == 1:
-        if scale > 1:
-            raise ConfigError(
-                f"regenerator {options.name} cannot enlarge x{scale}: choose another for that role, or augmenter "
-                "scales=[1]"
-            )
+        refuse_enlarging(options.name, [scale])
         return 1
     rounds, reached = 0, 1
     while reached < scale:
@@ -233,7 +230,7 @@ def batches(fitted: Sequence[Fitted], pixels: int) -> list[list[Fitted]]:
 
 def photograph(request: Request, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """That of the training view which a picture was made from, at the picture's size."""
-    whole = to_uint8(request.view.image().float())
+    whole = to_uint8(request.view.image())
     return resize(whole, image.shape[2], image.shape[1], "bicubic").float() / 255
 
 
@@ -280,21 +277,3 @@ def keep(path: Path, result: Float[Tensor, "3 H W"]) -> None:
         write_image(make_folder(path.parent) / path.name, result)
     except InputError as error:
         logger.warning("%s: it will be drawn again", error)
-
-
-class Pace:
-    """Says how far a batch of work is, and how long it will take."""
-
-    def __init__(self, name: str, whole: int) -> None:
-        self.name, self.whole, self.done = name, whole, 0
-        self.begun = self.told = time.perf_counter()
-
-    def more(self, count: int) -> None:
-        """So many more are done."""
-        self.done += count
-        now = time.perf_counter()
-        if now - self.told > PATIENCE and self.done < self.whole:
-            each = (now - self.begun) / self.done
-            left = each * (self.whole - self.done)
-            logger.info("%s: %d of %d, %.1f s each, %.0f s left", self.name, self.done, self.whole, each, left)
-            self.told = now

@@ -21,15 +21,18 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, make_folder, make_room
-from gsx.core.device import device_name
+from gsx.core.device import machine_stamp
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.regenerator import Material
 from gsx.core.shapes import Float, Int
+from gsx.core.window import Window
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
+from gsx.regenerators.diffusion.pace import Pace
 from gsx.regenerators.diffusion.recipes import Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.sizes import grown
+from gsx.regenerators.pairs import Pair, mean_square, random_part
 
 logger = logging.getLogger(__name__)
 
@@ -39,11 +42,6 @@ WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
 WEIGHT_DECAY = 1e-2
 LARGEST_NORM = 1.0
 """To which gradients are clipped (spec 5.1)."""
-PATIENCE = 30.0
-"""Seconds between two lines of progress."""
-
-Pair = tuple[Tensor, Tensor]
-"""(render, photograph), [3, h, w] each, display values."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,7 +91,7 @@ def key_of(pairs: Sequence[Pair], options: RestorerOptions, material: Material, 
     digest = hashlib.sha256()
     for part in (image for pair in pairs for image in pair):
         digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
-    machine = (code_stamp(), version("peft"), torch.get_num_threads(), device_name(material.device))
+    machine = (code_stamp(), version("peft"), *machine_stamp(material.device))
     telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
     return content_key(files, telling, digest.hexdigest(), material.seed, machine)
 
@@ -109,8 +107,7 @@ def new_adapter(
 ) -> None:
     """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder."""
     own, others = divided(pairs, options.tuning)
-    renders = sum(float((render - photo).square().mean()) for render, photo in others) / len(others)
-    figures = {"error_of_renders": renders, "error_raw": error_of(pipe, options, recipe, others)}
+    figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, recipe, others)}
     begun = time.perf_counter()
     try:
         whole = learn(pipe, options, recipe, own, material.seed)
@@ -163,20 +160,26 @@ def middle(pair: Pair, crop: int) -> Pair:
     """The same part of both, `crop` px wide at most."""
     height, width = (min(crop, side) for side in pair[0].shape[1:])
     top, left = (pair[0].shape[1] - height) // 2, (pair[0].shape[2] - width) // 2
-    render, photo = (image[:, top : top + height, left : left + width] for image in pair)
+    window = Window(left=left, top=top, width=width, height=height)
+    render, photo = (window.cut(image) for image in pair)
     return render, photo
 
 
 @torch.no_grad()
 def error_of(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[Pair]) -> float:
-    """Mean squared error of restored renders, by the call that the run makes, half-way between its strengths."""
-    strength, total = sum(options.tuning.strengths) / 2, 0.0
-    for number, (render, photo) in enumerate(pairs):
-        image, inside = grown(render, recipe.multiple, recipe.least)
-        batch = Batch(images=image[None], prompts=[options.tuning.prompt], seeds=[number], strength=strength)
-        result = inside.cut(recipe.call(pipe, batch, options)[0].cpu().float().clamp(0, 1))
-        total += float((result - photo).square().mean())
-    return total / len(pairs)
+    """Mean squared error of restored renders."""
+    numbered = enumerate(pairs)
+    return mean_square((restored(pipe, options, recipe, render, n), photo) for n, (render, photo) in numbered)
+
+
+def restored(
+    pipe: Any, options: RestorerOptions, recipe: Recipe, render: Float[Tensor, "3 h w"], seed: int
+) -> Float[Tensor, "3 h w"]:
+    """A render after the call that the run makes, half-way between its strengths."""
+    image, inside = grown(render, recipe.multiple, recipe.least)
+    strength = sum(options.tuning.strengths) / 2
+    batch = Batch(images=image[None], prompts=[options.tuning.prompt], seeds=[seed], strength=strength)
+    return inside.cut(recipe.call(pipe, batch, options)[0].cpu().float().clamp(0, 1))
 
 
 def cropped(
@@ -184,17 +187,12 @@ def cropped(
 ) -> tuple[Float[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"]]:
     """Crops at the same places of renders and photographs, mirrored at random, of sides that the model takes."""
     height, width = (min(options.crop, *(pair[0].shape[axis] for pair in pairs)) for axis in (1, 2))
-    renders, photos = [], []
-    for _ in range(options.crops):
-        pair = pairs[int(torch.randint(len(pairs), (), generator=generator))]
-        top = int(torch.randint(pair[0].shape[1] - height + 1, (), generator=generator))
-        left = int(torch.randint(pair[0].shape[2] - width + 1, (), generator=generator))
-        flips = [2] if bool(torch.randint(2, (), generator=generator)) else []
-        parts = [image[:, top : top + height, left : left + width].flip(flips) for image in pair]
-        render, photo = (grown(part, recipe.multiple, recipe.least)[0] for part in parts)
-        renders.append(render)
-        photos.append(photo)
-    return torch.stack(renders), torch.stack(photos)
+    parts = [random_part(pairs, (height, width), generator) for _ in range(options.crops)]
+    renders, photos = (
+        torch.stack([grown(image, recipe.multiple, recipe.least)[0] for image in images])
+        for images in zip(*parts, strict=True)
+    )
+    return renders, photos
 
 
 # -- learning ----------------------------------------------------------------------------------------------------------
@@ -210,17 +208,12 @@ def learn(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[P
     conditions = conditions_of(pipe, tuning.prompt, crops[0].shape[2:])
     renders, photos = (encoded(pipe, images) for images in crops)
     least, greatest = noise_steps(pipe, options)
-    begun = told = time.perf_counter()
+    progress = Pace(f"{options.name} is tuned", tuning.steps)
     with as_trained(pipe.unet, tuning.checkpointing):
         for step in range(tuning.steps):
-            now = time.perf_counter()
-            if tuning.seconds and now - begun > tuning.seconds:
+            if tuning.seconds and progress.seconds > tuning.seconds:
                 logger.warning("%s is tuned for %d of %d steps: tuning.seconds", options.name, step, tuning.steps)
                 return False
-            if now - told > PATIENCE:
-                left = (now - begun) / step * (tuning.steps - step)
-                logger.info("%s: tuning step %d of %d, %.0f s left", options.name, step, tuning.steps, left)
-                told = now
             picked = torch.randint(len(renders), (tuning.batch,), generator=generator)
             when = torch.randint(least, greatest + 1, (tuning.batch,), generator=generator)
             noise = torch.randn(renders[picked].shape, generator=generator)
@@ -230,6 +223,7 @@ def learn(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[P
             torch.nn.utils.clip_grad_norm_(adapted, LARGEST_NORM)
             optimiser.step()
             rates.step()
+            progress.more(1)
     return True
 
 
