@@ -173,9 +173,9 @@ def fingerprint(folder: Path, options: DiffusionOptions, recipe: Recipe) -> str:
 
 
 def code_stamp() -> str:
-    """Of this package and the libraries it calls: what they draw may change with them."""
+    """Of the code of regenerators and the libraries it calls: what they draw may change with them."""
     return content_key(
-        source_digest(Path(__file__).parent), *(version(package) for package in ("torch", *PACKAGES, "safetensors"))
+        source_digest(Path(__file__).parents[1]), *(version(package) for package in ("torch", *PACKAGES, "safetensors"))
     )
 
 
