@@ -40,7 +40,7 @@ SUBJECTS = {
         scene=("scene=blender", "scene.downscale=4"),
         zooms=("1", "2", "4", "0.25"),
         changes={
-            "scaffold": ("preset=scaffold_blender",),
+            "scaffold": ("preset=scaffold_nerf_synthetic",),
             "octree_scaffold": ("scene.random_points=10000",),
             "octree_gs3d": ("scene.random_points=10000",),
         },

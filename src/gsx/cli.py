@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -45,6 +46,8 @@ Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1
 """
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report it."""
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2") if hasattr(signal, name))
+"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for the latter)."""
 HYDRA_FLAGS = (
     "-m",
     "--multirun",
@@ -145,24 +148,38 @@ def plugins() -> "Plugins":
 def interruptible(run: "Run") -> Iterator[object]:
     """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
 
-    Yields a listener that takes the handler away when training is over.
+    So do the signals by which a cluster takes a machine back (STOPPING): with a checkpoint at hand they are sent again,
+    to whoever waited for them before.
+
+    Yields a listener that takes the handlers away when training is over.
     """
     from gsx.core.plugins import hookimpl
 
+    received: list[int] = []
+
     def stop(number: int, frame: Any) -> None:
         run.stopping = True
-        signal.signal(signal.SIGINT, before)
+        received.append(number)
+        give_back()
+
+    def give_back() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     class UntilTrained:
         @hookimpl
         def gsx_training_finished(self) -> None:
-            signal.signal(signal.SIGINT, before)
+            give_back()
 
-    before = signal.signal(signal.SIGINT, stop)
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *STOPPING)}
     try:
         yield UntilTrained()
     finally:
-        signal.signal(signal.SIGINT, before)
+        give_back()
+    if received and received[0] in STOPPING and not run.complete:
+        logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
+        signal.raise_signal(received[0])
+        raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
 
 
 # -- verbs ---------------------------------------------------------------------------------------------------------
@@ -177,9 +194,22 @@ def verb_train(words: list[str]) -> int:
             raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
     if flags:
         return hand_to_hydra(words)
+    from gsx.experiments.sweep import is_table
+
+    if is_table(words):
+        return fill_table(words)
     from gsx.core.config import compose
 
-    return train(compose(words, loaded := plugins()), loaded, [])
+    return train(compose(words, loaded := plugins()), loaded)
+
+
+def fill_table(words: list[str]) -> int:
+    """gsx +experiment=TABLE ..."""
+    from gsx.experiments.sweep import run_table
+
+    text, code = run_table(words, plugins(), sweep_job)
+    sys.stdout.write(text)
+    return code
 
 
 def hand_to_hydra(words: list[str]) -> int:
@@ -187,37 +217,97 @@ def hand_to_hydra(words: list[str]) -> int:
     from gsx.core.config import check_overrides, hydra_main
 
     loaded = plugins()
-    if {"-m", "--multirun"} & set(words):
-        check_overrides([word for word in words if not word.startswith("-")], loaded)
-    folders: list[Path] = []
-    code, sweep = hydra_main(words, loaded, lambda settings: guarded(lambda: train(settings, loaded, folders)))
-    if sweep is not None and folders:
-        from gsx.core.report import write_overview
-
-        sys.stdout.write(f"{write_overview(sweep, folders)}\n")
+    if not {"-m", "--multirun"} & set(words):
+        hydra_main(words, loaded, sweep_job)
+        return 0
+    given = [word for word in words if not word.startswith("-")]
+    sweep = new_sweep(check_overrides(given, loaded))
+    try:
+        hydra_main([*words, f"hydra.sweep.dir={sweep}"], loaded, sweep_job)
+    finally:
+        code = close_sweep(sweep)
     return code
 
 
-def guarded(action: Callable[[], int]) -> int:
-    """The exit code of an action; an error of one experiment is shown and does not end the others, Ctrl-C does."""
+def new_sweep(output: Path) -> Path:
+    """A new folder for the record of a multirun."""
+    for number in range(1, 1000):
+        stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        folder = output / "sweeps" / (stamp if number == 1 else f"{stamp}_{number}")
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            return folder
+    raise InputError(f"no free folder below {output / 'sweeps'}: clean it up")
+
+
+def close_sweep(sweep: Path) -> int:
+    """Report on the runs that a multirun has made; returns the worst exit code of its jobs."""
+    from gsx.core.files import read_json
+    from gsx.core.overview import write_overview
+
+    records = [read_json(path) for path in sorted((sweep / "jobs").glob("*.json"))]
+    folders = [folder for record in records if record["folder"] and (folder := Path(record["folder"])).is_dir()]
+    if folders:
+        sys.stdout.write(f"{write_overview(sweep, folders)}\n")
+    return max((record["code"] for record in records), default=0)
+
+
+def sweep_job(config: Any) -> int:
+    """One job of a multirun or of a table, in this process or in one of a launcher's; its record stays with the sweep.
+
+    An error is shown and does not end the others; Ctrl-C does.
+    """
+    from gsx.core.config import job_place, settings_from
+    from gsx.core.files import write_json
+
+    set_up_logging()
+    folders: list[Path] = []
     try:
-        code = action()
+        code = train(settings_from(config, loaded := plugins()), loaded, folders)
     except GsxError as error:
-        return complain(str(error))
+        code = complain(str(error))
     except OSError as error:
-        return complain(os_sentence(error))
+        code = complain(os_sentence(error))
+    except Exception:  # a defect, perhaps a plugin's: the other jobs are worth no less
+        logger.exception("this job failed")
+        code = 1
+    place = job_place()
+    if place is not None:
+        (place[0] / "jobs").mkdir(parents=True, exist_ok=True)
+        record = {"folder": str(folders[0].resolve()) if folders else "", "code": code}
+        write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
     if code == INTERRUPTED:
         raise KeyboardInterrupt
     return code
 
 
-def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
-    """Train one composed experiment in a new run folder, which is appended to `folders`."""
+def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
+    """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which."""
     from gsx.core.session import start
 
+    if settings.general.reuse:
+        return reused(settings, loaded, [] if folders is None else folders)
     run = start(settings, loaded)
-    folders.append(run.folder)
+    if folders is not None:
+        folders.append(run.folder)
     return carry_out(run, settings, loaded)
+
+
+def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
+    """Train what is left of a composition in its own folder."""
+    from gsx.core.identity import claimed, place_of
+    from gsx.core.session import pursue
+
+    folder = place_of(settings.resolved)
+    folders.append(folder)
+    with claimed(folder) as alone:
+        if not alone:
+            raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
+        _, run = pursue(settings, loaded)
+        if run is None:
+            sys.stdout.write(f"{folder / 'report.html'}\n")
+            return 0
+        return carry_out(run, settings, loaded)
 
 
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:

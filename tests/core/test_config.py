@@ -28,7 +28,7 @@ def test_every_file_composes_and_fits_its_schema(group: str, option: str) -> Non
 
 
 def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
-    given = ["scene=blender", "backbone=scaffold", "preset=scaffold_blender"]
+    given = ["scene=blender", "backbone=scaffold", "preset=scaffold_nerf_synthetic"]
     settings = compose(given, plugins())
     assert settings.scene.options.random_points == 10000
     assert settings.backbone.options.growth.coarsest == 4

@@ -188,6 +188,12 @@ class PseudoOptions:
         if not self.base and self.variants == 0:
             raise ValueError(f"{where}.base is false and variants is 0: there would be no pseudo view")
 
+    def begins(self, iterations: int) -> int:
+        """First event of a run of that length."""
+        published = self.timing.published_iterations
+        schedule = Schedule(iterations=iterations, published_iterations=published, views=1)  # no view decides it
+        return min(events_of(self.timing, schedule), default=iterations)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sketch:
@@ -248,7 +254,7 @@ class PseudoDetails:
 
     def begins(self) -> int:
         """The first event."""
-        return self.events[0] if self.events else self.setting.iterations
+        return self.options.begins(self.setting.iterations)
 
     def plan(self) -> dict[str, Any]:
         """Events and windows in steps of this run."""

@@ -139,6 +139,8 @@ class AnchorOptions:
     quirks: Quirks
     mip: MipOptions
     levels: LevelOptions | None
+    decay_until: int = 0
+    """Published step at which learning rates have come down; 0: at the end of the run."""
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
@@ -283,7 +285,8 @@ class Anchors:
 
     def begin(self, step: int) -> None:
         """Learning rates of this step (spec 2.7)."""
-        self.step, steps = step, self.schedule.step(self.options.published_iterations)
+        self.step = step
+        steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         for name in self.table.parameters:
             unit = self.extent if name == "offsets" else 1.0
             self.table.set_rate(name, unit * getattr(self.options.rates, name).at(step, steps))

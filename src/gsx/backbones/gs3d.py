@@ -126,6 +126,8 @@ class GS3DOptions:
     levels: LevelOptions | None = None
     """Levels of detail (Octree-GS), with density control across them; None: every camera draws everything."""
     level_density: LevelDensityOptions | None = None
+    decay_until: int = 0
+    """Published step at which the rate of the means has come down; 0: at the end of the run."""
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
@@ -230,7 +232,7 @@ class GS3D:
     def begin(self, step: int) -> None:
         """Learning rates and SH degree of this step (spec 6 and 1.3)."""
         self.step, rates = step, self.options.rates
-        steps = self.schedule.step(self.options.published_iterations)
+        steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         self.table.set_rate("means", self.extent * log_linear(step, steps, rates.means_first, rates.means_last))
         for name in ("sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats"):
             self.table.set_rate(name, getattr(rates, name))
@@ -520,7 +522,7 @@ class GS3D:
             "means_rate": {
                 "from": self.options.rates.means_first * self.extent,
                 "to": self.options.rates.means_last * self.extent,
-                "over": steps.step(self.options.published_iterations),
+                "over": steps.step(self.options.decay_until or self.options.published_iterations),
             },
             **({} if self.levels is None else {"levels": facts_of(self.levels, self.table["level"])}),
         }

@@ -64,6 +64,7 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
         mip=options.mip,
         levels=options.levels,
         level_density=own.level_density,
+        decay_until=options.decay_until,
     )
 
 

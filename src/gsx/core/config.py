@@ -7,7 +7,7 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,17 @@ from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.run import TrainingOptions
 
+OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
+
 MODULE = "gsx.conf"
+LAUNCHERS = {
+    "processes": ("hydra-joblib-launcher", "sweep"),
+    "joblib": ("hydra-joblib-launcher", "sweep"),
+    "slurm": ("hydra-submitit-launcher", "slurm"),
+    "submitit_slurm": ("hydra-submitit-launcher", "slurm"),
+    "submitit_local": ("hydra-submitit-launcher", "slurm"),
+}
+"""Package and extra of each launcher beside Hydra's own."""
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""
 
@@ -34,16 +44,60 @@ class GeneralOptions:
     device: str
     output: str
     folder: str
+    length: int = 0
+    """Iterations of the whole run, of which a budget takes a share."""
+    variant: str = ""
+    """Name of the published method that is composed; empty for others."""
+    data_root: str = ""
+    """Where datasets lie."""
+    reuse: bool = False
+    """The run's folder is named by its composition; what is finished there is not trained again (`core.identity`)."""
     init: str = "scratch"
     """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`core.trunk`)."""
+    trunk_at: list[int] = field(default_factory=list)
+    """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
     trunk_gb: float = 10.0
     """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
 
     def __post_init__(self) -> None:
         if self.init not in ("scratch", "trunk"):
             raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
+        if self.reuse and self.folder:
+            raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")
         if not self.trunk_gb >= 0:
             raise ValueError(f"trunk_gb is {self.trunk_gb}; give 10^9 bytes from 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How much of a published run is run; values in conf/budget."""
+
+    name: str
+    share: float
+    """Of the iterations."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise ValueError(f"budget.share is {self.share}; give a fraction above 0, at most 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """Published scenes below one folder; values in conf/dataset."""
+
+    name: str
+    title: str
+    """As tables name it."""
+    obtained: str
+    """Where it is to be had."""
+    folder: str
+    """Below data_root; empty: it is built in."""
+    needs: list[str]
+    """What the folder of a scene must hold."""
+    scenes: dict[str, str]
+    """Folder and name in tables, by scene."""
+    scene: str
+    """The one that is trained."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +122,7 @@ class Settings:
     """By name, in the order of the command line."""
     regenerators: dict[str, Chosen]
     """By role: upscale, restore. Only those that an augmenter asks for are built."""
+    dataset: Dataset | None
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
 
@@ -99,6 +154,53 @@ def register_search_paths(plugins: Plugins) -> None:
 
     if paths:
         HydraPlugins.instance().register(PluginPaths)
+
+
+class Compositions:
+    """Many compositions in one session of Hydra: `with Compositions(plugins) as compositions`."""
+
+    def __init__(self, plugins: Plugins) -> None:
+        self.plugins, self.session = plugins, hydra_session(plugins)
+
+    def __enter__(self) -> "Compositions":
+        self.session.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.session.__exit__(*error)
+
+    def settings(self, overrides: Sequence[str]) -> Settings:
+        """One composition, checked; see `compose`."""
+        return settings_from(compose_raw(overrides), self.plugins)
+
+    def node(self, overrides: Sequence[str], key: str) -> dict[str, Any]:
+        """One node of a composition as plain values, unchecked; empty where there is none."""
+        found = OmegaConf.select(compose_raw(overrides), key)
+        return OmegaConf.to_container(found, resolve=True) if isinstance(found, DictConfig) else {}  # type: ignore
+
+    def value(self, overrides: Sequence[str], key: str) -> Any:
+        """One value of a composition."""
+        return OmegaConf.select(compose_raw(overrides), key)
+
+    def choices(self, group: str) -> list[str]:
+        """Options of a group."""
+        from hydra.core.global_hydra import GlobalHydra
+
+        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+
+    def launch(self, overrides: Sequence[str], jobs: Sequence[Sequence[str]], job: Callable[[DictConfig], Any]) -> None:
+        """Carry out jobs, each given by its overrides, by the launcher that `overrides` choose (hydra/launcher=...)."""
+        from hydra import compose as hydra_compose
+        from hydra._internal.callbacks import Callbacks
+        from hydra.core.global_hydra import GlobalHydra
+        from hydra.core.plugins import Plugins as HydraPlugins
+        from hydra.types import HydraContext
+
+        config = hydra_compose("config", overrides=list(overrides), return_hydra_config=True)
+        context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
+        launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
+        for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
+            _ = result.return_value  # raises what a job raised
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
@@ -141,6 +243,8 @@ def check_groups(overrides: Sequence[str]) -> None:
     loader = GlobalHydra.instance().config_loader()
     groups = known_groups()
     for override in parse_overrides(overrides):
+        if override.key_or_group == "hydra/launcher":
+            refuse_absent_launcher(str(override.value()))
         if override.key_or_group not in groups or override.is_sweep_override():
             continue
         options = loader.get_group_options(override.key_or_group)
@@ -154,6 +258,18 @@ def check_groups(overrides: Sequence[str]) -> None:
                     f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
                     f"choose from {', '.join(options)}.{nearest(str(name), options)}"
                 )
+
+
+def refuse_absent_launcher(name: str) -> None:
+    """Raise ConfigError if a launcher's package is not installed."""
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    package, extra = LAUNCHERS.get(name, ("", ""))
+    try:
+        if package:
+            distribution(package)
+    except PackageNotFoundError as error:
+        raise ConfigError(f"hydra/launcher={name} needs the package {package}: pip install 'gsx[{extra}]'") from error
 
 
 def known_groups() -> list[str]:
@@ -203,14 +319,19 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     Raises:
         ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
     """
+    config = OmegaConf.create(config)
+    refuse_unknown_scene(config)
     try:
-        raw = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
+        raw = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         raise ConfigError(f"a value cannot be resolved: {first_line(error)}") from error
     assert isinstance(raw, dict)
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
-    values = dict(raw)
+    values = {key: value for key, value in raw.items() if key != "experiment"}
+    dataset, budget = values.pop("dataset", None), values.pop("budget", None)
+    if budget is not None:
+        typed(Budget, budget, "budget")
     augmenters, regenerators = (named_nodes(values.pop(kind, None), kind) for kind in ("augmenter", "regenerator"))
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
@@ -223,8 +344,21 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         backbone=chosen("backbone", parts["backbone"], plugins),
         augmenters={name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()},
         regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
-        resolved=raw,  # type: ignore[arg-type]
+        dataset=typed(Dataset, dataset, "dataset") if dataset else None,
+        resolved={key: value for key, value in raw.items() if key != "experiment"},  # type: ignore[misc]
     )
+
+
+def refuse_unknown_scene(config: Any) -> None:
+    """Raise ConfigError if the scene chosen is none of the dataset's."""
+    dataset = OmegaConf.to_container(config.get("dataset") or OmegaConf.create({}), resolve=False)
+    assert isinstance(dataset, dict)
+    known = list(dataset.get("scenes") or {})
+    if dataset and (name := str(dataset.get("scene"))) not in known:
+        raise ConfigError(
+            f"dataset.scene is '{name}'; {dataset.get('title')} has {', '.join(known) or 'no scenes: name them'}."
+            f"{nearest(name, known)}"
+        )
 
 
 def named_nodes(values: Any, kind: str) -> dict[str, Any]:
@@ -285,10 +419,10 @@ def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
     """Dotted field names of a dataclass and of those inside it."""
-    for field in dataclasses.fields(schema):
-        yield f"{prefix}{field.name}"
-        if dataclasses.is_dataclass(field.type):
-            yield from schema_keys(field.type, f"{prefix}{field.name}.")  # type: ignore[arg-type]
+    for entry in dataclasses.fields(schema):
+        yield f"{prefix}{entry.name}"
+        if dataclasses.is_dataclass(entry.type):
+            yield from schema_keys(entry.type, f"{prefix}{entry.name}.")  # type: ignore[arg-type]
 
 
 def write_config(path: Path, resolved: dict[str, Any]) -> None:
@@ -327,11 +461,15 @@ def add_newer_settings(config: Any) -> None:
         config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
 
 
-def check_overrides(overrides: Sequence[str], plugins: Plugins) -> None:
-    """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed."""
+def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
+    """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed.
+
+    Returns the folder that its runs go to.
+    """
     with hydra_session(plugins):
         parsed = parse_overrides(overrides)
-        compose_raw([first_of(override) for override in parsed if override.input_line])
+        composed = compose_raw([first_of(override) for override in parsed if override.input_line])
+        return Path(str(composed.output))
 
 
 def first_of(override: Any) -> str:
@@ -341,27 +479,21 @@ def first_of(override: Any) -> str:
     return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
 
 
-def hydra_main(arguments: Sequence[str], plugins: Plugins, task: Callable[[Settings], int]) -> tuple[int, Path | None]:
-    """Hydra's own command line on our configuration.
-
-    Returns the worst code of `task` over the experiments, and the folder of a multirun.
-    """
+def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
+    """Hydra's own command line on our configuration; `job` must be importable, for launchers that start processes."""
     import sys
 
     import hydra
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
 
     register_search_paths(plugins)
-
-    @hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")
-    def entry(config: DictConfig) -> None:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            swept.append(Path(HydraConfig.get().sweep.dir))
-        codes.append(task(settings_from(config, plugins)))
-
-    codes: list[int] = []
-    swept: list[Path] = []
     sys.argv = ["gsx", *arguments]
-    entry()
-    return max(codes, default=0), swept[-1] if swept else None
+    hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")(job)()
+
+
+def job_place() -> tuple[Path, int] | None:
+    """(folder of the multirun, number in it) of the job that runs in this process; None outside of one."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized() or OmegaConf.is_missing(HydraConfig.get().job, "num"):
+        return None
+    return Path(HydraConfig.get().sweep.dir), int(HydraConfig.get().job.num)

@@ -117,6 +117,12 @@ def mean(values: Sequence[float | None]) -> float | None:
     return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
+def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Means over the views of a group."""
+    keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
+    return {name: mean([view[key] for view in views]) for name, key in keys.items()}
+
+
 class Evaluator:
     """Measures one run by one protocol."""
 
@@ -183,7 +189,7 @@ class Evaluator:
             "render_fps": 1 / render_seconds(run, run.scene.test, self.options.tile_pixels),
             "train_seconds": run.seconds,
             "peak_memory_mb": max([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
-            "groups": {name: {key: mean([v[key] for v in vs]) for key in figures} for name, vs in by_group.items()},
+            "groups": {name: group_figures(vs) for name, vs in by_group.items()},
             "zoom": {f"{factor:g}": self.zoom(factor) for factor in self.options.zoom},
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
         }

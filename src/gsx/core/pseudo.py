@@ -74,6 +74,15 @@ class Augmenter(Protocol):
         ...
 
 
+@runtime_checkable
+class Foretold(Protocol):
+    """Options of an augmenter that tell, before there is a scene, where it begins; plans over many runs ask."""
+
+    def begins(self, iterations: int) -> int:
+        """What `Augmenter.begins` will say in a run of that length."""
+        ...
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Setting:
     """What an augmenter is built from."""

@@ -16,18 +16,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import gsx
 from gsx import __version__
 from gsx.core import checkpoint, trunk
 from gsx.core.backbone import Beginning
-from gsx.core.cache import cache_root
+from gsx.core.cache import cache_root, source_digest
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
-from gsx.core.errors import ConfigError, InputError, TrainingError, nearest
+from gsx.core.errors import CheckpointError, ConfigError, InputError, TrainingError, nearest
 from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
 from gsx.core.guard import Guard
+from gsx.core.identity import finished, place_of
 from gsx.core.images import write_image
 from gsx.core.lpips import load_lpips
 from gsx.core.metrics import psnr
@@ -41,6 +43,7 @@ from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.regenerator import Regenerator
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
+from gsx.core.run_files import read_run
 from gsx.core.scene import Scene, View
 from gsx.core.shapes import Float
 from gsx.core.trainer import train
@@ -178,6 +181,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "rasterizer": run.raster.path,
+        "source": source_digest(Path(gsx.__file__).parent)[:16],
         "device": device_name(run.device),
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
@@ -278,10 +282,56 @@ def open_run(
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
     settings = read_config(folder / "config.yaml", plugins, overrides)
+    return restored(settings, folder, training), settings
+
+
+def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
+    """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     run = build(settings, load_scene(settings), folder, training)
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
-    return run, settings
+    return run
+
+
+def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
+    """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
+
+    What was finished is not done again, what was interrupted goes on where it stopped, and what was judged otherwise is
+    judged anew. To be called with the folder `claimed`.
+
+    Raises:
+        ConfigError, InputError: something is wrong; no folder was made.
+    """
+    folder = place_of(settings.resolved)
+    files = read_run(folder)
+    if finished(files, settings.resolved):
+        logger.info("finished earlier: %s", folder)
+        return folder, None
+    at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
+    try:
+        if not checkpoint.sidecars(folder / "checkpoints"):
+            raise CheckpointError(f"{folder} holds no checkpoint")
+        run = restored(settings, folder, training=True)
+    except CheckpointError as error:
+        set_aside(folder, str(error))
+        return folder, start(at_hand, plugins)
+    logger.info("going on with %s at step %d", folder, run.step)
+    write_config(folder / "config.yaml", settings.resolved)
+    if settings.general.init == "trunk":
+        run.trunk = trunk.trunk_folder(run, plugins.versions)
+    return folder, run
+
+
+def set_aside(folder: Path, reason: str) -> None:
+    """Make room for a run in a folder without a checkpoint that could be used; damaged ones are kept beside it."""
+    if not folder.exists():
+        return
+    if not checkpoint.sidecars(folder / "checkpoints"):
+        shutil.rmtree(folder)
+        return
+    kept = next(p for n in range(1, 1000) if not (p := folder.parent / f".{folder.name}_damaged_{n}").exists())
+    folder.rename(kept)
+    logger.warning("%s; kept as %s, training anew", reason, kept)
 
 
 def in_units(scene: Scene, unit: float) -> Scene:
@@ -354,7 +404,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     log = MetricsLog(settings.evaluation)
     listeners: list[object] = [Guard(), log, Checkpointer(), Progress()]
     if run.trunk is not None:
-        listeners.append(trunk.TrunkKeeper(run.trunk, settings.general.trunk_gb * 1e9))
+        general = settings.general
+        listeners.append(trunk.TrunkKeeper(run.trunk, general.trunk_gb * 1e9, general.trunk_at))
     try:
         with plugins.listening(listeners):
             train(run, plugins)

@@ -8,7 +8,7 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,18 @@ from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, s
 from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
+from gsx.core.identity import trained
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
 logger = logging.getLogger(__name__)
 
+BRANCH = "branch.json"
+"""File of a run that branched: at which step, and how many seconds of training it did not have to take."""
+
 SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 """Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
 (spec 1.8)."""
-BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init", "trunk_gb")
-"""Keys of a composition that change nothing before the first pseudo views."""
-WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
-"""Keys of `training` that change nothing at all."""
 
 
 def common_steps(run: Run) -> int:
@@ -39,17 +39,20 @@ def common_steps(run: Run) -> int:
 
 def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
     """Where states of runs like this one are kept; `plugins`: versions of those installed."""
-    config: dict[str, Any] = {key: value for key, value in run.config.items() if key not in BESIDE}
-    config["training"] = {key: value for key, value in config["training"].items() if key not in WATCHING}
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
-        json.dumps(config, sort_keys=True, default=str),
+        json.dumps(trained(without_augmenters(run.config)), sort_keys=True, default=str),
         seen_by(run),
         source_digest(Path(gsx.__file__).parent),
         sorted(plugins.items()),
         machine,
     )
     return cache_folder("trunks", content_key(*parts))
+
+
+def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The composition of the control."""
+    return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator")}
 
 
 def seen_by(run: Run) -> str:
@@ -87,7 +90,13 @@ def branch(run: Run, sidecar: Path) -> None:
         shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
     (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
     checkpoint.restore(run)
+    write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
     logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
+
+
+def default_steps(run: Run) -> set[int]:
+    """Where the paper's variants begin."""
+    return {round(share * run.iterations) for share in SHARES}
 
 
 def lines_of(sidecar: Path) -> list[dict[str, Any]]:
@@ -99,13 +108,13 @@ def lines_of(sidecar: Path) -> list[dict[str, Any]]:
 class TrunkKeeper:
     """Listener: keeps states that other runs can branch from."""
 
-    def __init__(self, folder: Path, budget: float) -> None:
-        self.folder, self.budget = folder, budget
+    def __init__(self, folder: Path, budget: float, steps: Collection[int] = ()) -> None:
+        self.folder, self.budget, self.steps = folder, budget, steps
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
         """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
-        wanted = {round(share * run.iterations) for share in SHARES} | {common_steps(run)}
+        wanted = {*(self.steps or default_steps(run)), common_steps(run)}
         if run.step not in wanted or run.step > common_steps(run) or run.complete:
             return
         try:

@@ -33,7 +33,7 @@ SAME = 1e-6  # intrinsics that agree to this many pixels are the same
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(SceneOptions):
-    """The built-in scene; `path`, `split`, `max_width` and what concerns photographs do not apply to it."""
+    """The built-in scene; `path`, `split` and what concerns photographs do not apply to it."""
 
     width: int
     """Width of the pictures before `downscale`, pixels."""
@@ -197,7 +197,7 @@ def load(options: DemoOptions) -> Scene:
         ConfigError: see `check`.
     """
     check(options)
-    life, size = make_still_life(), training_size(options.width, options.height, options.downscale, 0)
+    life, size = make_still_life(), training_size(options.width, options.height, options.downscale, options.max_width)
     train = [spiral_camera(place, *size) for place in training_places(options.train_views)]
     test = [spiral_camera(place, *size) for place in test_places(options.train_views, options.test_views)]
     folder = cache_folder("demo", content_key(scene_version(), options.samples))

@@ -1,0 +1,81 @@
+"""Which run a composition is: one name for one training, wherever and however it is carried out."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import content_key
+from gsx.core.run_files import RunFiles, part
+
+WHERE = ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
+"""Keys that say where and how a run is carried out."""
+NAMES = ("variant", "length", "budget", "dataset")
+"""Keys that name what other keys hold."""
+JUDGING = ("eval", "metrics")
+"""Keys of what is looked at when training is over."""
+WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
+"""Keys of `training` that change nothing at all."""
+
+
+def trained(config: dict[str, Any]) -> dict[str, Any]:
+    """What of a resolved composition decides what is trained; regenerators only where an augmenter may ask for them."""
+    told = (*WHERE, *NAMES, *JUDGING, *(() if config.get("augmenter") else ("augmenter", "regenerator")))
+    kept = {key: value for key, value in config.items() if key not in told}
+    kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
+    return kept
+
+
+def composition_key(config: dict[str, Any]) -> str:
+    """A short digest: compositions that train the same have the same."""
+    return content_key(sorted_items(trained(config)))
+
+
+def sorted_items(value: Any) -> Any:
+    """A value whose text does not depend on the order in which mappings were written, but for that of augmenters."""
+    if isinstance(value, dict):
+        items = [(key, inner) for key, inner in value.items()]
+        return [
+            (key, [(name, sorted_items(node)) for name, node in inner.items()])
+            if key == "augmenter" and isinstance(inner, dict)
+            else (key, sorted_items(inner))
+            for key, inner in sorted(items, key=lambda item: str(item[0]))
+        ]
+    return [sorted_items(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def place_of(config: dict[str, Any]) -> Path:
+    """The folder of a composition: <output>/<scene>/<backbone>/<digest>."""
+    scene = part(config, "scene")
+    name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
+    backbone = str(part(config, "backbone").get("name"))
+    output = Path(str(config.get("output", "outputs")))
+    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config)
+
+
+def finished(files: RunFiles, config: dict[str, Any]) -> bool:
+    """Whether a run folder holds all that a composition asks for: trained to the end, and judged in the same way."""
+    evaluated = int(files.evaluation.get("step") or 0)
+    same = all(files.config.get(key) == config.get(key) for key in JUDGING)
+    return (
+        bool(files.evaluation)
+        and evaluated >= int(config["iterations"])
+        and same
+        and (files.status.get("state") == "ok")
+    )
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[bool]:
+    """Whether this process alone works on a folder, as long as the context lasts; the claim of a killed one is void."""
+    import fcntl
+
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / f".{folder.name}.lock").open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+            return
+        yield True

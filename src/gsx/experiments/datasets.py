@@ -1,0 +1,40 @@
+"""What the datasets of the paper consist of, what of them is on this machine, and where the rest is to be had."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+def scene_folder(dataset: dict[str, Any], scene: str, root: Path) -> Path | None:
+    """Where a scene belongs; None for one that is built in."""
+    return root / dataset["folder"] / scene if dataset["folder"] else None
+
+
+def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
+    """What keeps a scene from being trained; empty if it is all there."""
+    folder = scene_folder(dataset, scene, root)
+    if folder is None:
+        return ""
+    if not folder.is_dir():
+        return f"{folder} is not there"
+    absent = [name for name in dataset["needs"] if not (folder / name).exists()]
+    return f"{folder} lacks {', '.join(absent)}" if absent else ""
+
+
+def described(dataset: dict[str, Any], root: Path) -> Iterator[str]:
+    """A dataset in lines: what is expected, what is found, what is missing and where it is to be had."""
+    scenes = list(dataset["scenes"])
+    lacking = {scene: reason for scene in scenes if (reason := missing(dataset, scene, root))}
+    found = [scene for scene in scenes if scene not in lacking]
+    yield f"{dataset['name']}: {dataset['title']}, {len(found)} of {len(scenes)} scenes found"
+    if dataset["folder"]:
+        yield f"  expected: {root / dataset['folder']}/SCENE with {', '.join(dataset['needs']) or 'its files'}"
+    yield f"  found:    {', '.join(found) or 'none'}"
+    whole = [scene for scene, reason in lacking.items() if reason.endswith("is not there")]
+    if whole:
+        yield f"  missing:  {', '.join(whole)}"
+    for scene, reason in lacking.items():
+        if scene not in whole:
+            yield f"  damaged:  {reason}"
+    if lacking:
+        yield f"  from:     {dataset['obtained']}"
