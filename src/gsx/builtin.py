@@ -36,6 +36,7 @@ def gsx_register(registry: Registry) -> None:
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)
     registry.add("augmenter", "upscale", PseudoDetails, PseudoOptions)
     registry.add("augmenter", "bootstrap", PseudoDetails, PseudoOptions)
+    registry.add("augmenter", "mipmap", PseudoDetails, PseudoOptions)
     registry.add("augmenter", "bootstrap_original", PseudoDetails, PseudoOptions)
     registry.add("regenerator", "lanczos", Resampled, PlainOptions)
     registry.add("regenerator", "oracle", Oracle, PlainOptions)

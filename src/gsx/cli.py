@@ -36,10 +36,13 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx report DIR            report.html of a run, or of all runs below a folder
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
+  gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
   gsx plugins               what is installed, from where, and what failed to load
 
   gsx --cfg job             print the configuration instead of training
-  gsx -m K=V1,V2 ...        a run for every combination
+  gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
+  gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
+  gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
   gsx --version, gsx --help
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
@@ -434,6 +437,24 @@ def verb_scenes(words: list[str]) -> int:
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
+def verb_datasets(words: list[str]) -> int:
+    """gsx datasets [NAME ...] [data_root=FOLDER]"""
+    from gsx.core.config import Compositions
+    from gsx.experiments.datasets import described
+
+    overrides = [word for word in words if "=" in word]
+    with Compositions(plugins()) as compositions:
+        known = [name for name in compositions.choices("dataset") if name != "own"]
+        names = [word for word in words if word not in overrides] or known
+        for name in names:
+            if name not in known:
+                raise InputError(f"'{name}' is no dataset; there are {', '.join(known)}.{nearest(name, known)}")
+            asked = [f"dataset={name}", *overrides]
+            root = Path(str(compositions.value(asked, "data_root")))
+            sys.stdout.write("\n".join(described(compositions.node(asked, "dataset"), root)) + "\n")
+    return 0
+
+
 class Parser(argparse.ArgumentParser):
     """Mistakes become errors of ours: one sentence, without the usage text."""
 
@@ -572,5 +593,6 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "report": verb_report,
     "trade": verb_trade,
     "scenes": verb_scenes,
+    "datasets": verb_datasets,
     "plugins": verb_plugins,
 }

@@ -7,7 +7,7 @@ regenerator redraw what is cut from the photograph or rendered there; compare wi
 import hashlib
 import logging
 from collections.abc import Iterator, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from gsx.core.images import to_uint8, write_image
 from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.regenerator import Checked, Request, as_blocks, colour_matched, complaint, projected
+from gsx.core.regenerator import Checked, Request, as_blocks, box_average, colour_matched, complaint, projected
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
 from gsx.core.seeds import derived_seed
@@ -164,6 +164,8 @@ class PseudoOptions:
     """Of the mean difference between the reduced render and the known photograph, beside that of the pixels."""
     progressive: bool
     """The scales one after the other over the events, instead of all at once."""
+    coarser: list[int] = field(default_factory=list)
+    """Training cameras also count at these fractions of their size, with box averages for pictures (Mipmap-GS)."""
 
     def __post_init__(self) -> None:
         where = f"augmenter.{self.name}"
@@ -174,6 +176,8 @@ class PseudoOptions:
             raise ValueError(f"{where}.translation_unit is '{self.translation_unit}'; choose world or extent")
         if not self.scales or min(self.scales) < 1:
             raise ValueError(f"{where}.scales is {list(self.scales)}; give factors of 1 or more")
+        if any(factor < 2 for factor in self.coarser):
+            raise ValueError(f"{where}.coarser is {list(self.coarser)}; give factors of 2 or more")
         if not 0 < self.narrow <= 1:
             raise ValueError(f"{where}.narrow is {self.narrow}; give a fraction above 0, at most 1")
         for key in ("weights", "strength"):
@@ -237,6 +241,11 @@ class PseudoDetails:
         """
         options, name = self.options, self.setting.name
         for view in self.setting.scene.train:
+            if options.coarser and min(view.camera.size) < LEAST_WINDOW * max(options.coarser):
+                raise ConfigError(
+                    f"augmenter.{name}.coarser: '{view.name}' reduced by {max(options.coarser)} is less than "
+                    f"{LEAST_WINDOW} px wide or high: give smaller factors"
+                )
             for scale in options.scales:
                 width, height = size = window_size(*view.camera.size, options.narrow, scale)
                 if min(size) < LEAST_WINDOW:
@@ -372,6 +381,11 @@ class PseudoDetails:
             logger.info(
                 "%s at step %d: %d of %d pictures", self.setting.name, event, len(views) + len(dropped), len(sketches)
             )
+        views += [
+            self.coarser_view(run, event, parent, factor)
+            for parent in sorted({sketch.parent for sketch in sketches})
+            for factor in self.options.coarser
+        ]
         if dropped:
             logger.warning("%s: %d pictures dropped, the first because %s", self.setting.name, len(dropped), dropped[0])
         if len(dropped) > MOST_DROPPED * len(sketches):
@@ -579,6 +593,29 @@ class PseudoDetails:
                 "strength": request.strength,
                 **shares,
                 "sha256": hashlib.sha256(kept.numpy().tobytes()).hexdigest(),
+            },
+        )
+
+    def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
+        """The training camera at a fraction of its size, without what fills no block at the right and below."""
+        view = run.scene.train[parent]
+        width, height = view.camera.size
+        whole = Window(left=0, top=0, width=width, height=height)
+        _, camera, covered = reduced(whole, view.camera, factor)
+        photo = self.options.base_source == "photo"
+        picture = view.image() if photo else rendered(run, view.camera).cpu()
+        target = to_uint8(box_average(Window(0, 0, *covered.size).cut(picture), factor))
+        return PseudoView(
+            camera=camera,
+            target=target,
+            parent=parent,
+            provenance={
+                "event": event,
+                "view": view.name,
+                "kind": "coarser",
+                "scale": 1 / factor,
+                "source": "photo" if photo else "render",
+                "sha256": hashlib.sha256(target.numpy().tobytes()).hexdigest(),
             },
         )
 

@@ -20,11 +20,19 @@ WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
 
 
 def trained(config: dict[str, Any]) -> dict[str, Any]:
-    """What of a resolved composition decides what is trained; regenerators only where an augmenter may ask for them."""
-    told = (*WHERE, *NAMES, *JUDGING, *(() if config.get("augmenter") else ("augmenter", "regenerator")))
+    """What of a resolved composition decides what is trained."""
+    told = (*WHERE, *NAMES, *JUDGING, "regenerator")
     kept = {key: value for key, value in config.items() if key not in told}
+    kept["regenerator"] = asked_for(config)
     kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
     return kept
+
+
+def asked_for(config: dict[str, Any]) -> dict[str, Any]:
+    """The regenerators that augmenters may ask for: those of their roles, or all where one does not name its role."""
+    nodes = [node for node in part(config, "augmenter").values() if isinstance(node, dict)]
+    roles = {node.get("role") for node in nodes}
+    return {role: node for role, node in part(config, "regenerator").items() if roles & {role, None}}
 
 
 def composition_key(config: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.control import spread
 from gsx.core.files import read_json
-from gsx.core.identity import NAMES, WATCHING, WHERE
+from gsx.core.identity import NAMES, WATCHING, WHERE, asked_for
 from gsx.core.overview import flattened
 from gsx.core.run_files import RunFiles, is_number, part, read_run, state_of
 from gsx.core.trunk import BRANCH
@@ -314,6 +314,4 @@ def judged(config: dict[str, Any]) -> dict[str, Any]:
     kept["eval"] = {key: value for key, value in part(config, "eval").items() if key not in ("zoom", "tile_pixels")}
     kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
     kept["scene"] = {k: v for k, v in part(config, "scene").items() if k not in ("path", "cache_gb", "iterations")}
-    if not config.get("augmenter"):
-        kept.pop("regenerator", None)
-    return kept
+    return kept | {"regenerator": asked_for(config)}
