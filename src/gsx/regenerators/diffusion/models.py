@@ -89,7 +89,8 @@ def remedy(options: DiffusionOptions, recipe: Recipe) -> str:
     size = f", about {recipe.gigabytes:g} GB" if recipe.gigabytes else ""
     return (
         f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {patterns} --local-dir {folder}; then "
-        f"{recipe.where}.model={folder}. Or let gsx fetch it: {recipe.where}.download=true. Without diffusion: budget=quick"
+        f"{recipe.where}.model={folder}. Or let gsx fetch it: {recipe.where}.download=true. "
+        "Without diffusion: budget=quick"
     )
 
 
