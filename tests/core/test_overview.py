@@ -306,8 +306,8 @@ def test_other_windows_are_not_put_beside_each_other(pair: Path) -> None:
 def test_pictures_that_are_gone_cut_short_or_garbage_are_said_to_be(pair: Path) -> None:
     renders = pair / "a b" / "renders"
     (renders / "one.x4.truth.png").unlink()
-    (renders / "one.x4.render.png").write_bytes(b"\x00garbage\xff")
     whole = (renders / "two.x4.render.png").read_bytes()
+    (renders / "one.x4.render.png").write_bytes(b"\x00garbage\xff" + whole[-40:])
     (renders / "two.x4.render.png").write_bytes(whole[:-20])
     section = Page(write_overview(pair)).section("garden: side by side")
     for view, truth in (("v0", "c/renders/one.x4.truth.png"), ("v1", "a%20b/renders/two.x4.truth.png")):
@@ -351,6 +351,7 @@ def test_runs_are_called_by_their_variant_or_backbone_and_augmenters(tmp_path: P
     make_run(tmp_path / "3", {"variant": ""})
     make_run(tmp_path / "4", {"variant": ["no name"]})
     write_overview(tmp_path)
+    assert rows(tmp_path)["1"]["differences"] == rows(tmp_path)["2"]["differences"] == ""  # the name says it
     assert [row["variant"] for row in rows(tmp_path).values()] == ["octree_ub", "gs3d + upscale", "gs3d", "gs3d"]
     assert [row["backbone"] for row in rows(tmp_path).values()] == ["gs3d + upscale"] * 2 + ["gs3d"] * 2
 
@@ -394,7 +395,7 @@ GARBAGE = {
     "list": b"[1, 2]",
     "text": b'"words"',
     "deep": b"[" * 100_000,
-    "step": b'{"step": "many", "state": ["ok"], "psnr": 3, "iterations": {}, "backbone": 3, "augmenter": {"1": 2}}',
+    "step": b'{"step": "many", "state": ["ok"], "psnr": 3, "iterations": "all", "backbone": 3, "augmenter": {"1": 2}}',
     "lists": b'{"views": {"a": 1}, "zoom": [1, 2], "protocol": [3], "scene": {"path": [1]}, "backbone": {"name": 3}}',
     "rows": b'{"views": [1], "zoom": {"a": {}}, "groups": [], "scene": [], "seed": [1], "psnr": 1}',
     "entries": b'{"views": [{"size": ["a"], "files": [1]}, {"name": 3, "size": [0, 0]}, {"size": [4, 4]}], '
@@ -413,6 +414,7 @@ def test_the_page_is_written_whatever_one_file_of_a_run_holds(tmp_path: Path, na
     page = Page(write_overview(tmp_path))
     assert list(rows(tmp_path)) == ["a", "b", "damaged", "damaged_too"]
     assert page.row("a")[1:4] == ["ok", "garden", "a gs3d"]
+    assert "aspect-ratio: 0" not in page.source
     reads = content not in ("step", "lists", "rows", "entries", "windows")
     if reads and not (name == "metrics.jsonl" and content == "empty"):
         assert name in rows(tmp_path)["damaged"]["reason"]
@@ -483,6 +485,11 @@ def test_several_folders_give_one_page_in_what_they_share(folders: Path, capsys:
     assert main(["report", str(folders / "mon"), str(folders / "tue" / "deep" / "c"), str(folders / "mon" / "a")]) == 0
     assert capsys.readouterr().out == f"{folders / 'report.html'}\n"
     assert list(rows(folders)) == ["mon/a", "mon/b", "tue/deep/c"]
+
+
+def test_a_folder_with_a_single_run_gets_a_page_of_its_own(folders: Path) -> None:
+    assert report_on([folders / "tue"]) == folders / "tue" / "report.html"
+    assert list(rows(folders / "tue")) == ["deep/c"]
 
 
 def test_the_page_goes_where_it_is_told_to(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
