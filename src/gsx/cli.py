@@ -33,7 +33,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx eval RUN [K=V ...]    evaluate a run again, for example with 'eval.zoom=[1,2,4]'
   gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif (.webp, .mp4: gsx[video])
   gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
-  gsx report DIR            report.html of a run, or of all runs below a folder
+  gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
@@ -95,7 +95,7 @@ def os_sentence(error: OSError) -> str:
 
 def dispatch(words: list[str]) -> int:
     """Find the verb and run it."""
-    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in ("render", "trade")):
+    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in ("render", "report", "trade")):
         sys.stdout.write(HELP)
         return 0
     if words == ["--version"]:
@@ -415,14 +415,14 @@ def verb_export(words: list[str]) -> int:
 
 
 def verb_report(words: list[str]) -> int:
-    """gsx report DIR"""
-    from gsx.core.report import write_overview, write_report
+    """gsx report DIR [DIR ...] [--to FOLDER]"""
+    parser = Parser(prog="gsx report", description="Report of a run, or one page over all runs of some folders.")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
+    given = parser.parse_args(words)
+    from gsx.core.report import report_on
 
-    folder, _ = run_words("report", words)
-    if not folder.is_dir():
-        raise InputError(f"{folder} is no folder: give a run, or a folder with runs below it")
-    write = write_report if (folder / "config.yaml").is_file() else write_overview
-    sys.stdout.write(f"{write(folder)}\n")
+    sys.stdout.write(f"{report_on(given.folders, new_folder(given.to) if given.to else None)}\n")
     return 0
 
 

@@ -13,10 +13,16 @@ WIDTH, HEIGHT = 480, 250
 """Drawing units of a chart; the page scales it."""
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 38
 """Margins for labels, drawing units."""
+LETTER, LINE = 6, 12
+"""Width of a letter, about, and height of a line of text, drawing units."""
 MOST_POINTS = 400
 """Longer curves are averaged in groups down to this many points."""
 PADDING = 0.04
 """Room around the data, as a fraction of their range."""
+COLOURS, DASHES = 6, 3
+"""Colours of the page, and ways to draw each: solid, dashed or hollow, dotted or faint."""
+STYLES = COLOURS * DASHES
+"""Curves or points that can be told apart."""
 DIGITS_DECADES, MOST_DECADES = 4, 8
 """A logarithmic axis over more decades is marked with powers of ten only; over yet more, with every other one."""
 
@@ -53,7 +59,7 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """A curve: values over positions, drawn in style `kind` of the page (main, faint, test)."""
+    """A curve: values over positions, drawn in style `kind` of the page (main, faint, test, or of `style`)."""
 
     name: str
     x: Sequence[float]
@@ -83,7 +89,14 @@ class Dot:
     label: str
     """Written beside points of the front."""
     colour: int
-    """Number of its colour."""
+    """Number of its style."""
+    link: str = ""
+    """Where a click leads."""
+
+
+def style(number: int) -> str:
+    """Classes of the page for the curve or point of that number: colours first, then other ways to draw them."""
+    return f"k{number % COLOURS} v{number // COLOURS % DASHES}"
 
 
 def linear_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
@@ -203,7 +216,8 @@ def mark_line(plot: Plot, mark: Mark) -> str:
 def curve(plot: Plot, series: Series) -> str:
     """A polyline, with dots where asked for."""
     x, y = thinned(series.x, series.y)
-    body = f'<polyline class="curve {series.kind}" points="{plot.points(x, y)}"/>'
+    title = f"<title>{html.escape(series.name)}</title>"
+    body = f'<polyline class="curve {series.kind}" points="{plot.points(x, y)}">{title}</polyline>'
     if series.dots:
         places = zip(x, y, strict=True)
         body += "".join(
@@ -260,18 +274,35 @@ def scatter(dots: Sequence[Dot], *, x_label: str, falling: bool = False) -> Mark
     front = pareto_front([dot.x for dot in dots], [-dot.y if falling else dot.y for dot in dots])
     line = plot.points([dots[i].x for i in front], [dots[i].y for i in front])
     body = plot.frame(x_label) + f'<polyline class="front" points="{line}"/>'
-    return svg(body + "".join(scatter_dot(plot, dot, i in front) for i, dot in enumerate(dots)))
+    body += "".join(scatter_dot(plot, dot, i in front) for i, dot in enumerate(dots))
+    return svg(body + labels(plot, [dots[i] for i in front]))
 
 
 def scatter_dot(plot: Plot, dot: Dot, on_front: bool) -> str:
-    """A point; those of the front are larger and named."""
-    x, y = plot.across(dot.x), plot.down(dot.y)
-    style, radius = ("dot best", 5.5) if on_front else ("dot", 4)
+    """A point; those of the front are larger."""
+    kind, radius = ("dot best", 5.5) if on_front else ("dot", 4)
     title = f"<title>{html.escape(dot.text)}</title>"
-    body = f'<circle class="{style} k{dot.colour}" cx="{x}" cy="{y}" r="{radius}">{title}</circle>'
-    if not on_front:
-        return body
-    anchor, shift = ("end", -8) if x > WIDTH * 0.7 else ("start", 8)
-    return (
-        body + f'<text class="tick" x="{x + shift}" y="{y - 7}" text-anchor="{anchor}">{html.escape(dot.label)}</text>'
-    )
+    place = f'cx="{plot.across(dot.x)}" cy="{plot.down(dot.y)}"'
+    body = f'<circle class="{kind} {style(dot.colour)}" {place} r="{radius}">{title}</circle>'
+    return f'<a href="{html.escape(dot.link)}">{body}</a>' if dot.link else body
+
+
+def labels(plot: Plot, dots: Sequence[Dot]) -> str:
+    """Names beside points, above or below them, on the side with room; one that would cover another is left out."""
+    body, taken = "", list[tuple[float, float, float]]()
+    for dot in dots:
+        x, y, width = plot.across(dot.x), plot.down(dot.y), LETTER * len(dot.label)
+        leftwards = x + 8 + width > WIDTH and x > WIDTH / 2
+        left = x - 8 - width if leftwards else x + 8
+        free = [line for line in (y - 7, y + 16) if not any(covers(left, line, width, other) for other in taken)]
+        if free:
+            taken.append((left, free[0], width))
+            anchor, at = ("end", x - 8) if leftwards else ("start", x + 8)
+            text = html.escape(dot.label)
+            body += f'<text class="tick" x="{at:g}" y="{free[0]:g}" text-anchor="{anchor}">{text}</text>'
+    return body
+
+
+def covers(left: float, line: float, width: float, other: tuple[float, float, float]) -> bool:
+    """Whether two texts would overlap: left end, base line and width of each."""
+    return abs(line - other[1]) < LINE and left < other[0] + other[2] and other[0] < left + width

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.run_files import RunFiles, is_number, part
 
-BESIDE = ("augmenter", "regenerator", "folder", "output", "init", "trunk_gb", "eval", "metrics", "seed")
+BESIDE = ("variant", "augmenter", "regenerator", "folder", "output", "init", "trunk_gb", "eval", "metrics", "seed")
 """Keys in which a run may differ from its control, and runs of one comparison from each other (the seed)."""
 
 
@@ -39,7 +39,7 @@ def compared(runs: Sequence[RunFiles]) -> list[Comparison]:
         if control is None or not run.evaluation or not part(run.config, "augmenter"):
             continue
         choice = json.dumps([run.config.get("augmenter"), run.config.get("regenerator")], sort_keys=True)
-        names = " + ".join(part(run.config, "augmenter"))
+        names = " + ".join(map(str, part(run.config, "augmenter")))
         entry = found.setdefault(
             (key_of(run), choice),
             Comparison(scene=run.scene, backbone=run.backbone.split(" + ")[0], augmenters=names, told=""),
@@ -57,7 +57,8 @@ def key_of(run: RunFiles) -> str:
 
 def seed_of(run: RunFiles) -> int:
     """The run's seed."""
-    return int(run.config.get("seed") or 0)
+    seed = run.config.get("seed")
+    return int(seed) if is_number(seed) else 0
 
 
 def add(entry: Comparison, run: RunFiles, control: RunFiles) -> None:

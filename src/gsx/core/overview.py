@@ -1,29 +1,33 @@
-"""One page over all runs below a folder: a table, what cannot be compared, and PSNR against its cost."""
+"""One page over many runs in any state: a table, what cannot be compared, curves, PSNR against its cost, pictures.
+
+Pictures are not copied: the page refers to those in the runs' folders.
+"""
 
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from gsx import __version__
-from gsx.core.charts import Dot, pareto_front, scatter
+from gsx.core.comparison import Entry, compared_runs, groups_of
 from gsx.core.control import control_rows
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.core.page import fixed, template
+from gsx.core.page import template
 from gsx.core.run_files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+from gsx.core.side_by_side import pictures_of
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
 UNTOLD = ("folder", "output", "device")
 """Keys that say where a run ran, not what it is."""
-LABEL = 32
-"""Longest name beside a point."""
 FIELDS = (
-    "run", "state", "reason", "scene", "backbone", "differences", "iterations", "psnr", "ssim", "lpips", "primitives",
-    "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
+    "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
+    "primitives", "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 
@@ -34,19 +38,18 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     Raises:
         InputError: there is no run below it.
     """
-    runs = [read_run(path) for path in (runs_below(folder) if chosen is None else chosen)]
-    if not runs:
-        raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give the folder of some runs")
+    runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
     rows, controls = overview_rows(folder, runs), control_rows(runs)
+    groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
     replace_file(folder / "report.csv", csv_of(rows).encode())
     context = {
-        "title": f"{len(rows)} runs {'below' if chosen is None else 'of'} {folder.name or folder}",
+        "title": title_of(folder, runs),
         "version": __version__,
         "rows": rows,
         "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
         "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
         "mixed": mixed_protocols(rows),
-        "comparisons": comparisons(rows),
+        "groups": [compared_runs(group) | {"pictures": pictures_of(group, folder)} for group in groups],
         "controls": controls,
         "control_zooms": sorted({factor for entry in controls for factor in entry["gains"]}, key=float),
         "any_lpips": any(is_number(row["lpips"]) for row in rows),
@@ -56,13 +59,58 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     return path
 
 
+def title_of(folder: Path, runs: Sequence[RunFiles]) -> str:
+    """How many runs, and where they are if that is one place."""
+    count = f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}"
+    together = all(Path(os.path.abspath(run.folder)).is_relative_to(os.path.abspath(folder)) for run in runs)
+    return f"{count} below {folder.resolve().name or folder}" if together else count
+
+
+def runs_in(folders: Sequence[Path]) -> list[Path]:
+    """The runs that these folders are or hold, each once, however many ways lead to it.
+
+    Raises:
+        InputError: one of them is no folder, or neither is a run nor holds any.
+    """
+    found: dict[Path, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder} is no folder: give a run, or a folder with runs below it")
+        runs = [folder] if (folder / "config.yaml").is_file() else list(runs_below(folder))
+        if not runs:
+            raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give a folder of runs")
+        for run in runs:
+            found.setdefault(run.resolve(), run)
+    return list(found.values())
+
+
+def common_folder(folders: Sequence[Path]) -> Path:
+    """Where an overview of these folders is written: the closest folder above them all that is no run itself.
+
+    Raises:
+        InputError: they have nothing but the root of the file system in common.
+    """
+    try:
+        common = Path(os.path.commonpath([os.path.abspath(folder) for folder in folders]))
+    except ValueError:  # on different drives
+        common = Path(folders[0].anchor)
+    while (common / "config.yaml").is_file():
+        common = common.parent
+    if common == common.parent:
+        raise InputError(f"{folders[0]} and the others have no folder in common: say where with --to FOLDER")
+    return common
+
+
 def overview_rows(folder: Path, runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
     """One row for each run."""
     told = differences(runs)
     rows = [overview_row(folder, run, told[i]) for i, run in enumerate(runs)]
-    mixed = mixed_protocols(rows)
+    mixed, names = mixed_protocols(rows), names_of(rows)
     return [
-        row | {"comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"} for row in rows
+        row
+        | {"name": names[i]}
+        | {"comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"}
+        for i, row in enumerate(rows)
     ]
 
 
@@ -70,16 +118,17 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
     """The figures of a run."""
     state, reason = state_of(run)
     e = run.evaluation
-    zoom = {factor: gain_of(entry) for factor, entry in part(e, "zoom").items() if factor != "1"}
-    gains = {factor: gain for factor, gain in zoom.items() if gain is not None}
+    zoom = {factor: entry for factor, entry in part(e, "zoom").items() if factor != "1"}
+    gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
     report = run.folder / "report.html"
     return {
         "run": place(run.folder, folder),
-        "report": place(report, folder) if report.is_file() else "",
+        "link": quote(place(report, folder)) if report.is_file() else "",
         "state": state,
-        "reason": reason,
+        "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values()) if word)),
         "scene": run.scene,
         "backbone": run.backbone,
+        "variant": run.variant,
         "differences": told,
         "iterations": run.iterations,
         **{
@@ -88,6 +137,7 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
         },
         "seconds": e.get("train_seconds"),
         "gains": gains,
+        "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},
         "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
         "protocol": run.protocol_hash,
     }
@@ -99,10 +149,10 @@ def place(path: Path, folder: Path) -> str:
 
 
 def differences(runs: Sequence[RunFiles]) -> list[str]:
-    """For each run its values of the configuration keys in which runs of its scene and backbone differ."""
+    """For each run its values of the configuration keys in which runs of its scene and variant differ."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(runs):
-        groups.setdefault((run.scene, run.backbone), []).append(i)
+        groups.setdefault((run.scene, run.variant), []).append(i)
     flat = [flattened(run.config) for run in runs]
     out = [""] * len(runs)
     for members in groups.values():
@@ -111,6 +161,19 @@ def differences(runs: Sequence[RunFiles]) -> list[str]:
         for i in members:
             out[i] = ", ".join(f"{key}={flat[i].get(key, 'absent')}" for key in varied[:DIFFERENCES]) + more
     return out
+
+
+def names_of(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What each run is called: its variant; where a scene has several of those, also what differs, or its folder."""
+    names = [row["variant"] for row in rows]
+    told = [" ".join(word.split(".")[-1] for word in row["differences"].split(", ") if word) for row in rows]
+    for more in (told, [Path(row["run"]).name for row in rows]):
+        same = Counter((row["scene"], name) for row, name in zip(rows, names, strict=True))
+        names = [
+            f"{name} · {word}" if word and same[row["scene"], name] > 1 else name
+            for row, name, word in zip(rows, names, more, strict=True)
+        ]
+    return names
 
 
 def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
@@ -147,45 +210,3 @@ def csv_of(rows: Sequence[dict[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
-
-
-def comparisons(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Scatter plots of each scene and protocol with at least two evaluated runs."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in rows:
-        if all(is_number(row[key]) for key in ("psnr", "primitives", "seconds")):
-            groups.setdefault((row["scene"], row["protocol"]), []).append(row)
-    colours = {name: i for i, name in enumerate(dict.fromkeys(row["backbone"] for row in rows))}
-    return [comparison(*key, members, colours) for key, members in groups.items() if len(members) > 1]
-
-
-def comparison(scene: str, protocol: str, rows: Sequence[dict[str, Any]], colours: dict[str, int]) -> dict[str, Any]:
-    """PSNR against primitives and against training time, with both Pareto fronts."""
-
-    def plot(key: str, x_label: str) -> dict[str, Any]:
-        dots = [
-            Dot(
-                x=row[key],
-                y=row["psnr"],
-                text=f"{row['run']}: {fixed(row['psnr'])} dB, {fixed(row[key], 0)} {x_label}",
-                label=short_name(row),
-                colour=colours[row["backbone"]] % 6,
-            )
-            for row in rows
-        ]
-        front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
-        return {"svg": scatter(dots, x_label=x_label), "front": [rows[i]["run"] for i in front], "label": x_label}
-
-    return {
-        "scene": scene,
-        "protocol": protocol,
-        "plots": [plot("primitives", "primitives"), plot("seconds", "seconds of training")],
-        "legend": {name: colours[name] % 6 for name in dict.fromkeys(row["backbone"] for row in rows)},
-    }
-
-
-def short_name(row: dict[str, Any]) -> str:
-    """What tells a run from its like, or else its folder, cut to what fits beside a point."""
-    words = [word.split(".")[-1] for word in row["differences"].split(", ") if word]
-    name = " ".join(words) or Path(row["run"]).name
-    return name if len(name) <= LABEL else name[: LABEL - 1] + "…"

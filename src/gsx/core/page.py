@@ -35,6 +35,11 @@ def duration(seconds: Any) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
+def time_unit(seconds: float) -> tuple[str, int]:
+    """A unit in which the time is a handy number, and its seconds."""
+    return ("hours", 3600) if seconds > 7200 else ("minutes", 60) if seconds > 180 else ("seconds", 1)
+
+
 def template(name: str) -> jinja2.Template:
     """A template of this package: what is not marked as safe is escaped, missing figures show as n/a."""
     source = files("gsx.core")

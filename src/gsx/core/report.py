@@ -15,12 +15,12 @@ from gsx import __version__
 from gsx.core.charts import Mark, Series, line_chart, smoothed
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.core.overview import write_overview
-from gsx.core.page import NONE, duration, fixed, template
+from gsx.core.overview import common_folder, runs_in, write_overview
+from gsx.core.page import NONE, duration, fixed, template, time_unit
 from gsx.core.pictures import ERROR_COLOURS
 from gsx.core.run_files import RunFiles, gain_of, is_number, part, read_run, state_of
 
-__all__ = ["write_overview", "write_report"]
+__all__ = ["report_on", "write_overview", "write_report"]
 
 WORST = 10
 """Views in the table of the worst."""
@@ -44,6 +44,24 @@ def write_report(folder: Path) -> Path:
     path = folder / "report.html"
     replace_file(path, template("report.html").render(report_context(read_run(folder))).encode())
     return path
+
+
+def report_on(folders: Sequence[Path], to: Path | None = None) -> Path:
+    """The report of a run if one run is given and no `to`, else an overview in `to` or the folder they share.
+
+    Raises:
+        InputError: one of the folders holds no run, or there is no sensible place for the page.
+    """
+    chosen, given = runs_in(folders), {folder.resolve() for folder in folders}
+    if to is None and given == {run.resolve() for run in chosen} and len(chosen) == 1:
+        return write_report(folders[0])
+    if to is not None and (to / "config.yaml").is_file():
+        raise InputError(f"{to} is a run, whose report.html this would replace: choose another folder with --to FOLDER")
+    place = to or (common_folder(folders) if len(folders) > 1 or folders == chosen else folders[0])
+    try:
+        return write_overview(place, chosen)
+    except PermissionError as error:
+        raise InputError(f"{place} cannot be written: say where with --to FOLDER") from error
 
 
 def report_context(run: RunFiles) -> dict[str, Any]:
@@ -191,7 +209,7 @@ def curves(run: RunFiles) -> list[dict[str, Any]]:
     lines = run.lines
     if len(lines) < 2:
         return []
-    unit, seconds = time_unit(max((line.get("seconds") or 0) for line in lines))
+    unit, seconds = time_unit(max(value if is_number(value := line.get("seconds")) else 0 for line in lines))
     scales: dict[str, tuple[str, Callable[[dict[str, Any]], float | None]]] = {
         "step": ("training step", lambda line: line.get("step")),
         "time": (
@@ -217,11 +235,6 @@ def curves(run: RunFiles) -> list[dict[str, Any]]:
         }
         for title, name, log, legend in charts
     ]
-
-
-def time_unit(seconds: float) -> tuple[str, int]:
-    """A unit in which the time is a handy number, and its seconds."""
-    return ("hours", 3600) if seconds > 7200 else ("minutes", 60) if seconds > 180 else ("seconds", 1)
 
 
 def with_step_times(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

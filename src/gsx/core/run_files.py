@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -37,7 +37,8 @@ class RunFiles:
     @property
     def iterations(self) -> int:
         """Steps asked for; 0 where unknown."""
-        return int(self.config.get("iterations") or 0)
+        wanted = self.config.get("iterations")
+        return int(wanted) if is_number(wanted) else 0
 
     @property
     def remedy(self) -> str:
@@ -60,8 +61,14 @@ class RunFiles:
     @property
     def backbone(self) -> str:
         """Backbone and augmenters."""
-        names = [str(part(self.config, "backbone").get("name", "?")), *part(self.config, "augmenter")]
-        return " + ".join(names)
+        names = [part(self.config, "backbone").get("name", "?"), *part(self.config, "augmenter")]
+        return " + ".join(map(str, names))
+
+    @property
+    def variant(self) -> str:
+        """The name that config.yaml gives the run, else backbone and augmenters."""
+        name = self.config.get("variant")
+        return name if isinstance(name, str) and name else self.backbone
 
     @property
     def protocol_hash(self) -> str:
@@ -79,7 +86,11 @@ def read_run(folder: Path) -> RunFiles:
     """Everything that can be read of a run."""
     problems: dict[str, str] = {}
     config, text = read_yaml(folder / "config.yaml", problems)
-    evaluation = read_mapping(folder, "evaluation.json", problems)
+
+    def read(name: str, sound: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+        return read_mapping(folder, name, problems, sound)
+
+    evaluation = read("evaluation.json", sound_evaluation)
     if evaluation and not (is_number(evaluation.get("psnr")) or "views" in evaluation):
         problems["evaluation.json"] = "evaluation.json holds no figures"
         evaluation = {}
@@ -87,14 +98,45 @@ def read_run(folder: Path) -> RunFiles:
         folder=folder,
         config=config,
         config_text=text,
-        environment=read_mapping(folder, "environment.json", problems),
+        environment=read("environment.json"),
         lines=read_lines(folder / "metrics.jsonl", problems),
         evaluation=evaluation,
-        pictures=read_mapping(folder, "renders/index.json", problems),
-        pseudo=read_mapping(folder, "pseudo/index.json", problems),
-        status=read_mapping(folder, "status.json", problems),
+        pictures=read("renders/index.json", sound_pictures),
+        pseudo=read("pseudo/index.json", lambda content: rows(content.get("views", []))),
+        status=read("status.json", sound_step),
         problems=problems,
     )
+
+
+def sound_evaluation(content: dict[str, Any]) -> bool:
+    """Whether the parts of an evaluation.json that there are have the form that gsx gives them."""
+    zoom, groups = content.get("zoom", {}), content.get("groups", {})
+    named = all(isinstance(node, dict) and rows(list(node.values())) for node in (zoom, groups))
+    return sound_step(content) and named and all(map(is_decimal, zoom)) and rows(content.get("views", []))
+
+
+def sound_pictures(content: dict[str, Any]) -> bool:
+    """Whether the lists of a renders/index.json have the form that gsx gives them."""
+    views, crops = content.get("views", []), content.get("zoom", [])
+    return rows(views) and rows(crops) and all(is_number(crop.get("factor")) for crop in crops)
+
+
+def sound_step(content: dict[str, Any]) -> bool:
+    """Whether the step, where there is one, is a number."""
+    return content.get("step") is None or is_number(content["step"])
+
+
+def rows(value: Any) -> bool:
+    """Whether it is a list of mappings."""
+    return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
+
+
+def is_decimal(word: str) -> bool:
+    """Whether a key, of JSON and so a text, is a finite number."""
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
 
 
 def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str]:
@@ -104,23 +146,36 @@ def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str
     try:
         text = path.read_text(encoding="utf-8")
         content = yaml.safe_load(text)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        problems[path.name] = f"{path.name} cannot be read ({str(error).splitlines()[0]})"
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        problems[path.name] = f"{path.name} cannot be read ({first_line(error)})"
         return {}, ""
-    return (content if isinstance(content, dict) else {}), text
+    if not isinstance(content, dict):
+        problems[path.name] = f"{path.name} holds no settings"
+        return {}, text
+    return content, text
 
 
-def read_mapping(folder: Path, name: str, problems: dict[str, str]) -> dict[str, Any]:
-    """A JSON object; empty where the file is missing or damaged."""
+def first_line(error: Exception) -> str:
+    """What an error says, in one line."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def read_mapping(
+    folder: Path, name: str, problems: dict[str, str], sound: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
+    """A JSON object; empty where the file is missing, damaged, or not `sound`."""
     try:
         content = json.loads((folder / name).read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
-        problems[name] = f"{name} cannot be read ({error})"
+    except (OSError, ValueError, RecursionError) as error:
+        problems[name] = f"{name} cannot be read ({first_line(error)})"
         return {}
     if not isinstance(content, dict):
         problems[name] = f"{name} holds no JSON object"
+        return {}
+    if not sound(content):
+        problems[name] = f"{name} is not what gsx writes"
         return {}
     return content
 
@@ -133,7 +188,7 @@ def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             line = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             line = None
         if isinstance(line, dict) and is_number(line.get("step")):
             intact.append(line)
@@ -172,9 +227,11 @@ def state_of(files: RunFiles) -> tuple[str, str]:
 
 
 def runs_below(folder: Path) -> Iterator[Path]:
-    """Folders with a config.yaml, sorted; nothing inside a run is searched."""
+    """Folders with a config.yaml, sorted; nothing inside a run is searched, and no link leads back up."""
     for child in sorted(folder.iterdir()):
         if not child.is_dir() or child.name.startswith("."):
+            continue
+        if child.is_symlink() and folder.resolve().is_relative_to(child.resolve()):
             continue
         if (child / "config.yaml").is_file():
             yield child
