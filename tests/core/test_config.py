@@ -6,25 +6,28 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsx.cli import plugins
-from gsx.core.config import compose, read_config, typed, write_config
+from gsx.core.config import Compositions, compose, read_config, typed, write_config
 from gsx.core.errors import ConfigError
 from gsx.core.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
+GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")})
 NEEDS = {
     ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
     ("preset", "octree"): ("backbone=octree_scaffold",),
     ("preset", "clone"): ("backbone=octree_gs3d",),
+    ("dataset", "own"): ("+dataset.scenes.yard=Yard", "dataset.scene=yard"),
 }
 """What the settings of a dataset are for."""
 
 
-@pytest.mark.parametrize(("group", "option"), GROUPS)
-def test_every_file_composes_and_fits_its_schema(group: str, option: str) -> None:
-    settings = compose([*NEEDS.get((group, option.split("_")[0]), ()), f"{group}={option}"], plugins())
-    if group in ("scene", "backbone"):
-        assert getattr(settings, group).component.name == option
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_file_composes_and_fits_its_schema(group: str) -> None:
+    with Compositions(plugins()) as compositions:
+        for option in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
+            settings = compositions.settings([*NEEDS.get((group, option.split("_")[0]), ()), f"{group}={option}"])
+            if group in ("scene", "backbone"):
+                assert getattr(settings, group).component.name == option
 
 
 def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:

@@ -356,7 +356,7 @@ def refuse_unknown_scene(config: Any) -> None:
     known = list(dataset.get("scenes") or {})
     if dataset and (name := str(dataset.get("scene"))) not in known:
         raise ConfigError(
-            f"dataset.scene is '{name}'; {dataset.get('title')} has {', '.join(known) or 'no scenes: name them'}."
+            f"dataset.scene is '{name}'; {dataset.get('title')} has {', '.join(known) or 'no scenes: name them, +dataset.scenes.FOLDER=NAME'}."
             f"{nearest(name, known)}"
         )
 

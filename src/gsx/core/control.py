@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from gsx.core.identity import JUDGING, NAMES, WHERE
 from gsx.core.run_files import RunFiles, is_number, part
 
-BESIDE = ("variant", "augmenter", "regenerator", "folder", "output", "init", "trunk_gb", "eval", "metrics", "seed")
+BESIDE = (*WHERE, *NAMES, *JUDGING, "augmenter", "regenerator", "seed")
 """Keys in which a run may differ from its control, and runs of one comparison from each other (the seed)."""
 
 

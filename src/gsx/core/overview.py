@@ -17,14 +17,13 @@ from gsx.core.comparison import Entry, compared_runs, groups_of
 from gsx.core.control import control_rows
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
+from gsx.core.identity import WHERE
 from gsx.core.page import template
 from gsx.core.run_files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
 from gsx.core.side_by_side import pictures_of
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
-UNTOLD = ("folder", "output", "device")
-"""Keys that say where a run ran, not what it is."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
     "primitives", "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
@@ -183,12 +182,12 @@ def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys and values, without UNTOLD."""
+    """Dotted keys and values, without those that say where a run ran."""
     out: dict[str, Any] = {}
     for key, value in node.items():
         if isinstance(value, dict):
             out |= flattened(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in UNTOLD:
+        elif f"{prefix}{key}" not in (*WHERE, "length"):
             out[f"{prefix}{key}"] = value
     return out
 

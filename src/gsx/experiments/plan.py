@@ -189,4 +189,4 @@ def check_scenes(experiment: Experiment, datasets: dict[str, Any]) -> None:
                 f"{nearest(scene, known)}"
             )
     if not known:
-        raise ConfigError(f"{', '.join(datasets)} has no scenes: name them, 'dataset.scenes={{kitchen: Kitchen}}'")
+        raise ConfigError(f"{', '.join(datasets)} has no scenes: name them, +dataset.scenes.FOLDER=NAME")

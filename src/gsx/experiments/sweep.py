@@ -29,6 +29,11 @@ def key_of(word: str) -> str:
     return word.lstrip("+~").partition("=")[0].split(".")[0].split("/")[0].split("@")[0]
 
 
+def is_below_dataset(word: str) -> bool:
+    """Whether an override changes something of the dataset instead of choosing one."""
+    return word.lstrip("+").startswith("dataset.")
+
+
 def is_table(words: Sequence[str]) -> bool:
     """Whether a command line asks for a table."""
     return any(word.lstrip("+").startswith("experiment=") for word in words)
@@ -43,7 +48,7 @@ def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any])
         ConfigError: an experiment, dataset or override is wrong; nothing was run.
     """
     words = [word.lstrip("+") if is_table([word]) else word for word in words]
-    common = [word for word in words if key_of(word) not in OWN or word.startswith("dataset.")]
+    common = [word for word in words if key_of(word) not in OWN or is_below_dataset(word)]
     with Compositions(plugins) as compositions:
         refuse_sweeps(common)
         experiment: Experiment = typed(Experiment, compositions.node(words, "experiment"), "experiment")
@@ -77,7 +82,7 @@ def refuse_sweeps(words: Sequence[str]) -> None:
 def datasets_of(experiment: Experiment, words: Sequence[str], compositions: Compositions) -> dict[str, Any]:
     """The datasets of a table as composed, by name: that of the command line, or the paper's."""
     asked = [word.partition("=")[2] for word in words if word.startswith("dataset=")]
-    below = [word for word in words if word.startswith("dataset.")]
+    below = [word for word in words if is_below_dataset(word)]
     names = asked[-1:] or experiment.datasets
     return {name: compositions.node([f"dataset={name}", *below], "dataset") for name in names}
 

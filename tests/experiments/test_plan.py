@@ -1,0 +1,144 @@
+"""What is planned for a table: which runs, which of them first, where states are left, what is finished."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsx.cli import plugins
+from gsx.core.config import Compositions, write_config
+from gsx.core.identity import claimed, composition_key, place_of
+from gsx.experiments.plan import Cell, Experiment, cells_of, planned, told
+from gsx.experiments.sweep import run_table
+
+ROWS = {"control": "octree_gs", "UP": "octree_up", "UB": "octree_ub", "early": "octree_ub_start_10k",
+        "same": "octree_ub_infer_1", "other": "3d_gs"}  # fmt: skip
+DATASETS: dict[str, Any] = {"demo": {"title": "demo", "folder": "", "needs": [], "scenes": {"demo": "demo"}}}
+
+
+def experiment(**more: Any) -> Experiment:
+    return Experiment(name="t", title="T", published="", datasets=["demo"], baseline="control", rows=ROWS, **more)
+
+
+def cells(table: Experiment, folder: Path, *words: str) -> list[Cell]:
+    """As `gsx +experiment=... budget=quick` plans them."""
+    with Compositions(plugins()) as compositions:
+        common = [f"output={folder}", "budget=quick", *words]
+        return list(cells_of(table, DATASETS, common, compositions.settings))
+
+
+def words_of(plan: Any) -> list[list[tuple[str, str]]]:
+    """(variant, where states are left) of each run, phase by phase."""
+
+    def short(job: list[str]) -> tuple[str, str]:
+        given = dict(word.split("=", 1) for word in job)
+        return given["variant"], given["trunk_at"]
+
+    return [sorted(map(short, phase)) for phase in plan.phases]
+
+
+def finish(cell: Cell) -> None:
+    """A run folder as a finished run leaves it."""
+    cell.folder.mkdir(parents=True)
+    write_config(cell.folder / "config.yaml", cell.config)
+    steps = cell.config["iterations"]
+    (cell.folder / "evaluation.json").write_text(json.dumps({"step": steps, "psnr": 20.0, "views": []}))
+    (cell.folder / "status.json").write_text(json.dumps({"state": "ok", "step": steps}))
+
+
+def test_controls_go_first_and_leave_their_state_where_others_set_out(tmp_path: Path) -> None:
+    """Of 2,000 steps pseudo views begin at 10/40 = 500, 20/40 = 1,000 and 22/40 = 1,100."""
+    table = experiment()
+    plan = planned(table, DATASETS, cells(table, tmp_path))
+    assert words_of(plan) == [
+        [("3d_gs", "[]"), ("octree_gs", "[500,1000,1100]")],
+        [("octree_ub", "[500,1000,1100]"), ("octree_ub_start_10k", "[500,1000,1100]"),
+         ("octree_up", "[500,1000,1100]")],
+    ]  # fmt: skip
+    assert (plan.done, plan.steps, plan.shared) == (0, 5 * 2000, 500 + 1000 + 1100)
+    assert "2,600 of 10,000 steps are saved" in told(plan)[1]
+
+
+def test_without_a_control_the_one_that_begins_last_leads(tmp_path: Path) -> None:
+    table = experiment(only=["UP", "early"])
+    plan = planned(table, DATASETS, cells(table, tmp_path))
+    assert words_of(plan) == [[("octree_up", "[500]")], [("octree_ub_start_10k", "[500]")]]
+
+
+def test_what_is_finished_is_left_out_whoever_asked_for_it(tmp_path: Path) -> None:
+    """UB and `same` are one run, under whichever name it was trained."""
+    table = experiment(only=["UB", "same", "UP"])
+    every = cells(table, tmp_path)
+    assert every[1].row == "UB"
+    assert every[1].folder == every[2].folder
+    finish(every[2])
+    plan = planned(table, DATASETS, every)
+    assert (plan.done, words_of(plan)) == (1, [[("octree_up", "[]")]])
+
+
+def test_a_run_judged_otherwise_is_due_again_and_a_failed_one_too(tmp_path: Path) -> None:
+    table = experiment(only=["other"])
+    (cell,) = cells(table, tmp_path)
+    finish(cell)
+    assert planned(table, DATASETS, [cell]).done == 1
+    assert planned(table, DATASETS, cells(table, tmp_path, "eval.zoom=[1,8]")).done == 0
+    (cell.folder / "status.json").write_text(json.dumps({"state": "failed", "step": 5}))
+    assert planned(table, DATASETS, [cell]).done == 0
+
+
+def test_seeds_share_nothing(tmp_path: Path) -> None:
+    table = experiment(only=["control", "UP"], seeds=[0, 1])
+    plan = planned(table, DATASETS, cells(table, tmp_path))
+    assert [len(phase) for phase in plan.phases] == [2, 2]
+    assert len({cell.folder for cell in plan.cells}) == 4
+
+
+def test_a_composition_is_named_by_what_is_trained_alone() -> None:
+    with Compositions(plugins()) as compositions:
+
+        def key(*words: str) -> str:
+            return composition_key(compositions.settings(["scene=demo", *words]).resolved)
+
+        plain = key()
+        for word in ("output=elsewhere", "device=cpu", "init=trunk", "trunk_at=[3]", "eval.zoom=[1,2]", "reuse=true",
+                     "training.log_every=3", "regenerator/upscale=lanczos", "length=900"):  # fmt: skip
+            assert key(word) == plain, word
+        for word in ("seed=1", "iterations=901", "backbone=scaffold", "augmenter=upscale", "scene.samples=7",
+                     "rasterizer.tile_size=16", "training.ssim_weight=0.1"):  # fmt: skip
+            assert key(word) != plain, word
+        upscaled = key("augmenter=upscale")
+        assert key("augmenter=upscale", "regenerator/restore=identity") == upscaled  # nobody asks for it
+        assert key("augmenter=upscale", "regenerator/upscale=lanczos") != upscaled
+        assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
+        config = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"]).resolved
+    assert place_of(config) == Path("o/my_scene/gs3d") / composition_key(config)
+
+
+def test_a_folder_is_claimed_by_one_at_a_time(tmp_path: Path) -> None:
+    with claimed(tmp_path / "run") as first, claimed(tmp_path / "run") as second:
+        assert (first, second) == (True, False)
+    with claimed(tmp_path / "run") as again:
+        assert again
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed=0,1"], "experiment.seeds="),
+        (["experiment.only=[3DGS]"], "Did you mean '3D-GS'"),
+        (["experiment.scenes=[demmo]"], "Did you mean 'demo'"),
+        (["experiment.seeds=[]"], "at least one"),
+        (["backbone.voxxel=1"], "no configuration key"),
+        (["hydra/launcher=slurrm"], "slurrm"),
+    ],
+)
+def test_mistakes_are_named_before_anything_runs(words: list[str], message: str, tmp_path: Path) -> None:
+    def job(config: Any) -> None:
+        raise AssertionError("nothing must run")
+
+    from gsx.core.errors import ConfigError
+
+    with pytest.raises(ConfigError, match=message):
+        run_table(["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", *words], plugins(), job)
+    assert not list(tmp_path.iterdir())
