@@ -68,6 +68,8 @@ class Settings:
     """By name, in the order of the command line."""
     regenerators: dict[str, Chosen]
     """By role: upscale, restore. Only those that an augmenter asks for are built."""
+    trackers: dict[str, Chosen]
+    """By name, in the order of the command line."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
 
@@ -212,6 +214,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = dict(raw)
     augmenters, regenerators = (named_nodes(values.pop(kind, None), kind) for kind in ("augmenter", "regenerator"))
+    trackers = named_nodes(values.pop("tracker", None), "tracker")
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
     return Settings(
@@ -223,6 +226,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         backbone=chosen("backbone", parts["backbone"], plugins),
         augmenters={name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()},
         regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
+        trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
         resolved=raw,  # type: ignore[arg-type]
     )
 

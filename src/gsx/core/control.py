@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.run_files import RunFiles, is_number, part
 
-BESIDE = ("augmenter", "regenerator", "folder", "output", "init", "trunk_gb", "eval", "metrics", "seed")
+BESIDE = ("augmenter", "regenerator", "tracker", "folder", "output", "init", "trunk_gb", "eval", "metrics", "seed")
 """Keys in which a run may differ from its control, and runs of one comparison from each other (the seed)."""
 
 

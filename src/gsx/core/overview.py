@@ -17,8 +17,8 @@ from gsx.core.run_files import STATES, RunFiles, gain_of, is_number, part, read_
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
-UNTOLD = ("folder", "output", "device")
-"""Keys that say where a run ran, not what it is."""
+UNTOLD = ("folder", "output", "device", "tracker")
+"""Keys that say where a run ran and who was told, not what it is."""
 LABEL = 32
 """Longest name beside a point."""
 FIELDS = (
@@ -123,9 +123,11 @@ def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted keys and values, without UNTOLD."""
     out: dict[str, Any] = {}
     for key, value in node.items():
+        if f"{prefix}{key}" in UNTOLD:
+            continue
         if isinstance(value, dict):
             out |= flattened(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in UNTOLD:
+        else:
             out[f"{prefix}{key}"] = value
     return out
 

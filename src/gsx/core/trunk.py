@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 """Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
 (spec 1.8)."""
-BESIDE = ("augmenter", "regenerator", "eval", "metrics", "folder", "output", "init", "trunk_gb")
+BESIDE = ("augmenter", "regenerator", "tracker", "eval", "metrics", "folder", "output", "init", "trunk_gb")
 """Keys of a composition that change nothing before the first pseudo views."""
 WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
 """Keys of `training` that change nothing at all."""
