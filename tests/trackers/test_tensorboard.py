@@ -1,10 +1,12 @@
 """TensorBoard's own reader finds what metrics.jsonl and evaluation.json hold."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer.record_writer import RecordWriter
 from tiny import StopAfter, tiny_run, tiny_settings
 
 from gsx.cli import plugins
@@ -105,22 +107,28 @@ def test_lines_of_a_trunk_are_written_too(tmp_path: Path, monkeypatch: pytest.Mo
     assert lines(tmp_path / "second")[0]["step"] == 1
 
 
-def test_lines_are_on_disk_when_they_are_written(tmp_path: Path) -> None:
+def test_lines_are_on_disk_when_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Look:
-        """Reads at step 9, and hears of it after the tracker."""
+        """Reads at step 8, and hears of it after the tracker."""
 
         steps: list[int]
 
         @hookimpl(trylast=True)
         def gsx_step_finished(self, run: Run) -> None:
-            if run.step == 9:
+            if run.step == 8:
                 Look.steps = [point.step for point in read(run.folder / "tensorboard").Scalars("loss")]
 
+    def slow(writer: RecordWriter, data: bytes) -> None:
+        time.sleep(0.02)  # another thread writes; it must be waited for
+        write(writer, data)
+
+    write = RecordWriter.write
+    monkeypatch.setattr(RecordWriter, "write", slow)
     settings, loaded = tiny_settings(tmp_path / "run", *RUN), plugins()
     run = start(settings, loaded)
     with loaded.listening([Look(), StopAfter(10)]):
         execute(run, settings, loaded)
-    assert Look.steps == [line["step"] for line in lines(tmp_path / "run") if line["step"] <= 9]
+    assert Look.steps == [line["step"] for line in lines(tmp_path / "run") if line["step"] <= 8]
 
 
 def test_why_a_run_failed_is_said(tmp_path: Path) -> None:
