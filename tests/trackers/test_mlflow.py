@@ -115,13 +115,17 @@ def test_a_killed_run_goes_on_without_doubled_points(output: Path) -> None:
     assert all([step for step, _ in found[name]] == [step for step, _ in expected[name]] for name in timed)
 
 
-def test_a_run_that_goes_on_elsewhere_is_begun_there_with_all_its_points(output: Path, tmp_path: Path) -> None:
+def test_a_run_that_goes_on_elsewhere_is_begun_there_with_all_its_points(
+    output: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     folder = output / "moved"
     tiny_run(folder, (*RUN, f"output={output}"), stop_after=11)
     run, settings = open_run(folder, plugins(), [f"tracker.mlflow.uri=sqlite:///{tmp_path / 'other.db'}"])
     execute(run, settings, plugins())
     assert json.loads((folder / "mlflow.json").read_text())["uri"] == f"sqlite:///{tmp_path / 'other.db'}"
     assert curves(folder) == expected_curves(folder)
+    assert {path.name for path in tmp_path.iterdir()} == {"other.db", "mlflow_files", ".mlflow.lock"}
 
 
 class Raises:

@@ -92,7 +92,7 @@ class MLflow:
 
     def begin(self, run: Run, uri: str) -> None:
         """A new run, with its parameters."""
-        experiment = experiment_id(self.client, self.options, run)
+        experiment = experiment_id(self.client, uri, self.options.experiment or run.scene.name)
         tags = {"gsx.folder": str(run.folder.resolve()), "gsx.device": device_name(run.device)}
         self.run_id = self.client.create_run(experiment, tags=tags, run_name=run.folder.name).info.run_id
         write_json(run.folder / KEPT, {"uri": uri, "run": self.run_id})
@@ -182,12 +182,12 @@ def own_store(run: Run) -> str:
     return f"{SQLITE}{Path(run.config['output']).resolve() / 'mlflow.db'}"
 
 
-def experiment_id(client: Any, options: MLflowOptions, run: Run) -> str:
-    """The experiment's id; it is made if it is missing, with its files in the output folder if the store lies there."""
+def experiment_id(client: Any, uri: str, name: str) -> str:
+    """The experiment's id; made if it is missing, with its files beside a database, else where a server has them."""
     from mlflow.exceptions import MlflowException
 
-    name = options.experiment or run.scene.name
-    files = None if options.uri else (Path(run.config["output"]).resolve() / "mlflow_files" / name).as_uri()
+    local = uri.startswith(SQLITE)  # MLflow's own choice is the current folder
+    files = (Path(uri.removeprefix(SQLITE)).parent.resolve() / "mlflow_files" / name).as_uri() if local else None
     try:
         return client.create_experiment(name, artifact_location=files)
     except MlflowException as error:
