@@ -7,7 +7,7 @@ from gsx.core.plugins import Registry, hookimpl
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    """Scenes, backbones, augmenters and regenerators of gsx itself."""
+    """Scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
     from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
     from gsx.backbones.anchors import NeuralOptions, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
@@ -22,6 +22,8 @@ def gsx_register(registry: Registry) -> None:
     from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
+    from gsx.trackers.mlflow import MLflow, MLflowOptions
+    from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
     registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions)
@@ -49,3 +51,5 @@ def gsx_register(registry: Registry) -> None:
     registry.add("regenerator", "sd_x2_latent", partial(Diffusion, SD_X2_LATENT), UpscalerOptions)
     registry.add("regenerator", "sd_x4", partial(Diffusion, SD_X4), UpscalerOptions)
     registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)
+    registry.add("tracker", "tensorboard", TensorBoard, TensorBoardOptions)
+    registry.add("tracker", "mlflow", MLflow, MLflowOptions)

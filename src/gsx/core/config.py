@@ -123,6 +123,8 @@ class Settings:
     regenerators: dict[str, Chosen]
     """By role: upscale, restore. Only those that an augmenter asks for are built."""
     dataset: Dataset | None
+    trackers: dict[str, Chosen]
+    """By name, in the order of the command line."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
 
@@ -333,6 +335,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if budget is not None:
         typed(Budget, budget, "budget")
     augmenters, regenerators = (named_nodes(values.pop(kind, None), kind) for kind in ("augmenter", "regenerator"))
+    trackers = named_nodes(values.pop("tracker", None), "tracker")
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
     return Settings(
@@ -345,6 +348,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         augmenters={name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()},
         regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
+        trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
         resolved={key: value for key, value in raw.items() if key != "experiment"},  # type: ignore[misc]
     )
 
@@ -356,8 +360,8 @@ def refuse_unknown_scene(config: Any) -> None:
     known = list(dataset.get("scenes") or {})
     if dataset and (name := str(dataset.get("scene"))) not in known:
         raise ConfigError(
-            f"dataset.scene is '{name}'; {dataset.get('title')} has {', '.join(known) or 'no scenes: name them, +dataset.scenes.FOLDER=NAME'}."
-            f"{nearest(name, known)}"
+            f"dataset.scene is '{name}'; {dataset.get('title')} has "
+            f"{', '.join(known) or 'no scenes: name them, +dataset.scenes.FOLDER=NAME'}.{nearest(name, known)}"
         )
 
 

@@ -185,9 +185,11 @@ def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted keys and values, without those that say where a run ran."""
     out: dict[str, Any] = {}
     for key, value in node.items():
+        if f"{prefix}{key}" in (*WHERE, "length"):
+            continue
         if isinstance(value, dict):
             out |= flattened(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in (*WHERE, "length"):
+        else:
             out[f"{prefix}{key}"] = value
     return out
 

@@ -23,7 +23,7 @@ GROUP = "gsx"
 """Entry-point group and pluggy project name."""
 BLOCK = "GSX_NO_PLUGINS"
 """Environment variable: when set and not empty, only built-ins are loaded."""
-KINDS = ("scene", "backbone", "augmenter", "regenerator")
+KINDS = ("scene", "backbone", "augmenter", "regenerator", "tracker")
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -114,6 +114,10 @@ class Hooks:
     @hookspec
     def gsx_run_finished(self, run: "Run") -> None:
         """Everything of the run is on disk."""
+
+    @hookspec
+    def gsx_run_failed(self, run: "Run", reason: str) -> None:
+        """Training or what follows it ended with an error, or with a second Ctrl-C (KeyboardInterrupt: ...)."""
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ from gsx.core.run import Run, Sampler, Step
 from gsx.core.run_files import read_run
 from gsx.core.scene import Scene, View
 from gsx.core.shapes import Float
+from gsx.core.tracking import build_trackers, telling_of_failure
 from gsx.core.trainer import train
 
 logger = logging.getLogger(__name__)
@@ -255,6 +256,7 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     choose_device(settings.general.device)
     refuse_used(settings.general.folder)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
+    build_trackers(settings.trackers)  # the same: a missing package
     run = build(settings, load_scene(settings), Path(), training=True)
     run.folder = new_folder(settings, run.scene)
     try:
@@ -398,16 +400,17 @@ def status(run: Run, state: str, reason: str = "") -> None:
 
 def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint."""
+    trackers = build_trackers(settings.trackers)
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
     log = MetricsLog(settings.evaluation)
-    listeners: list[object] = [Guard(), log, Checkpointer(), Progress()]
+    listeners: list[object] = [Guard(), log, *trackers, Checkpointer(), Progress()]  # trackers read what log has kept
     if run.trunk is not None:
         general = settings.general
         listeners.append(trunk.TrunkKeeper(run.trunk, general.trunk_gb * 1e9, general.trunk_at))
     try:
-        with plugins.listening(listeners):
+        with plugins.listening(listeners), telling_of_failure(run, plugins):
             train(run, plugins)
             if run.complete:
                 finish(run, settings, plugins)

@@ -1,0 +1,116 @@
+"""TensorBoard: the lines of metrics.jsonl as curves, figures of the evaluation, test pictures and the configuration."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsx.core.files import read_json
+from gsx.core.images import read_image
+from gsx.core.plugins import hookimpl
+from gsx.core.run import Run
+from gsx.core.tracking import require
+from gsx.trackers.figures import evaluation_figures, line_figures
+
+
+@dataclass(frozen=True, kw_only=True)
+class TensorBoardOptions:
+    """Options of the tracker; values in conf/tracker/tensorboard.yaml."""
+
+    name: str
+    folder: str
+    """Where runs are written, each to a folder of its own; empty: `tensorboard` in the run folder."""
+    pictures: int
+    """Test views that are shown beside their truth when the run is evaluated."""
+
+    def __post_init__(self) -> None:
+        if self.pictures < 0:
+            raise ValueError(f"tracker.tensorboard.pictures is {self.pictures}; give a number from 0")
+
+
+class TensorBoard:
+    """Listener: writes event files.
+
+    Raises:
+        ConfigError: tensorboard is not installed.
+    """
+
+    def __init__(self, options: TensorBoardOptions) -> None:
+        require("tensorboard", ("tensorboard",), "gsx[tensorboard]")
+        self.options = options
+        self.writer: Any = None
+        self.sent = 0
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Open an event file; one that goes on hides what earlier ones hold after the checkpoint."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        folder = events_folder(run, self.options.folder)
+        begun = any(folder.glob("events.out.tfevents.*"))
+        self.writer = SummaryWriter(str(folder), purge_step=run.step + 1 if begun else None)
+        self.sent = len(run.curves) if begun else 0
+        self.writer.add_text("config", indented((run.folder / "config.yaml").read_text()), run.step)
+        self.send(run)
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        """Write what metrics.jsonl has got."""
+        self.send(run)
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Close the file of a run that was interrupted."""
+        if not run.complete:
+            self.writer.close()
+
+    @hookimpl
+    def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
+        """Write figures and pictures."""
+        for tag, value in evaluation_figures(evaluation).items():
+            self.writer.add_scalar(tag, value, evaluation["step"])
+        for tag, path in pictures(run.folder / "renders", self.options.pictures).items():
+            self.writer.add_image(tag, read_image(path), evaluation["step"])
+
+    @hookimpl
+    def gsx_run_finished(self) -> None:
+        """Close the file."""
+        self.writer.close()
+
+    @hookimpl
+    def gsx_run_failed(self, run: Run, reason: str) -> None:
+        """Say why, and close the file."""
+        self.writer.add_text("failed", indented(reason), run.step)
+        self.writer.close()
+
+    def send(self, run: Run) -> None:
+        """Write new lines, and onto the disk at once: what a checkpoint covers must be there when a run goes on."""
+        lines = run.curves[self.sent :]
+        for line in lines:
+            for tag, value in line_figures(line).items():
+                self.writer.add_scalar(tag, value, int(line["step"]))
+        self.sent = len(run.curves)
+        if lines:
+            self.writer.flush()
+
+
+def events_folder(run: Run, folder: str) -> Path:
+    """Where a run's event files go; below `folder` it lies as it does below `output`."""
+    if not folder:
+        return run.folder / "tensorboard"
+    own, output = run.folder.resolve(), Path(run.config["output"]).resolve()
+    return Path(folder).expanduser() / (own.relative_to(output) if own.is_relative_to(output) else own.name)
+
+
+def pictures(renders: Path, count: int) -> dict[str, Path]:
+    """Pictures of the first `count` test views that were drawn, by tag."""
+    views = read_json(renders / "index.json")["views"][:count]
+    return {
+        f"{view['name']}/{kind}": renders / Path(view["files"][kind]).name
+        for view in views
+        for kind in ("render", "truth")
+    }
+
+
+def indented(text: str) -> str:
+    """Text that Markdown leaves as it is."""
+    return "".join(f"    {line}\n" for line in text.splitlines())
