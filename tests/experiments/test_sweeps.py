@@ -31,7 +31,7 @@ def own_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def rows(folder: Path) -> list[dict[str, str]]:
     """Lines of the table's CSV with a PSNR."""
     (path,) = folder.glob("outputs/experiments/*/table.csv")
-    return [line for line in csv.DictReader(path.open()) if line["metric"] == "PSNR"]
+    return [line for line in csv.DictReader(path.read_text().splitlines()) if line["metric"] == "PSNR"]
 
 
 def run_of(folder: Path, variant: str) -> Path:
@@ -117,7 +117,7 @@ def test_a_multirun_over_processes_reports_its_failure_and_divides_the_threads(
     (report,) = (Path(line) for line in capsys.readouterr().out.splitlines() if line.endswith("report.html"))
     records = [json.loads(path.read_text()) for path in sorted((report.parent / "jobs").glob("*.json"))]
     assert [record["code"] for record in records] == [0, 2, 0, 2]
-    listed = list(csv.DictReader((report.parent / "report.csv").open()))
+    listed = list(csv.DictReader((report.parent / "report.csv").read_text().splitlines()))
     assert [line["state"] for line in listed] == ["ok", "ok"]
     assert {line["variant"] for line in listed} == {"3d_gs"}
     for record in records[::2]:

@@ -120,6 +120,8 @@ def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: 
            "regenerator": {"upscale": {"name": "lanczos"}, "restore": {"name": "other"}},
            "scene": {"name": "colmap", "path": "/b", "max_width": 400}, "training": {"log_every": 1}}  # fmt: skip
     assert protocol_differences([(paper, paper)]) == []
+    longer = ({**own, "iterations": 5}, {**paper, "iterations": 50})
+    assert "iterations=4, 5 (paper: 40, 50)" in protocol_differences([(own, paper), longer])
     assert sorted(protocol_differences([(own, paper), (own, paper)])) == [
         "iterations=4 (paper: 40)",
         "regenerator.upscale.name=lanczos (paper: sd)",  # of another component only its name; restore is not used

@@ -288,23 +288,32 @@ def notes_of(
 
 def protocol_differences(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:
     """In which keys compositions (as run, as published) differ, each with its values, those of most rows first."""
-    told: dict[str, int] = {}
+    found: dict[str, list[tuple[str, str]]] = {}
     for own, paper in pairs:
-        for key, value in differing(own, paper):
-            told[f"{key}={value}"] = told.get(f"{key}={value}", 0) + 1
-    ranked = sorted(told, key=lambda text: -told[text])
-    more = [f"and {len(ranked) - SHOWN_KEYS} more"] if len(ranked) > SHOWN_KEYS else []
-    return ranked[:SHOWN_KEYS] + more
+        for key, ours, theirs in differing(own, paper):
+            found.setdefault(key, []).append((ours, theirs))
+    ranked = sorted(found, key=lambda key: -len(found[key]))
+    told = []
+    for key in ranked:
+        ours, theirs = zip(*found[key], strict=True)
+        told.append(f"{key}={listed(ours)} (paper: {listed(theirs)})")
+    more = [f"and {len(told) - SHOWN_KEYS} more"] if len(told) > SHOWN_KEYS else []
+    return told[:SHOWN_KEYS] + more
 
 
-def differing(own: dict[str, Any], paper: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Keys whose values differ, with "ours (paper: theirs)"; of a component that is another one only its name."""
+def listed(values: Sequence[str]) -> str:
+    """Different values, in order."""
+    return ", ".join(dict.fromkeys(values))
+
+
+def differing(own: dict[str, Any], paper: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
     mine, theirs = (flattened(judged(config)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
     for key in dict.fromkeys([*mine, *theirs]):
         inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)
         if mine.get(key) != theirs.get(key) and not inside:
-            yield key, f"{mine.get(key, 'absent')} (paper: {theirs.get(key, 'absent')})"
+            yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
 
 
 def judged(config: dict[str, Any]) -> dict[str, Any]:
