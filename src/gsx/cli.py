@@ -3,12 +3,13 @@
 import argparse
 import errno
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from gsx import __version__
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
@@ -39,6 +40,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
 
   gsx --cfg job             print the configuration instead of training
   gsx -m K=V1,V2 ...        a run for every combination
+  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/clusters.md)
   gsx --version, gsx --help
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
@@ -63,21 +65,48 @@ HYDRA_FLAGS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if processes() > 1:
+        from gsx.core.distributed import as_one
+
+        return as_one(lambda: dispatch_together(words), explained)
     try:
         return dispatch(words)
-    except GsxError as error:
+    except BaseException as error:
+        return explained(error)
+
+
+def explained(error: BaseException) -> int:
+    """The exit code of an error that people can mend, which is shown; others are raised again."""
+    if isinstance(error, GsxError):
         return complain(str(error))
-    except OSError as error:
+    if isinstance(error, OSError):
         return complain(os_sentence(error))
-    except KeyboardInterrupt:
-        sys.stderr.write("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n")
+    if isinstance(error, KeyboardInterrupt):
+        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", sys.stderr)
         return INTERRUPTED
+    raise error
 
 
 def complain(sentence: str) -> int:
     """Show an error as one sentence."""
-    sys.stderr.write(f"gsx: {sentence}\n")
+    say(f"gsx: {sentence}\n", sys.stderr)
     return 2
+
+
+def processes() -> int:
+    """How many processes torchrun has started for this run; 1 without it."""
+    return int(os.environ.get("WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
+
+
+def speaks() -> bool:
+    """Whether this process is the one that is heard: of torchrun's the first."""
+    return processes() == 1 or os.environ["RANK"] == "0"
+
+
+def say(text: str, stream: TextIO) -> None:
+    """Write to a stream, once for all processes."""
+    if speaks():
+        stream.write(text)
 
 
 def os_sentence(error: OSError) -> str:
@@ -85,6 +114,18 @@ def os_sentence(error: OSError) -> str:
     where = f" ({error.filename})" if error.filename else ""
     remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
     return f"{error.strerror or error}{where}: {remedy}, or choose a writable place, for example output=FOLDER"
+
+
+def dispatch_together(words: list[str]) -> int:
+    """Train or resume on several processes.
+
+    Raises:
+        ConfigError: anything else is asked for.
+    """
+    if any(word.startswith("-") for word in words) or (words[:1] and words[0] in VERBS and words[0] != "resume"):
+        asked = " ".join(words[:2])
+        raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
+    return dispatch(words)
 
 
 def dispatch(words: list[str]) -> int:
@@ -116,12 +157,15 @@ def set_up_logging() -> None:
     root.propagate = False
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Plain())
-    root.handlers = [handler]
+    root.handlers = [handler] if speaks() else [logging.NullHandler()]
 
 
 @contextmanager
 def logged_to(folder: Path) -> Iterator[None]:
     """Also write messages to the run's log.txt."""
+    if not speaks():
+        yield
+        return
     handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
@@ -228,12 +272,12 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
-        sys.stderr.write(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n")
+        say(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
         return INTERRUPTED
     if not run.complete:
-        sys.stderr.write(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n")
+        say(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
         return INTERRUPTED
-    sys.stdout.write(f"{run.folder / 'report.html'}\n")
+    say(f"{run.folder / 'report.html'}\n", sys.stdout)
     return 0
 
 
@@ -254,7 +298,8 @@ def verb_resume(words: list[str]) -> int:
     run, settings = open_run(folder, loaded, overrides, training=True)
     if run.complete and (folder / "evaluation.json").is_file():
         raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
-    write_config(folder / "config.yaml", settings.resolved)
+    if run.ranks.first:
+        write_config(folder / "config.yaml", settings.resolved)
     logger.info("resuming %s at step %d", folder, run.step)
     return carry_out(run, settings, loaded)
 

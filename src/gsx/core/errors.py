@@ -34,6 +34,6 @@ def nearest(word: str, options: Iterable[str]) -> str:
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """First line of an error's message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
