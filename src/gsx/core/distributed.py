@@ -188,7 +188,7 @@ def exchange(word: Any) -> list[Any]:
         dist.all_gather_object(words, word)
     except RuntimeError as error:
         raise TrainingError(
-            f"another process of this run is gone ({first_line(error)}): what it said last is above; "
-            "start all of them again with gsx resume RUN"
+            "another process of this run has died without a word (killed, perhaps for want of memory): go on with gsx "
+            "resume RUN, on all of them"
         ) from error
     return words

@@ -28,6 +28,10 @@ class TrainingError(GsxError):
     """Training cannot go on, for example after three non-finite steps in a row."""
 
 
+class Disagreement(TrainingError):
+    """The processes of one run hold different models, of which none may become a checkpoint."""
+
+
 def nearest(word: str, options: Iterable[str]) -> str:
     """` Did you mean 'x'?` for the closest option, or an empty string when nothing is close."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)

@@ -8,7 +8,7 @@ import logging
 
 import torch
 
-from gsx.core.errors import TrainingError
+from gsx.core.errors import Disagreement, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
@@ -66,13 +66,13 @@ class Agreement:
         """Compare digests when due.
 
         Raises:
-            TrainingError: they differ.
+            Disagreement: they differ.
         """
         due = run.step % run.training.checkpoint_every == 0 or run.complete
         if due and run.ranks.size > 1 and len(set(run.ranks.everyone(digest(run)))) > 1:
-            raise TrainingError(
-                f"ranks disagree at step {run.step}: their models have drifted apart, and none of them can be trusted; "
-                f"go on from the last checkpoint with gsx resume {run.folder}"
+            raise Disagreement(
+                f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
+                f"checkpoint before, if there is one, with gsx resume {run.folder}"
             )
 
 

@@ -24,7 +24,7 @@ from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
 from gsx.core.distributed import placed, ranks_here, refuse_uneven
-from gsx.core.errors import ConfigError, InputError, TrainingError, nearest
+from gsx.core.errors import ConfigError, Disagreement, InputError, TrainingError, nearest
 from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
@@ -384,7 +384,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
             if run.complete:
                 finish(run, settings, plugins)
     except TrainingError as error:
-        checkpoint.save(run)
+        if not isinstance(error, Disagreement):
+            checkpoint.save(run)
         status(run, "failed", str(error))
         raise
     except BaseException as error:
