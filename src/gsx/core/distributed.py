@@ -5,10 +5,11 @@ next word, so that nobody waits for it in vain; tensors are therefore exchanged 
 """
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -147,8 +148,8 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
-def as_one(action: Callable[[], int], explained: Callable[[BaseException], int]) -> int:
-    """The exit code of what the processes of torchrun do together: that of the first, once all are done.
+def as_one(action: Callable[[], int], explained: Callable[[BaseException], int]) -> NoReturn:
+    """Do something with the other processes of torchrun, and end with the exit code of the first, once all are done.
 
     `explained` shows an error and returns its code, or raises it again.
     """
@@ -162,8 +163,14 @@ def as_one(action: Callable[[], int], explained: Callable[[BaseException], int])
         code = explained(error)
     finally:
         code = leave(Left(code=code, reason=reason))
-        dist.destroy_process_group()
-    return code
+    end(code)
+
+
+def end(code: int) -> NoReturn:
+    """End this process at once: while its interpreter is taken down, threads of the group now and then abort it."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def leave(word: Left) -> int:
