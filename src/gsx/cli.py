@@ -3,13 +3,14 @@
 import argparse
 import errno
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from gsx import __version__
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
@@ -43,6 +44,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
   gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
   gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
+  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/clusters.md)
   gsx --version, gsx --help
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
@@ -69,21 +71,48 @@ HYDRA_FLAGS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if processes() > 1:
+        from gsx.core.distributed import as_one
+
+        return as_one(lambda: dispatch_together(words), explained)
     try:
         return dispatch(words)
-    except GsxError as error:
+    except BaseException as error:
+        return explained(error)
+
+
+def explained(error: BaseException) -> int:
+    """The exit code of an error that people can mend, which is shown; others are raised again."""
+    if isinstance(error, GsxError):
         return complain(str(error))
-    except OSError as error:
+    if isinstance(error, OSError):
         return complain(os_sentence(error))
-    except KeyboardInterrupt:
-        sys.stderr.write("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n")
+    if isinstance(error, KeyboardInterrupt):
+        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", sys.stderr)
         return INTERRUPTED
+    raise error
 
 
 def complain(sentence: str) -> int:
     """Show an error as one sentence."""
-    sys.stderr.write(f"gsx: {sentence}\n")
+    say(f"gsx: {sentence}\n", sys.stderr)
     return 2
+
+
+def processes() -> int:
+    """How many processes torchrun has started for this run; 1 without it."""
+    return int(os.environ.get("WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
+
+
+def speaks() -> bool:
+    """Whether this process is the one that is heard: of torchrun's the first."""
+    return processes() == 1 or os.environ["RANK"] == "0"
+
+
+def say(text: str, stream: TextIO) -> None:
+    """Write to a stream, once for all processes."""
+    if speaks():
+        stream.write(text)
 
 
 def os_sentence(error: OSError) -> str:
@@ -91,6 +120,22 @@ def os_sentence(error: OSError) -> str:
     where = f" ({error.filename})" if error.filename else ""
     remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
     return f"{error.strerror or error}{where}: {remedy}, or choose a writable place, for example output=FOLDER"
+
+
+def dispatch_together(words: list[str]) -> int:
+    """Train or resume on several processes.
+
+    Raises:
+        ConfigError: anything else is asked for.
+    """
+    if any(word.startswith("-") for word in words) or (words[:1] and words[0] in VERBS and words[0] != "resume"):
+        asked = " ".join(words[:2])
+        raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
+    from gsx.experiments.sweep import is_table
+
+    if is_table(words):
+        raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
+    return dispatch(words)
 
 
 def dispatch(words: list[str]) -> int:
@@ -122,12 +167,15 @@ def set_up_logging() -> None:
     root.propagate = False
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Plain())
-    root.handlers = [handler]
+    root.handlers = [handler] if speaks() else [logging.NullHandler()]
 
 
 @contextmanager
 def logged_to(folder: Path) -> Iterator[None]:
     """Also write messages to the run's log.txt."""
+    if not speaks():
+        yield
+        return
     handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
@@ -174,7 +222,8 @@ def interruptible(run: "Run") -> Iterator[object]:
         def gsx_training_finished(self) -> None:
             give_back()
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *STOPPING)}
+    alone = STOPPING if processes() == 1 else ()  # torchrun ends its processes itself, some while they wait for others
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *alone)}
     try:
         yield UntilTrained()
     finally:
@@ -301,6 +350,8 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     from gsx.core.identity import claimed, place_of
     from gsx.core.session import pursue
 
+    if processes() > 1:
+        raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
     folder = place_of(settings.resolved)
     folders.append(folder)
     with claimed(folder) as alone:
@@ -321,12 +372,12 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
-        sys.stderr.write(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n")
+        say(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
         return INTERRUPTED
     if not run.complete:
-        sys.stderr.write(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n")
+        say(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
         return INTERRUPTED
-    sys.stdout.write(f"{run.folder / 'report.html'}\n")
+    say(f"{run.folder / 'report.html'}\n", sys.stdout)
     return 0
 
 
@@ -347,7 +398,8 @@ def verb_resume(words: list[str]) -> int:
     run, settings = open_run(folder, loaded, overrides, training=True)
     if run.complete and (folder / "evaluation.json").is_file():
         raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
-    write_config(folder / "config.yaml", settings.resolved)
+    if run.ranks.first:
+        write_config(folder / "config.yaml", settings.resolved)
     logger.info("resuming %s at step %d", folder, run.step)
     return carry_out(run, settings, loaded)
 

@@ -325,7 +325,7 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
         regulariser = model.regulariser()
         assert regulariser is None or float(regulariser.detach()) == 0
         assert all(not gradient.any() for _, gradient in model.gradients())
-        model.observe(rendering, 1000)
+        model.record(model.observe(rendering, 1000))
         assert model.table["visits"].sum() == len(model.last[1].rows)
         assert model.adapt(1000) == {}
         model.update()
@@ -371,7 +371,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
                 slot = int(decoded.slots[splat])
                 wanted[2][slot] += math.hypot(x * camera.width / 2, y * camera.height / 2)
                 wanted[3][slot] += 1
-        backbone.observe(rendering, 1000)
+        backbone.record(backbone.observe(rendering, 1000))
         backbone.discard()
     for column, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(backbone.table[column].flatten(), torch.tensor(values))
@@ -384,7 +384,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
 def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: bool) -> None:
     backbone = small_anchors("scaffold")
     backbone.begin(step)
-    backbone.observe(render(backbone, backbone.cameras[0]), step)
+    backbone.record(backbone.observe(render(backbone, backbone.cameras[0]), step))
     assert bool(backbone.table["visits"].any()) == counts
 
 

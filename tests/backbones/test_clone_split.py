@@ -355,7 +355,7 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
     backbone.table["level"].copy_(torch.arange(len(backbone.table)) % 3)
     backbone.begin(1)
     rendering = render(backbone, seen_from(30.0))
-    backbone.observe(rendering, 1)
+    backbone.record(backbone.observe(rendering, 1))
     coarse = backbone.table["level"] == 0
     assert backbone.statistics.count[coarse].sum() > 10
     assert not backbone.statistics.count[~coarse].any()

@@ -56,7 +56,7 @@ def trained(backbone: Backbone, scene: Scene) -> list[float]:
         extra = backbone.regulariser()
         loss = loss if extra is None else loss + extra
         loss.backward()
-        backbone.observe(rendering, step)
+        backbone.record(backbone.observe(rendering, step))
         backbone.adapt(step)
         backbone.update()
         losses.append(float(loss.detach()))

@@ -186,8 +186,8 @@ def seen_as(backbone: GS3D, ids: list[int], radii: list[int], gradients: list[li
 def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     # half the raster is (12, 8) px: the norms are 60, 15 (unseen: radius 0) and then 20 with the opposite sign
-    backbone.observe(seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1)
-    backbone.observe(seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2)
+    backbone.record(backbone.observe(seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
+    backbone.record(backbone.observe(seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
     assert backbone.statistics.count.tolist() == [2, 0, 1]
     expected = torch.tensor([(math.hypot(36, 48) + math.hypot(12, 16)) / 2, 0.0, 4.0])
     torch.testing.assert_close(backbone.statistics.mean_gradient(), expected)
@@ -195,8 +195,8 @@ def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() ->
 
 def test_statistics_end_with_density_control() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
-    backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999)
-    backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000)
+    backbone.record(backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
+    backbone.record(backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
     assert backbone.statistics.count.tolist() == [1, 0, 0]
 
 
@@ -435,7 +435,7 @@ def step_on(backbone: GS3D, step: int) -> dict[str, int]:
     backbone.begin(step)
     picture = rasterize(backbone.splats(seen), seen, RasterSettings())
     photometric(picture.image, target, 0.2).backward()
-    backbone.observe(picture, step)
+    backbone.record(backbone.observe(picture, step))
     done = backbone.adapt(step)
     backbone.update()
     return done

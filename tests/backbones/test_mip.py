@@ -409,7 +409,7 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
             truth.index_add_(0, screen.ids, by_mean[:, 0] * 12 / 2 + by_mean[:, 1] * 8 / 2)
         picture = rasterize(backbone.splats(small), small, backbone.raster, absolute_gradient=True)
         (picture.image * weights).sum().backward()
-        backbone.observe(picture, number + 1)
+        backbone.record(backbone.observe(picture, number + 1))
     assert backbone.absolute_gradient
     assert backbone.statistics.count.tolist() == [2] * 12
     torch.testing.assert_close(backbone.statistics.mean_absolute().double(), truth / 2, rtol=1e-4, atol=1e-6)
@@ -551,7 +551,7 @@ def test_training_stays_finite(name: str) -> None:
         assert torch.isfinite(picture.image).all()
         photometric(picture.image, torch.full_like(picture.image, 0.5), 0.2).backward()
         assert all(torch.isfinite(gradient).all() for _, gradient in backbone.gradients())
-        backbone.observe(picture, step)
+        backbone.record(backbone.observe(picture, step))
         backbone.adapt(step)
         backbone.update()
         assert finite(backbone.splats(camera))

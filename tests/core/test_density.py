@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.density import Statistics, Table, append_rows, keep_rows, reset_column, restored_table, table_tensors
+from gsx.core.density import (
+    Statistics,
+    Table,
+    append_rows,
+    keep_rows,
+    reset_column,
+    restored_table,
+    sightings,
+    table_tensors,
+)
 from gsx.core.errors import CheckpointError
 from gsx.core.rasterizer import ScreenStatistics
 
@@ -256,8 +265,10 @@ def screen(ids: list[int], radii: list[int], gradient: list[list[float]], size: 
 def test_statistics_are_means_of_norms_in_ndc_over_the_views_that_saw_the_row() -> None:
     statistics = Statistics.zeros(4, "cpu")
     # 20 x 8 px: NDC gradients are (10, 4) times those in pixels
-    statistics.add(screen([3, 0, 1], [5, 0, 2], [[0.3, 1.0], [9.0, 9.0], [0.0, 0.5]], (20, 8)))  # norms 5, -, 2
-    statistics.add(screen([1, 3], [1, 1], [[-0.6, 2.0], [-0.3, -1.0]], (20, 8)))  # 10 and 5: opposite to the first view
+    one = screen([3, 0, 1], [5, 0, 2], [[0.3, 1.0], [9.0, 9.0], [0.0, 0.5]], (20, 8))  # norms 5, -, 2
+    other = screen([1, 3], [1, 1], [[-0.6, 2.0], [-0.3, -1.0]], (20, 8))  # 10 and 5: opposite to the first view
+    for picture in (one, other):
+        statistics.add(sightings(picture))
     assert statistics.count.tolist() == [0, 2, 0, 2]
     torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([0.0, 6.0, 0.0, 5.0]))
 
@@ -267,7 +278,7 @@ def test_a_view_without_gradient_still_counts() -> None:
     unused = ScreenStatistics(
         ids=torch.tensor([1]), radii=torch.tensor([3]), shift=torch.zeros(1, 2), probe=None, heaviest=None, size=(4, 4)
     )
-    statistics.add(unused)
+    statistics.add(sightings(unused))
     assert statistics.count.tolist() == [0, 1]
     assert statistics.mean_gradient().tolist() == [0.0, 0.0]
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.core import pictures
 from gsx.core.backbone import Gaussians
@@ -58,12 +59,18 @@ class FourSplats:
 
     def regulariser(self) -> None: ...
 
-    def observe(self, rendering: Rendering, step: int) -> None: ...
+    def observe(self, rendering: Rendering, step: int) -> dict[str, Tensor]:
+        return {}
+
+    def record(self, seen: dict[str, Tensor]) -> None: ...
 
     def adapt(self, step: int) -> dict[str, int]:
         return {}
 
     def update(self) -> None: ...
+
+    def parameters(self) -> Iterator[tuple[str, Parameter]]:
+        return iter(())
 
     def gradients(self) -> Iterator[tuple[str, Tensor]]:
         return iter(())

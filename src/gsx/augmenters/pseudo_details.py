@@ -307,20 +307,27 @@ class PseudoDetails:
     def of_event(self, run: Run, event: int, view: int) -> list[PseudoView]:
         """The pseudo views of an event: made now, or as the run made them before it was interrupted.
 
-        Only those that steps of its window will ask for, the first of them for `view`: the others are never looked at.
+        Only those that steps of its window will ask for, the first of them for `view` and the rest of its batch: the
+        others are never looked at. Of several processes the first makes them all.
 
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
-        if run.step == event:
-            steps = min(self.span, run.iterations - event)
-            views, facts = self.made(run, event, {view} | run.sampler.coming(steps - 1))
-            path = self.path(run, event)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_views(path, views, facts)
-            self.forget(run, event)
-            return views
-        return self.recalled(run, event)
+        fresh = run.step == event
+        views = self.written(run, event, view) if fresh and run.ranks.first else None
+        if fresh:
+            run.ranks.everyone(None)  # the others wait for the file
+        return self.recalled(run, event) if views is None else views
+
+    def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
+        """The pseudo views of an event that begins with this step, made and written to its file."""
+        steps = min(self.span, run.iterations - event)
+        views, facts = self.made(run, event, {view, *run.sampler.taken} | run.sampler.coming(steps - 1))
+        path = self.path(run, event)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_views(path, views, facts)
+        self.forget(run, event)
+        return views
 
     def path(self, run: Run, event: int) -> Path:
         """Where the pseudo views of an event are kept while a checkpoint may need them."""

@@ -44,7 +44,7 @@ from gsx.backbones.levels import (
     warnings_of,
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
-from gsx.core.backbone import Beginning, Gaussians
+from gsx.core.backbone import Beginning, Gaussians, Observation
 from gsx.core.camera import Camera
 from gsx.core.density import (
     ADAM_EPSILON,
@@ -54,6 +54,7 @@ from gsx.core.density import (
     keep_rows,
     restore_adam,
     restored_table,
+    sightings,
     table_tensors,
 )
 from gsx.core.errors import InputError
@@ -327,15 +328,24 @@ class Anchors:
         volumes = self.last[0].splats.scales.prod(1)
         return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> None:
+    def observe(self, rendering: Rendering, step: int) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
         growth = self.options.growth
         if self.last is None or not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
-            return
-        (decoded, taking_part), screen = self.last, rendering.screen
-        norms = screen.ndc_gradient(screen.shift)[screen.visible].norm(dim=1)
-        slots = decoded.slots[screen.ids[screen.visible]]
-        observe(self.table, taking_part.rows, decoded.opacities, slots, norms.to(decoded.opacities))
+            return {}
+        decoded, taking_part = self.last
+        seen = sightings(rendering.screen, decoded.slots)
+        return {
+            "rows": taking_part.rows,
+            "opacities": decoded.opacities,
+            "slots": seen["rows"],
+            "gradients": seen["gradient"].to(decoded.opacities),
+        }
+
+    def record(self, seen: Observation) -> None:
+        """Add an observation to the columns of the table."""
+        if seen:
+            observe(self.table, **seen)
 
     def adapt(self, step: int) -> dict[str, int]:
         """Grow and prune when due (spec 2.6)."""
@@ -356,10 +366,13 @@ class Anchors:
             self.head_optimiser.step()
         self.discard()
 
+    def parameters(self) -> Iterable[tuple[str, Parameter]]:
+        """Parameters by name, those of anchors before those of the heads."""
+        return [*self.table.parameters.items(), *self.head_parameters()]
+
     def gradients(self) -> Iterable[tuple[str, Tensor]]:
         """Gradients by parameter name."""
-        named = [*self.table.parameters.items(), *self.head_parameters()]
-        return ((name, p.grad) for name, p in named if p.grad is not None)
+        return ((name, p.grad) for name, p in self.parameters() if p.grad is not None)
 
     def head_parameters(self) -> list[tuple[str, Parameter]]:
         """Names and values of the heads' parameters."""

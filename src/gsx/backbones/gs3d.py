@@ -35,7 +35,7 @@ from gsx.backbones.levels import (
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
-from gsx.core.backbone import Beginning, Gaussians
+from gsx.core.backbone import Beginning, Gaussians, Observation
 from gsx.core.camera import Camera
 from gsx.core.density import (
     Statistics,
@@ -45,6 +45,7 @@ from gsx.core.density import (
     keep_rows,
     reset_column,
     restored_table,
+    sightings,
     table_tensors,
     within_room,
 )
@@ -291,10 +292,16 @@ class GS3D:
         volumes = self.last[1].prod(1)
         return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> None:
-        """Screen gradients count until density control ends (spec 7, cadence)."""
-        if step < self.schedule.step(self.options.density.stop):
-            self.statistics.add(rendering.screen, self.last[0].rows if self.last else None)
+    def observe(self, rendering: Rendering, step: int) -> Observation:
+        """Screen gradients, which count until density control ends (spec 7, cadence)."""
+        if step >= self.schedule.step(self.options.density.stop):
+            return {}
+        return sightings(rendering.screen, self.last[0].rows if self.last else None)
+
+    def record(self, seen: Observation) -> None:
+        """Add screen gradients to the statistics."""
+        if seen:
+            self.statistics.add(seen)
 
     def adapt(self, step: int) -> dict[str, int]:
         """Clone, split, prune and reset when due."""
@@ -316,9 +323,13 @@ class GS3D:
         self.table.optimiser.step()
         self.discard()
 
+    def parameters(self) -> Iterable[tuple[str, Parameter]]:
+        """Parameters by name."""
+        return self.table.parameters.items()
+
     def gradients(self) -> Iterable[tuple[str, Tensor]]:
         """Gradients by parameter name."""
-        return ((name, p.grad) for name, p in self.table.parameters.items() if p.grad is not None)
+        return ((name, p.grad) for name, p in self.parameters() if p.grad is not None)
 
     def shared(self) -> Iterable[Tensor]:
         """Every Gaussian has a colour of its own."""

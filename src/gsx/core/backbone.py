@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer import RasterSettings, Rendering
@@ -13,6 +14,9 @@ from gsx.core.scene import Scene
 from gsx.core.schedule import Schedule
 from gsx.core.shapes import Float
 from gsx.core.splats import Splats
+
+Observation: TypeAlias = dict[str, Tensor]
+"""What density control learns from one render, as tensors by name; empty: nothing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,7 +54,8 @@ class Gaussians:
 class Backbone(Protocol):
     """A scene representation that trains itself and hands out splats.
 
-    A step calls, in this order: `begin`, `splats`, `regulariser`, (backward), `observe`, `adapt`, `update`.
+    A step calls, in this order: `begin`; for each view `splats`, `regulariser`, (backward), `observe`; for each
+    observation `record`; `adapt`, `update`. Gradients of the views add up in between.
     """
 
     @property
@@ -75,8 +80,12 @@ class Backbone(Protocol):
         """A term to add to the loss for the splats handed out last, or None."""
         ...
 
-    def observe(self, rendering: Rendering, step: int) -> None:
-        """Gather statistics of a training render after the backward pass."""
+    def observe(self, rendering: Rendering, step: int) -> Observation:
+        """What density control learns from the render of the splats handed out last, after its backward pass."""
+        ...
+
+    def record(self, seen: Observation) -> None:
+        """Count an observation in: one of this process, or of another that trains the same model."""
         ...
 
     def adapt(self, step: int) -> dict[str, int]:
@@ -85,6 +94,10 @@ class Backbone(Protocol):
 
     def update(self) -> None:
         """Let the optimiser move the parameters, and clear their gradients."""
+        ...
+
+    def parameters(self) -> Iterable[tuple[str, Parameter]]:
+        """Name and value of everything that is learnt, in the same order on every process."""
         ...
 
     def gradients(self) -> Iterable[tuple[str, Tensor]]:

@@ -131,6 +131,7 @@ def restore(run: Run) -> None:
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
     run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
-    for sidecar in sidecars(run.folder / "checkpoints"):  # newer ones are damaged; they must not outlive good ones
+    for sidecar in sidecars(run.folder / "checkpoints") if run.ranks.first else ():
+        # newer ones are damaged; they must not outlive good ones
         if sidecar.stem > f"step_{run.step:07d}":
             sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -148,6 +148,20 @@ def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device
     return table
 
 
+def sightings(screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None) -> dict[str, Tensor]:
+    """Of one render after its backward pass the visible primitives, and the norms of their gradients (spec 4).
+
+    `drawn`: rows of the splats that were rendered; None: splat n is row n.
+    """
+    visible = screen.visible
+    ids = screen.ids[visible]
+    seen = {
+        "rows": ids if drawn is None else drawn[ids],
+        "gradient": screen.ndc_gradient(screen.shift)[visible].norm(dim=1),
+    }
+    return seen if screen.probe is None else seen | {"absolute": screen.ndc_gradient(screen.probe)[visible].sum(1)}
+
+
 @dataclass(eq=False)
 class Statistics:
     """Per-primitive sums over the training renders since the last density event."""
@@ -165,19 +179,13 @@ class Statistics:
         sums, seen = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
         return Statistics(sums, seen, torch.zeros_like(sums) if absolute else None)
 
-    def add(self, screen: ScreenStatistics, drawn: Int[Tensor, "M"] | None = None) -> None:
-        """Count one render in after its backward pass: a norm per view, visible primitives only (spec 4).
-
-        `drawn`: rows of the splats that were rendered; None: splat n is row n.
-        """
-        visible = screen.visible
-        ids = screen.ids[visible]
-        rows = ids if drawn is None else drawn[ids]
-        self.gradient.index_add_(0, rows, screen.ndc_gradient(screen.shift)[visible].norm(dim=1).to(self.gradient))
+    def add(self, seen: dict[str, Tensor]) -> None:
+        """Count in what `sightings` found in one render."""
+        rows = seen["rows"]
+        self.gradient.index_add_(0, rows, seen["gradient"].to(self.gradient))
         self.count[rows] += 1
-        if self.absolute is not None and screen.probe is not None:
-            sums = screen.ndc_gradient(screen.probe)[visible].sum(1)
-            self.absolute.index_add_(0, rows, sums.to(self.absolute))
+        if self.absolute is not None and "absolute" in seen:
+            self.absolute.index_add_(0, rows, seen["absolute"].to(self.absolute))
 
     def mean_gradient(self) -> Float[Tensor, "N"]:
         """Mean norm over the renders that saw the primitive; 0 for unseen ones."""

@@ -28,12 +28,16 @@ class TrainingError(GsxError):
     """Training cannot go on, for example after three non-finite steps in a row."""
 
 
+class Disagreement(TrainingError):
+    """The processes of one run hold different models, of which none may become a checkpoint."""
+
+
 def nearest(word: str, options: Iterable[str]) -> str:
     """` Did you mean 'x'?` for the closest option, or an empty string when nothing is close."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """First line of an error's message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

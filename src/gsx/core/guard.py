@@ -1,10 +1,14 @@
-"""Stops a run that has gone bad: skips steps with a non-finite loss or gradient and names the culprit."""
+"""Stops a run that has gone bad: skips steps with a non-finite loss or gradient and names the culprit.
 
+A run on several processes is also stopped when these no longer hold the same model.
+"""
+
+import hashlib
 import logging
 
 import torch
 
-from gsx.core.errors import TrainingError
+from gsx.core.errors import Disagreement, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
@@ -52,3 +56,29 @@ def culprit(run: Run, step: Step) -> str | None:
                 continue
             return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
     return None
+
+
+class Agreement:
+    """Listener: at the steps of checkpoints all ranks must hold the same state."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Compare digests when due.
+
+        Raises:
+            Disagreement: they differ.
+        """
+        due = run.step % run.training.checkpoint_every == 0 or run.complete
+        if due and run.ranks.size > 1 and len(set(run.ranks.everyone(digest(run)))) > 1:
+            raise Disagreement(
+                f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
+                f"checkpoint before, if there is one, with gsx resume {run.folder}"
+            )
+
+
+def digest(run: Run) -> str:
+    """Of everything that the next steps depend on."""
+    content = hashlib.sha256(repr((run.sampler.order, run.sampler.begun)).encode())
+    for name, value in sorted({"generator": run.generator.get_state(), **run.backbone.tensors()}.items()):
+        content.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return content.hexdigest()

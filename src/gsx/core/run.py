@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.backbone import Backbone
+from gsx.core.backbone import Backbone, Observation
+from gsx.core.distributed import Ranks
 from gsx.core.metrics import psnr
 from gsx.core.pseudo import Augmenter
 from gsx.core.rasterizer import RasterSettings, Rendering
@@ -27,9 +28,11 @@ class TrainingOptions:
     checkpoint_every: int
     checkpoints_kept: int
     test_points: int
+    batch: int = 1
+    """Views per step, whose mean loss it lowers. The default: runs older than this option."""
 
     def __post_init__(self) -> None:
-        for name in ("log_every", "checkpoint_every", "checkpoints_kept"):
+        for name in ("batch", "log_every", "checkpoint_every", "checkpoints_kept"):
             if getattr(self, name) < 1:
                 raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
         if not 0 <= self.ssim_weight <= 1:
@@ -49,6 +52,20 @@ class Sampler:
     """What is left of the current order, the next one last."""
     begun: int = 0
     """Orders begun so far."""
+    batch: int = 1
+    """Views of one step."""
+    taken: list[int] = field(default_factory=list)
+    """Those of the step under way."""
+
+    def take(self) -> list[int]:
+        """Indices of the views of the next step, in order."""
+        self.taken = [self.next() for _ in range(self.batch)]
+        return self.taken
+
+    def put_back(self) -> None:
+        """Undo `take`: the same views come next again."""
+        self.order += reversed(self.taken)
+        self.taken = []
 
     def next(self) -> int:
         """Index of the next view."""
@@ -59,7 +76,7 @@ class Sampler:
     def coming(self, steps: int) -> set[int]:
         """Indices of the views of the next steps."""
         ahead = replace(self, order=list(self.order))
-        return {ahead.next() for _ in range(steps)}
+        return {ahead.next() for _ in range(steps * self.batch)}
 
     def shuffled(self, number: int) -> list[int]:
         """The order of that number."""
@@ -83,6 +100,8 @@ class Run:
     generator: torch.Generator
     sampler: Sampler
     augmenters: Sequence[Augmenter] = ()
+    ranks: Ranks = Ranks()
+    """The processes that train it together."""
     step: int = 0
     """Steps done."""
     trunk: Path | None = None
@@ -107,20 +126,28 @@ class Run:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Step:
-    """One training step, after its backward pass."""
+    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first."""
 
     number: int
     view: View
     target: Float[Tensor, "3 H W"]
     rendering: Rendering
     loss: Float[Tensor, ""]
+    """Mean over the batch."""
+    seen: Sequence[Observation] = ()
+    """What density control learns from the renders of the batch, in its order."""
+    dropped: int = 0
+    """Splats that renders of training views left out because a value of theirs is not finite."""
+    others: Sequence["Step"] = ()
+    """This rank's other views, as steps of their own."""
     changes: dict[str, int] = field(default_factory=dict)
     """What density control did."""
     terms: dict[str, float] = field(default_factory=dict)
-    """Parts of the loss by name, as they enter it, where there is more than the backbone's own."""
+    """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 
     def psnr(self) -> float:
-        """PSNR of the training view before the update, dB."""
-        return psnr(self.rendering.image.detach().clamp(0, 1), self.target)
+        """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
+        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target)
+        return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))

@@ -24,11 +24,12 @@ from gsx.core.cache import cache_root, source_digest
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
-from gsx.core.errors import CheckpointError, ConfigError, InputError, TrainingError, nearest
+from gsx.core.distributed import placed, ranks_here, refuse_uneven
+from gsx.core.errors import CheckpointError, ConfigError, Disagreement, InputError, TrainingError, nearest
 from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
-from gsx.core.guard import Guard
+from gsx.core.guard import Agreement, Guard
 from gsx.core.identity import finished, place_of
 from gsx.core.images import write_image
 from gsx.core.lpips import load_lpips
@@ -114,8 +115,10 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
 def build(settings: Settings, scene: Scene, folder: Path, training: bool = False) -> Run:
     """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
     rasterizer that suits training. Looking at a run needs none of what its regenerators need."""
-    general = settings.general
-    device = choose_device(general.device)
+    general, ranks = settings.general, ranks_here()
+    device = placed(choose_device(general.device))
+    if training:
+        refuse_uneven(settings.training.batch, ranks)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
@@ -132,8 +135,9 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         iterations=general.iterations,
         device=device,
         generator=generator,
-        sampler=Sampler(len(scene.train), general.seed),
+        sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
         augmenters=build_augmenters(settings, scene) if training else [],
+        ranks=ranks,
     )
 
 
@@ -184,6 +188,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "rasterizer": run.raster.path,
         "source": source_digest(Path(gsx.__file__).parent)[:16],
         "device": device_name(run.device),
+        "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
         "plan": plan_of(run),
@@ -248,16 +253,28 @@ def load_scene(settings: Settings) -> Scene:
 def start(settings: Settings, plugins: Plugins) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
 
+    Of several processes the first does what concerns the folder.
+
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
     """
+    ranks = ranks_here()
     if settings.general.iterations < 1:
         raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
     choose_device(settings.general.device)
-    refuse_used(settings.general.folder)
+    ranks.of_first(lambda: refuse_used(settings.general.folder))
+    refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
-    run = build(settings, load_scene(settings), Path(), training=True)
+    run = build(settings, ranks.in_turn(lambda: load_scene(settings)), Path(), training=True)
+    run.folder = ranks.of_first(lambda: begun(run, settings, plugins))
+    if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of a trunk
+        checkpoint.restore(run)
+    return run
+
+
+def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
+    """The folder of a new run, with what is known before its first step; `init=trunk`: at a state it branches from."""
     run.folder = new_folder(settings, run.scene)
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
@@ -269,7 +286,7 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
-    return run
+    return run.folder
 
 
 def open_run(
@@ -289,7 +306,7 @@ def open_run(
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
-    run = build(settings, load_scene(settings), folder, training)
+    run = build(settings, ranks_here().in_turn(lambda: load_scene(settings)), folder, training)
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     return run
@@ -399,13 +416,26 @@ def status(run: Run, state: str, reason: str = "") -> None:
 
 
 def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
-    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint."""
+    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint.
+
+    All ranks but the first only train.
+    """
+    if not run.ranks.first:
+        follow(run, plugins)
+        return
     trackers = build_trackers(settings.trackers)
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
     log = MetricsLog(settings.evaluation)
-    listeners: list[object] = [Guard(), log, *trackers, Checkpointer(), Progress()]  # trackers read what log has kept
+    listeners: list[object] = [
+        Guard(),
+        Agreement(),
+        log,
+        *trackers,
+        Checkpointer(),
+        Progress(),
+    ]  # trackers read the log
     if run.trunk is not None:
         general = settings.general
         listeners.append(trunk.TrunkKeeper(run.trunk, general.trunk_gb * 1e9, general.trunk_at))
@@ -415,7 +445,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
             if run.complete:
                 finish(run, settings, plugins)
     except TrainingError as error:
-        checkpoint.save(run)
+        if not isinstance(error, Disagreement):
+            checkpoint.save(run)
         status(run, "failed", str(error))
         raise
     except BaseException as error:
@@ -426,6 +457,13 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)
+
+
+def follow(run: Run, plugins: Plugins) -> None:
+    """Train as another process does, and write nothing."""
+    warm(run.raster, run.device)
+    with plugins.listening([Guard(), Agreement()]):
+        train(run, plugins)
 
 
 def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:

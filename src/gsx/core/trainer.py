@@ -9,21 +9,24 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gsx.core.backbone import Observation
+from gsx.core.batch import added_up, merged, views_of_step
 from gsx.core.camera import Camera
 from gsx.core.losses import photometric
 from gsx.core.plugins import Plugins
 from gsx.core.pseudo import PseudoView, Term, pseudo_loss
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.run import Run, Step
+from gsx.core.scene import View
 from gsx.core.shapes import Float
 
 logger = logging.getLogger(__name__)
 
 
 def train(run: Run, plugins: Plugins) -> None:
-    """Take steps until the run is complete or asked to stop; listeners hear of each."""
+    """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
     plugins.emit.gsx_run_started(run=run)
-    while not (run.complete or run.stopping):
+    while not (run.complete or any(run.ranks.everyone(run.stopping))):
         begun = time.perf_counter()
         step = take_step(run, plugins)
         run.seconds += time.perf_counter() - begun
@@ -34,51 +37,74 @@ def train(run: Run, plugins: Plugins) -> None:
 def take_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (spec 7): render, backward, statistics, density, Adam."""
     step = backward(run)
-    reason = healed(run, step) or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    reason = veto(run, step, plugins)
     if reason:
         run.backbone.discard()
     else:
-        run.backbone.observe(step.rendering, step.number)
+        for seen in step.seen:
+            run.backbone.record(seen)
         step.changes.update(run.backbone.adapt(step.number))
         run.backbone.update()
     run.step = step.number
     synchronise(run.device)
-    return step if not reason else Step(**(vars(step) | {"skipped": reason}))
+    return step if not reason else replace(step, skipped=reason)
+
+
+def veto(run: Run, step: Step, plugins: Plugins) -> str:
+    """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
+    reason = healed(run, step) or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    return next(filter(None, run.ranks.everyone(reason)), "")
 
 
 def healed(run: Run, step: Step) -> str:
     """Removes primitives that the render had to leave out; a reason to skip the step if there were any."""
-    removed = run.backbone.heal() if step.rendering.dropped else 0
+    removed = run.backbone.heal() if step.dropped else 0
     if removed:
         logger.warning("step %d: removed %d primitives with values that are not finite", step.number, removed)
     return f"removed {removed} primitives" if removed else ""
 
 
 def backward(run: Run) -> Step:
-    """Render the next view, and the pseudo views that go with it, and send the loss back (spec 1.3).
+    """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
+    number = run.step + 1
+    with views_of_step(run) as batch:
+        picked = run.ranks.share(batch)
+        terms = [terms_of(run, number, view) for view in picked]
+        colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
+        run.backbone.begin(number)
+        steps = [of_view(run, number, *each) for each in zip(picked, terms, colours, strict=True)]
+        return steps[0] if len(batch) == 1 else merged(run, steps)
+
+
+def terms_of(run: Run, number: int, picked: int) -> list[Term]:
+    """What augmenters add to the loss of a training view."""
+    return [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
+
+
+def of_view(run: Run, number: int, picked: int, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+    """The step of one view; its gradients are added to those of the views before it."""
+    with added_up(run.backbone):
+        return backward_of(run, number, run.scene.train[picked], terms, colour)
+
+
+def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+    """Render a view, and the pseudo views that go with it, and send the loss back (spec 1.3).
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
     compared with its own render.
     """
-    number, picked = run.step + 1, run.sampler.next()
-    view = run.scene.train[picked]
-    target = view.image().to(run.device)
-    try:
-        terms = [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
-    except Exception:  # the step has not been taken: a checkpoint written now begins with this view again
-        run.sampler.order.append(picked)
-        raise
-    run.backbone.begin(number)
+    target, seen = view.image().to(run.device), list[Observation]()
     divided = [divide(run, term, view.camera) for term in terms]
-    parts = {term.name: add_term(run, term, number) for term, _ in sorted(divided, key=lambda pair: pair[0].shared)}
+    ordered = sorted(divided, key=lambda pair: pair[0].shared)
+    parts = {term.name: add_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.taken for term in terms)
     splats = run.backbone.splats(view.camera)
     rendering = rasterize(
         splats,
         view.camera,
         run.raster,
-        background=background(run),
+        background=colour,
         absolute_gradient=run.backbone.absolute_gradient,
     )
     loss = photometric(rendering.image, target, run.training.ssim_weight)
@@ -93,8 +119,22 @@ def backward(run: Run) -> Step:
             named[term.name] += float(value.detach())
             loss = loss + value
     loss.backward()
-    whole = loss.detach() + sum(parts.values())
-    return Step(number=number, view=view, target=target, rendering=rendering, loss=whole, terms=named)
+    seen.append(run.backbone.observe(rendering, number))
+    return Step(
+        number=number,
+        view=view,
+        target=target,
+        rendering=without_graph(rendering),
+        loss=loss.detach() + sum(parts.values()),
+        terms=named,
+        seen=seen,
+        dropped=rendering.dropped,
+    )
+
+
+def without_graph(rendering: Rendering) -> Rendering:
+    """The picture alone, so that the steps of a batch do not hold on to what made theirs."""
+    return replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach())
 
 
 def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
@@ -105,8 +145,8 @@ def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[P
     return replace(term, parts=[part for part in term.parts if part not in here]), here
 
 
-def add_term(run: Run, term: Term, number: int) -> float:
-    """Send an augmenter's term back; returns its value."""
+def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> float:
+    """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
     total = 0.0
     for view, weight in term.parts:
         rendering = rasterize(
@@ -120,7 +160,7 @@ def add_term(run: Run, term: Term, number: int) -> float:
         loss.backward()
         total += float(loss.detach())
         if term.observed and math.isfinite(total) and finite_shift(rendering):
-            run.backbone.observe(rendering, number)
+            seen.append(run.backbone.observe(rendering, number))
     if not term.shared:
         for parameter in run.backbone.shared():
             parameter.grad = None

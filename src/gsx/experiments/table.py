@@ -290,8 +290,8 @@ def protocol_differences(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]])
     """In which keys compositions (as run, as published) differ, each with its values, those of most rows first."""
     found: dict[str, list[tuple[str, str]]] = {}
     for own, paper in pairs:
-        for key, ours, theirs in differing(own, paper):
-            found.setdefault(key, []).append((ours, theirs))
+        for key, value, published in differing(own, paper):
+            found.setdefault(key, []).append((value, published))
     ranked = sorted(found, key=lambda key: -len(found[key]))
     told = []
     for key in ranked:
