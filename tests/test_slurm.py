@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from slurm_cluster import absent, jobs, slurm
 
-pytestmark = pytest.mark.skipif(bool(absent()), reason=absent())
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(absent()), reason=absent())]
 
 TABLE = [
     "+experiment=table_frameworks", "experiment.only=[3D-GS,3D-GS-UP]", "dataset=demo", "budget=smoke",

@@ -9,8 +9,9 @@ from gsx.cli import main, plugins
 from gsx.core.config import Compositions
 
 VARIANTS = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "variant").glob("*.yaml"))
-SMALL = ["dataset=demo", "budget=smoke", "iterations=60", "scene.train_views=8", "scene.test_views=2", "scene.samples=1",
-         "scene.points=800", "training.test_points=0", "rasterizer=eager", "device=cpu"]  # fmt: skip
+SMALL = ["dataset=demo", "budget=smoke", "iterations=60", "scene.train_views=8", "scene.test_views=2",
+         "scene.samples=1", "scene.points=800", "training.test_points=0", "training.log_every=1", "rasterizer=eager",
+         "device=cpu"]  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
