@@ -266,8 +266,11 @@ def fill_table(words: list[str]) -> int:
 
 def hand_to_hydra(words: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
-    from gsx.core.config import check_overrides, hydra_main
+    from gsx.core.config import check_overrides, hydra_main, quoted
+    from gsx.experiments.sweep import is_table
 
+    if is_table(words) and {"-m", "--multirun"} & set(words):
+        raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
     loaded = plugins()
     if not {"-m", "--multirun"} & set(words):
         hydra_main(words, loaded, sweep_job)
@@ -275,7 +278,7 @@ def hand_to_hydra(words: list[str]) -> int:
     given = [word for word in words if not word.startswith("-")]
     sweep = new_sweep(check_overrides(given, loaded))
     try:
-        hydra_main([*words, f"hydra.sweep.dir={sweep}"], loaded, sweep_job)
+        hydra_main([*words, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     finally:
         code = close_sweep(sweep)
     return code
@@ -372,13 +375,18 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
-        say(f"\ngsx: interrupted after step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
+        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
         return INTERRUPTED
     if not run.complete:
-        say(f"gsx: stopped at step {run.step}; go on with: gsx resume {run.folder}\n", sys.stderr)
+        say(f"gsx: stopped at step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
         return INTERRUPTED
     say(f"{run.folder / 'report.html'}\n", sys.stdout)
     return 0
+
+
+def onwards(run: "Run") -> str:
+    """The command that goes on with a run; one that is named by its composition is found again by it."""
+    return "the same command" if run.config.get("reuse") else f"gsx resume {run.folder}"
 
 
 def run_words(verb: str, words: list[str]) -> tuple[Path, list[str]]:

@@ -8,7 +8,7 @@ import pytest
 
 from gsx.cli import plugins
 from gsx.core.config import Compositions, write_config
-from gsx.core.identity import claimed, composition_key, place_of
+from gsx.core.identity import claimed, composition_key, judging, place_of
 from gsx.experiments.plan import Cell, Experiment, cells_of, planned, told
 from gsx.experiments.sweep import run_table
 
@@ -25,7 +25,7 @@ def cells(table: Experiment, folder: Path, *words: str) -> list[Cell]:
     """As `gsx +experiment=... budget=quick` plans them."""
     with Compositions(plugins()) as compositions:
         common = [f"output={folder}", "budget=quick", *words]
-        return list(cells_of(table, DATASETS, common, compositions.settings))
+        return list(cells_of(table, DATASETS, lambda variant: common, compositions.settings))
 
 
 def words_of(plan: Any) -> list[list[tuple[str, str]]]:
@@ -33,7 +33,7 @@ def words_of(plan: Any) -> list[list[tuple[str, str]]]:
 
     def short(job: list[str]) -> tuple[str, str]:
         given = dict(word.split("=", 1) for word in job)
-        return given["variant"], given["trunk_at"]
+        return given["variant"], given.get("trunk_at", given["init"])
 
     return [sorted(map(short, phase)) for phase in plan.phases]
 
@@ -43,26 +43,32 @@ def finish(cell: Cell) -> None:
     cell.folder.mkdir(parents=True)
     write_config(cell.folder / "config.yaml", cell.config)
     steps = cell.config["iterations"]
-    (cell.folder / "evaluation.json").write_text(json.dumps({"step": steps, "psnr": 20.0, "views": []}))
+    (cell.folder / "evaluation.json").write_text(
+        json.dumps({"step": steps, "psnr": 20.0, "views": [], "judged": judging(cell.config)})
+    )
     (cell.folder / "status.json").write_text(json.dumps({"state": "ok", "step": steps}))
 
 
 def test_controls_go_first_and_leave_their_state_where_others_set_out(tmp_path: Path) -> None:
     """Of 2,000 steps pseudo views begin at 10/40 = 500, 20/40 = 1,000 and 22/40 = 1,100."""
     table = experiment()
-    plan = planned(table, DATASETS, cells(table, tmp_path))
+    every = cells(table, tmp_path)
+    plan = planned(table, DATASETS, every, together=True)
     assert words_of(plan) == [
-        [("3d_gs", "[]"), ("octree_gs", "[500,1000,1100]")],
+        [("3d_gs", "scratch"), ("octree_gs", "[500,1000,1100]")],
         [("octree_ub", "[500,1000,1100]"), ("octree_ub_start_10k", "[500,1000,1100]"),
          ("octree_up", "[500,1000,1100]")],
     ]  # fmt: skip
     assert (plan.done, plan.steps, plan.shared) == (0, 5 * 2000, 500 + 1000 + 1100)
     assert "2,600 of 10,000 steps are saved" in told(plan)[1]
+    (alone,) = planned(table, DATASETS, every).phases  # one after the other: each leader right before its followers
+    assert [job[1] for job in alone] == [f"variant={v}" for v in
+            ("octree_gs", "octree_up", "octree_ub", "octree_ub_start_10k", "3d_gs")]  # fmt: skip
 
 
 def test_without_a_control_the_one_that_begins_last_leads(tmp_path: Path) -> None:
     table = experiment(only=["UP", "early"])
-    plan = planned(table, DATASETS, cells(table, tmp_path))
+    plan = planned(table, DATASETS, cells(table, tmp_path), together=True)
     assert words_of(plan) == [[("octree_up", "[500]")], [("octree_ub_start_10k", "[500]")]]
 
 
@@ -74,7 +80,7 @@ def test_what_is_finished_is_left_out_whoever_asked_for_it(tmp_path: Path) -> No
     assert every[1].folder == every[2].folder
     finish(every[2])
     plan = planned(table, DATASETS, every)
-    assert (plan.done, words_of(plan)) == (1, [[("octree_up", "[]")]])
+    assert (plan.done, words_of(plan)) == (1, [[("octree_up", "scratch")]])
 
 
 def test_a_run_judged_otherwise_is_due_again_and_a_failed_one_too(tmp_path: Path) -> None:
@@ -89,7 +95,7 @@ def test_a_run_judged_otherwise_is_due_again_and_a_failed_one_too(tmp_path: Path
 
 def test_seeds_share_nothing(tmp_path: Path) -> None:
     table = experiment(only=["control", "UP"], seeds=[0, 1])
-    plan = planned(table, DATASETS, cells(table, tmp_path))
+    plan = planned(table, DATASETS, cells(table, tmp_path), together=True)
     assert [len(phase) for phase in plan.phases] == [2, 2]
     assert len({cell.folder for cell in plan.cells}) == 4
 
@@ -102,7 +108,8 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
 
         plain = key()
         for word in ("output=elsewhere", "device=cpu", "init=trunk", "trunk_at=[3]", "eval.zoom=[1,2]", "reuse=true",
-                     "training.log_every=3", "regenerator/upscale=lanczos", "length=900"):  # fmt: skip
+                     "training.log_every=3", "regenerator/upscale=lanczos", "length=900",
+                     "scene.cache_gb=1"):  # fmt: skip
             assert key(word) == plain, word
         for word in ("seed=1", "iterations=901", "backbone=scaffold", "augmenter=upscale", "scene.samples=7",
                      "rasterizer.tile_size=16", "training.ssim_weight=0.1"):  # fmt: skip
@@ -126,9 +133,14 @@ def test_a_folder_is_claimed_by_one_at_a_time(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["seed=0,1"], "experiment.seeds="),
+        (["seed=3"], "experiment.seeds="),
+        (["dataset.scene=demo"], "experiment.scenes="),
+        (["variant=octree_ub"], "experiment.only="),
+        (["regenerator.upscale.modl=x"], "Did you mean 'regenerator.upscale.model'"),
+        (["experiment.seeds=[1,1]"], "different ones"),
         (["experiment.only=[3DGS]"], "Did you mean '3D-GS'"),
         (["experiment.scenes=[demmo]"], "Did you mean 'demo'"),
-        (["experiment.seeds=[]"], "at least one"),
+        (["experiment.seeds=[]"], "different ones"),
         (["backbone.voxxel=1"], "no configuration key"),
         (["hydra/launcher=slurrm"], "slurrm"),
     ],
@@ -142,3 +154,35 @@ def test_mistakes_are_named_before_anything_runs(words: list[str], message: str,
     with pytest.raises(ConfigError, match=message):
         run_table(["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", *words], plugins(), job)
     assert not list(tmp_path.iterdir())
+
+
+def test_words_of_a_component_go_to_the_rows_that_have_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", "experiment.dry=true",
+             "regenerator.upscale.model=models/x2", "experiment.only=[3D-GS,3D-GS-UP]"]  # fmt: skip
+    commands, _ = run_table(words, plugins(), lambda config: None)
+    control, upscaled = commands.splitlines()
+    assert "variant=3d_gs " in control
+    assert "model=" not in control
+    assert "regenerator.upscale.model=models/x2" in upscaled
+
+
+def test_a_changed_experiment_is_another_table_and_says_so(tmp_path: Path) -> None:
+    words = ["+experiment=table_frameworks", "dataset=own", "+dataset.scenes.yard=Yard", f"output={tmp_path}",
+             f"data_root={tmp_path}", "experiment.only=[3D-GS]"]  # fmt: skip
+    plain, _ = run_table(words, plugins(), lambda config: None)
+    changed, _ = run_table([*words, "experiment.overrides=['iterations=100']"], plugins(), lambda config: None)
+    assert "iterations=100 (paper: 40000)" in changed
+    assert "iterations=" not in plain
+    assert "yard is not there" in plain
+    assert plain.splitlines()[-1] != changed.splitlines()[-1]
+
+
+def test_a_launcher_that_gives_up_does_not_cost_the_table(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def job(config: Any) -> None:
+        raise RuntimeError("a process was killed")
+
+    words = ["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}/a (1)", "experiment.only=[3D-GS]"]
+    text, code = run_table([words[0], words[1], f"output='{tmp_path}/a (1)'", words[3]], plugins(), job)
+    assert code == 2
+    assert "not run yet" in text
+    assert "gave up (RuntimeError: a process was killed)" in caplog.text

@@ -104,7 +104,7 @@ def test_killed_and_started_again_a_table_goes_on_where_it_was(tmp_path: Path) -
     assert "1 runs finished, 1 to train" in again.stderr
     assert "going on with" in again.stderr
     assert len(list(tmp_path.glob("outputs/demo/gs3d/*/evaluation.json"))) == 2
-    assert not list(tmp_path.glob("outputs/demo/gs3d/*/*.tmp*"))
+    assert not list(tmp_path.glob("outputs/demo/gs3d/*/**/*partial*"))
 
 
 def test_a_multirun_over_processes_reports_its_failure_and_divides_the_threads(
@@ -149,7 +149,7 @@ def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
     assert main(words) == 0
     assert "training anew" in capsys.readouterr().err
     assert all(torch.equal(value, state[name]) for name, value in last_state(run).items())
-    assert list(run.parent.glob(".*_damaged_1/config.yaml"))
+    assert list(run.parent.glob(".*_set_aside_1/config.yaml"))
     assert stamp
     assert main([*words, f"folder={tmp_path / 'x'}"]) == 2
     assert "leave out folder=" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -85,6 +86,7 @@ def test_a_failed_run_leaves_the_rest_and_no_difference_that_would_mislead(table
 def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
     assert table.at("base", "Set & Co", "kGS").ours == 1.5  # drawn per view, in thousands
     assert table.at("base", "Scale-1", "PSNR").ours == 30.5  # of the group
+    assert table.at("base", "Scene Two", "PSNR").ours == 30.0  # not in the paper's table: beside its figures
     assert table.at("base", "Scene One", "PSNR x2").ours == 20.0
     quoted = table.at("quoted", "Set & Co", "PSNR")
     assert (quoted.ours, quoted.paper, quoted.paper_gain) == (None, 24.0, -1.0)
@@ -94,7 +96,7 @@ def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
 
 def test_the_same_figures_in_every_form(table: Table) -> None:
     lines = list(csv.DictReader(io.StringIO(as_csv(table))))
-    assert len(lines) == 3 * 3 * 3  # rows, scopes, metrics: PSNR, #GS, PSNR x2
+    assert len(lines) == 3 * 4 * 3  # rows; the three scopes and the other scene; PSNR, #GS, PSNR x2
     line = next(n for n in lines if (n["row"], n["scope"], n["metric"]) == ("base", "Set & Co", "PSNR"))
     assert (line["ours"], line["spread"], line["paper"], line["difference"]) == ("25.5", "0.5", "25.0", "0.5")
     assert next(n for n in lines if n["row"] == "quoted")["ours"] == ""
@@ -107,8 +109,28 @@ def test_the_same_figures_in_every_form(table: Table) -> None:
     assert r"Set \& Co" in latex
     assert r"T: 100 \%" in latex
     assert r"base & 25.50 $\pm$ 0.50 & 25.00 & +0.50" in latex
-    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 3
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 4
     assert "NOT the paper's protocol" in latex
+
+
+def test_some_scenes_are_not_set_against_the_mean_of_all_nor_gains_taken_over_other_scenes(tmp_path: Path) -> None:
+    """The baseline lacks `two`, the other row lacks `one`: each is a mean over one scene, but not over the same."""
+    cells = [cell(r, s, 0, tmp_path) for r in ("base", "more") for s in DATASET["scenes"]]
+    for c, psnr in zip(cells, (20.0, None, None, 31.0), strict=True):
+        write_run(c.folder, psnr)
+    published = Published(name="p", figures={("base", "Set & Co", "PSNR"): 25.0}, notes=[])
+    experiment = Experiment(
+        name="t", title="T", published="p", datasets=["set"], baseline="base", rows={"base": "b", "more": "m"}
+    )
+    both = table_of(experiment, {"set": DATASET}, cells, published, {}, [])
+    assert both.at("more", "Set & Co", "PSNR").ours == 31.0
+    assert both.at("more", "Set & Co", "PSNR").gain is None
+    some = replace(experiment, scenes=["one"])
+    table = table_of(some, {"set": DATASET}, [c for c in cells if c.scene == "one"], published, {}, [])
+    (scope,) = table.scopes
+    assert scope.title == "Set & Co (1 of 2 scenes)"
+    assert table.at("base", scope.title, "PSNR").ours == 20.0
+    assert table.at("base", scope.title, "PSNR").difference is None
 
 
 def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: Table) -> None:

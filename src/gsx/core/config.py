@@ -180,6 +180,10 @@ class Compositions:
         found = OmegaConf.select(compose_raw(overrides), key)
         return OmegaConf.to_container(found, resolve=True) if isinstance(found, DictConfig) else {}  # type: ignore
 
+    def keys(self, overrides: Sequence[str]) -> list[str]:
+        """Dotted keys of a composition."""
+        return list(dotted(OmegaConf.to_container(compose_raw(overrides), resolve=False)))
+
     def value(self, overrides: Sequence[str], key: str) -> Any:
         """One value of a composition."""
         return OmegaConf.select(compose_raw(overrides), key)
@@ -190,19 +194,35 @@ class Compositions:
 
         return list(GlobalHydra.instance().config_loader().get_group_options(group))
 
-    def launch(self, overrides: Sequence[str], jobs: Sequence[Sequence[str]], job: Callable[[DictConfig], Any]) -> None:
-        """Carry out jobs, each given by its overrides, by the launcher that `overrides` choose (hydra/launcher=...)."""
+    def launch(
+        self,
+        overrides: Sequence[str],
+        folder: Path,
+        jobs: Sequence[Sequence[str]],
+        job: Callable[[DictConfig], Any],
+    ) -> None:
+        """Carry out jobs, each given by its overrides, by the launcher that `overrides` choose (hydra/launcher=...).
+
+        What the launcher writes goes to `folder`.
+        """
         from hydra import compose as hydra_compose
         from hydra._internal.callbacks import Callbacks
         from hydra.core.global_hydra import GlobalHydra
         from hydra.core.plugins import Plugins as HydraPlugins
         from hydra.types import HydraContext
 
-        config = hydra_compose("config", overrides=list(overrides), return_hydra_config=True)
+        config = hydra_compose(
+            "config", overrides=[*overrides, f"hydra.sweep.dir={quoted(str(folder))}"], return_hydra_config=True
+        )
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
         for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
             _ = result.return_value  # raises what a job raised
+
+
+def quoted(text: str) -> str:
+    """A text as the value of an override, whatever characters it has."""
+    return "'" + text.replace("'", "\\'") + "'"
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:

@@ -30,7 +30,7 @@ from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
 from gsx.core.guard import Agreement, Guard
-from gsx.core.identity import finished, place_of
+from gsx.core.identity import composition_key, finished, judging, place_of
 from gsx.core.images import write_image
 from gsx.core.lpips import load_lpips
 from gsx.core.metrics import psnr
@@ -119,6 +119,8 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
@@ -330,6 +332,8 @@ def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
     try:
         if not checkpoint.sidecars(folder / "checkpoints"):
             raise CheckpointError(f"{folder} holds no checkpoint")
+        if composition_key(files.config) != composition_key(settings.resolved):
+            raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
         run = restored(settings, folder, training=True)
     except CheckpointError as error:
         set_aside(folder, str(error))
@@ -342,13 +346,14 @@ def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
 
 
 def set_aside(folder: Path, reason: str) -> None:
-    """Make room for a run in a folder without a checkpoint that could be used; damaged ones are kept beside it."""
+    """Make room for a run in a folder without a checkpoint that it could use; what has results is kept beside it."""
     if not folder.exists():
         return
-    if not checkpoint.sidecars(folder / "checkpoints"):
+    results = [folder / "evaluation.json", folder / "point_cloud.ply", *checkpoint.sidecars(folder / "checkpoints")]
+    if not any(path.exists() for path in results):
         shutil.rmtree(folder)
         return
-    kept = next(p for n in range(1, 1000) if not (p := folder.parent / f".{folder.name}_damaged_{n}").exists())
+    kept = next(p for n in range(1, 1000) if not (p := folder.parent / f".{folder.name}_set_aside_{n}").exists())
     folder.rename(kept)
     logger.warning("%s; kept as %s, training anew", reason, kept)
 
@@ -480,7 +485,7 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run."""
     logger.info("evaluating %d test views at zoom %s", len(run.scene.test), settings.evaluation.zoom)
-    evaluation = Evaluator(run, settings.evaluation).evaluate()
+    evaluation = Evaluator(run, settings.evaluation).evaluate() | {"judged": judging(settings.resolved)}
     write_json(run.folder / "evaluation.json", evaluation)
     write_pictures(run, settings.evaluation, evaluation)
     write_pseudo_pictures(run, settings.evaluation)

@@ -7,7 +7,7 @@ from typing import Any
 
 def scene_folder(dataset: dict[str, Any], scene: str, root: Path) -> Path | None:
     """Where a scene belongs; None for one that is built in."""
-    return root / dataset["folder"] / scene if dataset["folder"] else None
+    return root.expanduser() / dataset["folder"] / scene if dataset["folder"] else None
 
 
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:

@@ -52,8 +52,8 @@ class Experiment:
                     f"experiment.only: '{row}' is no row of {self.name}; it has {', '.join(self.rows)}."
                     f"{nearest(row, self.rows)}"
                 )
-        if not self.seeds:
-            raise ValueError("experiment.seeds is empty; give at least one, for example [0,1,2]")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"experiment.seeds is {list(self.seeds)}; give different ones, for example [0,1,2]")
 
     @property
     def chosen(self) -> dict[str, str]:
@@ -115,9 +115,12 @@ class Plan:
 
 
 def cells_of(
-    experiment: Experiment, datasets: dict[str, Any], words: Sequence[str], compose: Callable[[list[str]], Settings]
+    experiment: Experiment,
+    datasets: dict[str, Any],
+    words: Callable[[str], Sequence[str]],
+    compose: Callable[[list[str]], Settings],
 ) -> Iterator[Cell]:
-    """Every run of a table, in its order: scene by scene, row by row, seed by seed.
+    """Every run of a table, in its order: scene by scene, row by row, seed by seed. `words`: overrides by variant.
 
     Raises:
         ConfigError: a composition is wrong.
@@ -128,25 +131,30 @@ def cells_of(
                 continue
             for row, variant in experiment.chosen.items():
                 for seed in experiment.seeds:
-                    overrides = [f"dataset={name}", f"variant={variant}", *experiment.overrides, *words]
-                    overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true", "init=trunk"]
+                    overrides = [f"dataset={name}", f"variant={variant}", *experiment.overrides, *words(variant)]
+                    overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true"]
                     settings = compose(overrides)
                     yield Cell(row=row, dataset=name, scene=scene, seed=seed, overrides=overrides, settings=settings)
 
 
-def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Cell]) -> Plan:
-    """What of the cells is to be run, and in which order."""
+def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Cell], together: bool = False) -> Plan:
+    """What of the cells is to be run, and in which order; `together`: by a launcher that runs several at once.
+
+    One after the other each group is run as a whole, so that few states need be kept at a time.
+    """
     runs = {cell.folder: cell for cell in reversed(cells)}  # of cells with one run the first
     due = [cell for cell in cells if runs[cell.folder] is cell and not finished(read_run(cell.folder), cell.config)]
     groups: dict[str, list[Cell]] = {}
     for cell in due:
         groups.setdefault(cell.trunk, []).append(cell)
-    first, second, shared = [], [], 0
+    first: list[list[str]] = []
+    second: list[list[str]] = []
+    shared = 0
     for members in groups.values():
         leader = max(members, key=lambda cell: cell.begins)
         others = [cell for cell in members if cell is not leader]
         first.append(with_states(leader, others))
-        second += [with_states(cell, others) for cell in others]
+        (second if together else first).extend(with_states(cell, others) for cell in others)
         shared += sum(cell.begins for cell in others)
     return Plan(
         experiment=experiment,
@@ -162,7 +170,9 @@ def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Ce
 def with_states(cell: Cell, others: Sequence[Cell]) -> list[str]:
     """A run's overrides, so that it leaves its state where others set out."""
     steps = sorted({other.begins for other in others if 0 < other.begins < other.settings.general.iterations})
-    return [*cell.overrides, f"trunk_at=[{','.join(map(str, steps))}]"]
+    if not steps:
+        return [*cell.overrides, "init=scratch"]
+    return [*cell.overrides, "init=trunk", f"trunk_at=[{','.join(map(str, steps))}]"]
 
 
 def told(plan: Plan) -> list[str]:

@@ -8,8 +8,9 @@ from typing import Any
 
 from gsx.core.cache import content_key
 from gsx.core.config import Compositions, parse_overrides, typed
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import replace_file
+from gsx.core.identity import sorted_items
 from gsx.core.overview import write_overview
 from gsx.core.plugins import Plugins
 from gsx.experiments.datasets import missing
@@ -20,6 +21,18 @@ from gsx.experiments.table_text import as_csv, as_latex, as_markdown, as_text
 
 logger = logging.getLogger(__name__)
 
+PARTS = ("regenerator", "augmenter", "backbone")
+"""Groups whose keys not every row has."""
+TAKEN = {
+    "seed": "experiment.seeds=[0,1,2]",
+    "variant": "experiment.only=[ROW,...] chooses rows",
+    "dataset.scene": "experiment.scenes=[NAME,...] chooses scenes",
+    "reuse": "leave it out",
+    "init": "leave it out",
+    "trunk_at": "leave it out",
+    "folder": "output=FOLDER",
+}
+"""Keys that are set for each run, and what to say instead."""
 OWN = ("experiment", "dataset", "hydra")
 """Keys of the command line that are not handed on to every run as they are."""
 
@@ -31,7 +44,7 @@ def key_of(word: str) -> str:
 
 def is_below_dataset(word: str) -> bool:
     """Whether an override changes something of the dataset instead of choosing one."""
-    return word.lstrip("+").startswith("dataset.")
+    return word.lstrip("+~").startswith("dataset.")
 
 
 def is_table(words: Sequence[str]) -> bool:
@@ -49,26 +62,87 @@ def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any])
     """
     words = [word.lstrip("+") if is_table([word]) else word for word in words]
     common = [word for word in words if key_of(word) not in OWN or is_below_dataset(word)]
+    launching = [word for word in words if key_of(word) == "hydra"]
     with Compositions(plugins) as compositions:
         refuse_sweeps(common)
-        experiment: Experiment = typed(Experiment, compositions.node(words, "experiment"), "experiment")
+        refuse_taken(common)
+        chosen = [word for word in words if key_of(word) == "experiment"]
+        experiment = experiment_of([*chosen, *launching], compositions)
         datasets = datasets_of(experiment, words, compositions)
         check_scenes(experiment, datasets)
-        cells = list(cells_of(experiment, datasets, common, compositions.settings))
-        foreign = protocol_of(experiment, cells, compositions)
+        fitting = fitting_words(experiment, list(datasets), common, compositions)
+        cells = list(cells_of(experiment, datasets, fitting.__getitem__, compositions.settings))
+        plain = experiment_of([word for word in chosen if is_table([word])], compositions)
+        foreign = protocol_of(plain, cells, compositions)
         lacking = lacking_of(cells, datasets)
-        plan = planned(experiment, datasets, [c for c in cells if (c.dataset, c.scene) not in lacking])
-        folder = folder_of(plan, cells[0].config, common)
+        due = [cell for cell in cells if (cell.dataset, cell.scene) not in lacking]
+        plan = planned(experiment, datasets, due, together=any("launcher=" in word for word in launching))
+        folder = folder_of(plan, plain, cells[0].config, common)
         tell(plan, lacking)
         if experiment.dry:
             return "".join(f"gsx {shlex.join(job)}\n" for phase in plan.phases for job in phase), 0
         for number, phase in enumerate(plan.phases):
-            own = [word for word in words if key_of(word) == "hydra"]
-            compositions.launch([*own, f"hydra.sweep.dir={folder / 'launched' / str(number)}"], phase, job)
+            launched(compositions, launching, folder / "launched" / str(number), phase, job)
     published = read_table(experiment.published) if experiment.published else None
     table = table_of(experiment, datasets, cells, published, lacking, foreign)
     write_table(table, folder, [cell.folder for cell in cells if cell.folder.is_dir()])
     return f"{as_text(table)}\n{folder / 'table.md'}\n", 0 if set(table.states) == {"ok"} else 2
+
+
+def launched(
+    compositions: Compositions,
+    words: Sequence[str],
+    folder: Path,
+    jobs: Sequence[Sequence[str]],
+    job: Callable[[Any], Any],
+) -> None:
+    """Carry out a phase. A launcher that gives up, for one killed process perhaps, does not cost the table."""
+    try:
+        compositions.launch(words, folder, jobs, job)
+    except Exception as error:
+        logger.warning(
+            "the launcher gave up (%s: %s): give the same command again for what is missing",
+            type(error).__name__,
+            first_line(error),
+        )
+
+
+def experiment_of(words: Sequence[str], compositions: Compositions) -> Experiment:
+    """The table that these words choose and change."""
+    experiment: Experiment = typed(Experiment, compositions.node(words, "experiment"), "experiment")
+    return experiment
+
+
+def fitting_words(
+    experiment: Experiment, datasets: Sequence[str], words: Sequence[str], compositions: Compositions
+) -> dict[str, list[str]]:
+    """The overrides of each variant: those of a component (PARTS) only where the variant has such a key.
+
+    Raises:
+        ConfigError: no variant has it.
+    """
+    particular = [word for word in words if key_of(word) in PARTS and "." in word.partition("=")[0]]
+    others = [word for word in words if word not in particular]
+    variants = set(experiment.chosen.values())
+    known = {v: compositions.keys([f"dataset={datasets[0]}", f"variant={v}", *others]) for v in variants if particular}
+    every = sorted({key for keys in known.values() for key in keys})
+    for word in particular:
+        if not word.startswith(("+", "~")) and (key := word.partition("=")[0]) not in every:
+            raise ConfigError(f"'{key}' is no configuration key of any row.{nearest(key, every)}")
+
+    def fits(word: str, variant: str) -> bool:
+        return word not in particular or word.startswith(("+", "~")) or word.partition("=")[0] in known[variant]
+
+    return {variant: [word for word in words if fits(word, variant)] for variant in variants}
+
+
+def refuse_taken(words: Sequence[str]) -> None:
+    """Raise ConfigError for words that each run of a table has of its own."""
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        if key in TAKEN or word.startswith("~dataset"):
+            remedy = TAKEN.get(key, "experiment.scenes=[NAME,...] chooses scenes")
+            raise ConfigError(f"'{word}' is not for tables, whose runs have it of their own: {remedy}")
 
 
 def refuse_sweeps(words: Sequence[str]) -> None:
@@ -107,12 +181,13 @@ def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[st
     return {place: reason for place, reason in reasons.items() if reason}
 
 
-def folder_of(plan: Plan, config: dict[str, Any], common: Sequence[str]) -> Path:
-    """Where a table is written: other overrides, another folder."""
+def folder_of(plan: Plan, plain: Experiment, config: dict[str, Any], common: Sequence[str]) -> Path:
+    """Where a table is written: with other overrides than the published ones it is another folder."""
     told = [plan.experiment.name, *plan.datasets, config["budget"]["name"]]
-    choice = (list(common), plan.experiment.seeds, plan.experiment.only, plan.experiment.scenes)
-    plain = choice == ([word for word in common if key_of(word) == "budget"], [0], [], [])
-    return Path(config["output"]) / "experiments" / "_".join([*told, *([] if plain else [content_key(choice)[:6]])])
+    others = [word for word in common if key_of(word) not in ("budget", "output", "data_root")]
+    changed = others or plan.experiment != plain
+    key = [content_key(others, sorted_items(vars(plan.experiment)))[:6]] if changed else []
+    return Path(config["output"]) / "experiments" / "_".join([*told, *key])
 
 
 def tell(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.control import spread
 from gsx.core.files import read_json
-from gsx.core.identity import NAMES, WATCHING, WHERE, asked_for
+from gsx.core.identity import NAMES, OPERATING, WATCHING, WHERE, asked_for, without
 from gsx.core.overview import flattened
 from gsx.core.run_files import RunFiles, is_number, part, read_run, state_of
 from gsx.core.trunk import BRANCH
@@ -23,6 +23,8 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "MB": lambda e: e.get("megabytes"),
 }
 """By metric, from an evaluation or one of its groups; Mem is the size of the model (spec 1.10, 32)."""
+PLACES = ("model", "revision", "variant", "dtype", "tiling")
+"""Keys of regenerators that say where a model comes from and how it fits into memory."""
 SHOWN_KEYS = 12
 """Differences from the paper's protocol that are listed."""
 
@@ -56,7 +58,7 @@ class Figure:
     spread: float | None
     """Half of the range over the seeds; None with a single one."""
     seeds: int
-    scenes: int
+    whole: tuple[str, ...]
     """Scenes with a figure for every seed."""
     of_scenes: int
     paper: float | None
@@ -66,6 +68,11 @@ class Figure:
     paper_gain: float | None = None
     problem: str = ""
     """Why there is no figure."""
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes the figure is a mean over."""
+        return len(self.whole)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,12 +104,17 @@ def scopes_of(datasets: dict[str, Any], scenes: Sequence[str], published: Publis
         Scope(title=dataset["title"], dataset=name, scenes=chosen_scenes(dataset, scenes))
         for name, dataset in datasets.items()
     ]
-    if published is None:
-        return own
-    known = [scope for title in published.scopes if (scope := matching(title, datasets, scenes))]
-    if known:
-        return known
-    return [Scope(title=s.title, dataset=s.dataset, scenes=s.scenes, paper=published.scopes[0]) for s in own]
+    known = [scope for title in (published.scopes if published else []) if (scope := matching(title, datasets, scenes))]
+    if published and not known:
+        known = [Scope(title=s.title, dataset=s.dataset, scenes=s.scenes, paper=published.scopes[0]) for s in own]
+    singles = [
+        Scope(title=datasets[s.dataset]["scenes"][scene], dataset=s.dataset, scenes=[scene])
+        for s in own
+        for scene in s.scenes
+        if len(s.scenes) > 1
+    ]
+    told = {(tuple(scope.scenes), scope.group) for scope in known}
+    return known + [scope for scope in [*own, *singles] if (tuple(scope.scenes), "") not in told]
 
 
 def chosen_scenes(dataset: dict[str, Any], scenes: Sequence[str]) -> list[str]:
@@ -114,10 +126,12 @@ def matching(title: str, datasets: dict[str, Any], scenes: Sequence[str]) -> Sco
     """The scope that the paper calls so, if it is among those that are run."""
     for name, dataset in datasets.items():
         chosen = chosen_scenes(dataset, scenes)
+        some = "" if len(chosen) == len(dataset["scenes"]) else f" ({len(chosen)} of {len(dataset['scenes'])} scenes)"
         if title in (dataset["title"], f"{dataset['title']} (Average)"):
-            return Scope(title=title, dataset=name, scenes=chosen, paper=title if chosen else "")
+            return Scope(title=title + some, dataset=name, scenes=chosen, paper="" if some else title)
         if title.startswith("Scale-"):
-            return Scope(title=title, dataset=name, scenes=chosen, group=title.lower(), paper=title)
+            paper = "" if some else title
+            return Scope(title=title + some, dataset=name, scenes=chosen, group=title.lower(), paper=paper)
         for scene in chosen:
             if dataset["scenes"][scene] == title:
                 return Scope(title=title, dataset=name, scenes=[scene], paper=title)
@@ -187,7 +201,7 @@ def figure(
         ours=ours,
         spread=spread(by_seed) if len(by_seed) > 1 else None,
         seeds=len(seeds),
-        scenes=len(whole),
+        whole=tuple(whole),
         of_scenes=len(scope.scenes),
         paper=paper,
         difference=ours - paper if complete and ours is not None and paper is not None else None,
@@ -219,7 +233,8 @@ def problem_of(
             return "not run yet"
         if state != "ok":
             return f"{state}: {why}"
-    return f"{metric} is not measured" if cells else "not run"
+    remedy = ": give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE" if metric == "LPIPS" else ""
+    return f"{metric} is not measured{remedy}" if cells else "not run"
 
 
 def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
@@ -232,7 +247,7 @@ def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
     out = []
     for f in figures:
         b = base.get((f.scope, f.metric))
-        same = b is not None and f.scenes == b.scenes
+        same = b is not None and f.whole == b.whole
         ours = gain(f, f.ours, b.ours) if b and same else None
         theirs = gain(f, f.paper, b.paper) if b else None
         out.append(Figure(**(vars(f) | {"gain": ours, "paper_gain": theirs})))
@@ -323,4 +338,5 @@ def judged(config: dict[str, Any]) -> dict[str, Any]:
     kept["eval"] = {key: value for key, value in part(config, "eval").items() if key not in ("zoom", "tile_pixels")}
     kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
     kept["scene"] = {k: v for k, v in part(config, "scene").items() if k not in ("path", "cache_gb", "iterations")}
-    return kept | {"regenerator": asked_for(config)}
+    kept["metrics"] = {key: part(part(config, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
+    return kept | {"regenerator": without(asked_for(config), (*OPERATING, *PLACES))}

@@ -78,11 +78,6 @@ def cells(table: Table, scope: Scope) -> list[list[str]]:
     return [[*head, *gains], *rows]
 
 
-def by_scene(table: Table) -> list[Scope]:
-    """Scopes that are one scene or group each."""
-    return [scope for scope in table.scopes if len(scope.scenes) == 1 or scope.group]
-
-
 def problems(table: Table) -> list[str]:
     """Why figures are missing: each reason once, with the rows it holds for."""
     rows: dict[str, list[str]] = {}
