@@ -43,7 +43,7 @@ def experiments() -> dict[str, dict]:
     """Every experiment that ships."""
     with Compositions(plugins()) as compositions:
         names = compositions.choices("experiment")
-        return {name: compositions.node([f"experiment={name}"], "experiment") for name in names}
+        return {name: compositions.node([f"+experiment={name}"], "experiment") for name in names}
 
 
 def covered(table: Published, node: dict) -> set[str]:

@@ -60,7 +60,7 @@ def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any])
     Raises:
         ConfigError: an experiment, dataset or override is wrong; nothing was run.
     """
-    words = [word.lstrip("+") if is_table([word]) else word for word in words]
+    words = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in words]
     common = [word for word in words if key_of(word) not in OWN or is_below_dataset(word)]
     launching = [word for word in words if key_of(word) == "hydra"]
     with Compositions(plugins) as compositions:
