@@ -1,4 +1,4 @@
-"""Models of half of the training views each: what they are shown, what they show, and that the run goes on untouched."""
+"""Models of half of the training views each: what they are shown, what they show; the run goes on untouched."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import published_options, small_scene, spread
+from tiny import tiny_run
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D
+from gsx.cli import plugins
 from gsx.core.backbone import Backbone, Beginning
 from gsx.core.camera import Camera
 from gsx.core.errors import InputError
@@ -17,6 +19,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.run import Run, Sampler, TrainingOptions
 from gsx.core.scene import Scene
+from gsx.core.session import execute, open_run
 from gsx.core.trainer import take_step
 
 TRAINING = TrainingOptions(
@@ -128,3 +131,32 @@ def test_one_view_has_no_halves(tmp_path: Path) -> None:
     run, _ = begun(tmp_path, views=1, steps=1)
     with pytest.raises(InputError, match="one training view"):
         held_out_renders(run, 0.5, seed=0)
+
+
+RUN = (
+    "iterations=24",
+    "rasterizer=eager",
+    "augmenter=bootstrap",
+    "regenerator/restore=scene_restorer_brief",
+    "augmenter.bootstrap.timing.every=4000",
+    "augmenter.bootstrap.timing.span=2000",
+    "training.checkpoint_every=5",
+)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_run_killed_after_its_event_makes_the_same_of_it_again(kept: bool, tmp_path: Path) -> None:
+    """From the checkpoint of step 10, before the event at 12: with the file of half-models' renders, and without."""
+    whole, folder = tiny_run(tmp_path / "whole", RUN), tmp_path / "killed"
+    tiny_run(folder, RUN, stop_after=13)
+    for path in (folder / "checkpoints").glob("step_0000013*"):
+        path.unlink()
+    (renders,) = (folder / "regenerators").glob("halves_0000012_4.safetensors")
+    if not kept:
+        renders.unlink()
+    run, settings = open_run(folder, plugins(), (), training=True)
+    assert run.step == 10
+    execute(run, settings, plugins())
+    assert run.complete
+    again = run.backbone.tensors()
+    assert all(torch.equal(value, again[name]) for name, value in whole.backbone.tensors().items())
