@@ -466,13 +466,13 @@ def test_pictures_that_cannot_be_used_are_dropped_and_counted(
     augmenter = with_regenerator(run, Spoiling(3, SPOILT[reason]))
     augmenter.term(run, 45, 0)
     assert sum(map(len, augmenter.views.values())) == 12
-    assert "6 pictures dropped" in caplog.text
+    assert "6 of 18 x2 pictures dropped" in caplog.text
     assert reason in caplog.text
 
 
 def test_an_event_that_loses_most_pictures_is_an_error(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
-    with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at step 44.*regenerator/upscale"):
+    with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at x2, step 44.*regenerator/upscale"):
         with_regenerator(run, Spoiling(1, SPOILT["not finite"])).term(run, 45, 0)
 
 
