@@ -123,6 +123,7 @@ def test_every_variant_is_looked_at_and_says_its_name(composed: dict[str, Settin
     assert set(composed) == set(DELTAS) | set(OTHERS) | long
     for name, settings in composed.items():
         assert settings.general.variant == name
+        assert settings.backbone.options.max_primitives == 0  # published runs have no cap
     assert [composed[name].general.iterations for name in sorted(long)] == [50000, 60000, 70000, 80000]
 
 

@@ -42,6 +42,7 @@ from gsx.core.pseudo import Augmenter, Setting
 from gsx.core.pseudo_pictures import write_pseudo_pictures
 from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.regenerator import Regenerator
+from gsx.core.remarks import CapNotice, remarks_of
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
 from gsx.core.run_files import read_run
@@ -436,6 +437,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     listeners: list[object] = [
         Guard(),
         Agreement(),
+        CapNotice(),
         log,
         *trackers,
         Checkpointer(),
@@ -503,7 +505,7 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s, "
         f"{e['train_seconds']:.0f} s of training, peak memory {e['peak_memory_mb']:,.0f} MB",
     ]
-    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()]
+    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()] + remarks_of(e)
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ from gsx.core.control import spread
 from gsx.core.files import read_json
 from gsx.core.identity import NAMES, OPERATING, WATCHING, WHERE, asked_for, without
 from gsx.core.overview import flattened
+from gsx.core.remarks import remarks_of
 from gsx.core.run_files import RunFiles, is_number, part, read_run, state_of
 from gsx.core.trunk import BRANCH
 from gsx.experiments.plan import Cell, Experiment
@@ -68,6 +69,8 @@ class Figure:
     paper_gain: float | None = None
     problem: str = ""
     """Why there is no figure."""
+    remarks: tuple[str, ...] = ()
+    """What a reader must know of the runs behind it."""
 
     @property
     def scenes(self) -> int:
@@ -206,7 +209,13 @@ def figure(
         paper=paper,
         difference=ours - paper if complete and ours is not None and paper is not None else None,
         problem="" if complete else problem_of(inside, files, lacking, metric),
+        remarks=tuple(dict.fromkeys(told for cell in inside for told in remarks_on(cell, files))),
     )
+
+
+def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
+    """What a reader must know of a run, with its row and scene."""
+    return [f"{cell.row}, {cell.scene}: {remark}" for remark in remarks_of(files[cell.folder].evaluation)]
 
 
 def measured(files: RunFiles, metric: str, group: str) -> float | None:
@@ -285,6 +294,7 @@ def notes_of(
 ) -> list[str]:
     """What a reader must know beside the figures."""
     notes = [f"{row}: {reason}" for row, reason in experiment.quoted.items()]
+    notes += dict.fromkeys(f"* {told}" for cell in cells for told in remarks_on(cell, files))
     notes += [f"corrected: {note}" for note in (published.notes if published else [])]
     shared: dict[Path, list[str]] = {}
     for cell in cells:
