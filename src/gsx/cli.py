@@ -40,7 +40,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
   gsx plugins               what is installed, from where, and what failed to load
 
-  gsx --cfg job             print the configuration instead of training
+  gsx --cfg job --resolve   print the configuration instead of training
   gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
   gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
   gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
@@ -64,6 +64,7 @@ HYDRA_FLAGS = (
     "-c",
     "-p",
     "--package",
+    "--resolve",
 )
 """Flags that are handed to Hydra as they are."""
 
