@@ -351,17 +351,18 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.core.identity import claimed, place_of
+    from gsx.core.identity import claimed, place_of, scene_stamp
     from gsx.core.session import pursue
 
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
-    folder = place_of(settings.resolved)
+    stamp = scene_stamp(settings.resolved)
+    folder = place_of(settings.resolved, stamp)
     folders.append(folder)
     with claimed(folder) as alone:
         if not alone:
             raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
-        _, run = pursue(settings, loaded)
+        _, run = pursue(settings, loaded, stamp)
         if run is None:
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0
