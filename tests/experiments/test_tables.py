@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from gsx.core.cache import source_revision
 from gsx.experiments.plan import Cell, Experiment
 from gsx.experiments.published import Published
 from gsx.experiments.table import Table, protocol_differences, table_of
@@ -131,6 +132,24 @@ def test_some_scenes_are_not_set_against_the_mean_of_all_nor_gains_taken_over_ot
     assert scope.title == "Set & Co (1 of 2 scenes)"
     assert table.at("base", scope.title, "PSNR").ours == 20.0
     assert table.at("base", scope.title, "PSNR").difference is None
+
+
+def test_rows_of_another_revision_of_the_source_are_named(tmp_path: Path) -> None:
+    """One run of `base` and both of `more` are of others; `more` was begun by one and finished by another."""
+    cells = [cell(r, s, 0, tmp_path) for r in ("base", "more") for s in DATASET["scenes"]]
+    sources = [source_revision(), "0123456789abcdef", "0123456789abcdef", f"0123456789abcdef+{source_revision()}"]
+    for c, source in zip(cells, sources, strict=True):
+        write_run(c.folder, 20.0)
+        (c.folder / "environment.json").write_text(json.dumps({"source": source}))
+    experiment = Experiment(
+        name="t", title="T", published="", datasets=["set"], baseline="base", rows={"base": "b", "more": "m"}
+    )
+    said = as_markdown(table_of(experiment, {"set": DATASET}, cells, None, {}, []))
+    this = source_revision()
+    assert f"(0123456789abcdef, this is {this}): base (1 of 2 runs), more (1 of 2 runs)" in said
+    assert f"(0123456789abcdef+{this}, this is {this}): more (1 of 2 runs)" in said
+    (tmp_path / "base_two_0" / "environment.json").write_text(json.dumps({"source": this}))
+    assert "base (" not in as_text(table_of(experiment, {"set": DATASET}, cells[:2], None, {}, []))
 
 
 def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: Table) -> None:

@@ -21,6 +21,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.regenerator import Checks
 from gsx.core.run import TrainingOptions
 
+OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
 OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
 MODULE = "gsx.conf"
@@ -46,7 +47,7 @@ class GeneralOptions:
     output: str
     folder: str
     length: int = 0
-    """Iterations of the whole run, of which a budget takes a share."""
+    """Iterations of the whole run, of which a budget takes a share: the variant's, the scene's or the backbone's."""
     variant: str = ""
     """Name of the published method that is composed; empty for others."""
     data_root: str = ""
