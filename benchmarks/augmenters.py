@@ -8,10 +8,7 @@ below --runs are not trained again. Takes one to two hours on two cores.
 """
 
 import argparse
-import os
-import shutil
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -24,7 +21,8 @@ import torch
 
 from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, stamped, text_table, write_results
+from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.runs import train
 
 RESULTS = Path(__file__).parent / "results"
 SUBJECTS = {
@@ -114,22 +112,10 @@ def train_group(scene: str, family: str, seed: int, once: bool, given: argparse.
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
     for name, words in asked(FAMILIES[family], once).items():
         folder = folder_of(scene, family, name, seed, given)
-        if (folder / "evaluation.json").is_file():
-            continue
         common = (f"iterations={given.iterations}", f"seed={seed}", "init=trunk", "eval.zoom=[1,2,4]")
-        command = [*SUBJECTS[scene], *where, *FAMILIES[family].control, *words, *common, f"folder={folder}"]
-        shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
         print(time.strftime("%H:%M"), folder.name, flush=True)
-        log = folder.with_suffix(".log")
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("w") as stream:
-            subprocess.run(
-                [sys.executable, "-m", "gsx", *command],
-                check=True,
-                env=os.environ | threads,
-                stdout=stream,
-                stderr=subprocess.STDOUT,
-            )
+        overrides = [*SUBJECTS[scene], *where, *FAMILIES[family].control, *words, *common]
+        train(folder, overrides, threads, folder.with_suffix(".log"))
 
 
 def rows_of(scene: str, family: str, given: argparse.Namespace) -> list[dict[str, Any]]:
@@ -185,6 +171,8 @@ def main(words: Sequence[str]) -> None:
     """Train everything, and write the tables."""
     given = arguments(words)
     machine, load = describe_machine(torch.device("cpu")), told_load()
+    machine |= {"threads": 1} if given.jobs > 1 else {}
+    read_sections(given.to / "augmenters_cpu.json")  # what cannot be added to is refused before training
     scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
     families = given.families.split(",")
     groups = [(scene, family, seed, False) for seed in range(given.seeds) for scene in scenes for family in families]

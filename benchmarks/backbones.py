@@ -7,7 +7,6 @@ line; those found finished below --runs are not trained again. Takes one to two 
 """
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +15,9 @@ from typing import Any
 
 import torch
 
-from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, stamped, text_table, write_results
+from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.runs import shown, train
 
 BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d")
 RESULTS = Path(__file__).parent / "results"
@@ -60,7 +59,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def overrides(name: str, backbone: str, given: argparse.Namespace, folder: Path) -> list[str]:
+def overrides(name: str, backbone: str, given: argparse.Namespace) -> list[str]:
     """What the run is given after `gsx`."""
     subject = SUBJECTS[name]
     return [
@@ -70,17 +69,12 @@ def overrides(name: str, backbone: str, given: argparse.Namespace, folder: Path)
         *subject.changes.get(backbone, ()),
         f"iterations={given.iterations}",
         f"eval.zoom=[{','.join(subject.zooms)}]",
-        f"folder={folder}",
     ]
 
 
 def trained(name: str, backbone: str, given: argparse.Namespace) -> dict[str, Any]:
     """evaluation.json of a run, trained unless that was done before."""
-    folder = given.runs / f"{name}_{given.iterations}_{backbone}"
-    result = folder / "evaluation.json"
-    if not result.is_file():
-        subprocess.run([sys.executable, "-m", "gsx", *overrides(name, backbone, given, folder)], check=True)
-    return read_json(result)
+    return train(given.runs / f"{name}_{given.iterations}_{backbone}", overrides(name, backbone, given))
 
 
 def row(backbone: str, evaluation: dict[str, Any]) -> dict[str, Any]:
@@ -99,11 +93,6 @@ def row(backbone: str, evaluation: dict[str, Any]) -> dict[str, Any]:
         "fps": f"{evaluation['render_fps']:.1f}",
         "peak_mb": round(evaluation["peak_memory_mb"]),
     }
-
-
-def shown(entry: dict[str, Any]) -> str:
-    """PSNR of the zoomed render, and of the x1 render resized."""
-    return f"{entry['psnr']:.2f} ({entry['enlarged_psnr']:.2f})"
 
 
 def section(name: str, given: argparse.Namespace, rows: list[dict[str, Any]], load: float, command: str) -> Section:
@@ -130,6 +119,7 @@ def main(words: Sequence[str]) -> None:
     given = arguments(words)
     machine, load = describe_machine(torch.device("cpu")), told_load()
     command = shown_command(words, "benchmarks/backbones.py")
+    read_sections(given.to / "backbones_cpu.json")  # what cannot be added to is refused before training
     for name in given.only.split(","):
         rows: list[dict[str, Any]] = []
         for backbone in given.backbones.split(","):

@@ -6,8 +6,8 @@
     python benchmarks/rasterizer.py --only step --run RUN      # training steps of a run folder from its checkpoint on
     python benchmarks/rasterizer.py --device cuda
 
-Prints tables; writes JSON, Markdown and a plot to benchmarks/results. Sections measured earlier on the same machine
-are kept there. Measure alone: on a busy machine two threads can be tens of times slower.
+Prints tables; writes JSON, Markdown and a plot to benchmarks/results. Sections measured earlier are kept there, each
+with its machine. Measure alone: on a busy machine two threads can be tens of times slower.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from measuring.ceiling import limits_section
 from measuring.machine import BUSY, describe_machine, load_average, shown_command
 from measuring.memory import unmeasurable
 from measuring.prototype import prototype_section
-from measuring.results import Section, text_table, write_results
+from measuring.results import Section, read_sections, text_table, write_results
 from measuring.scaling import gpu_table, scale_overlap, scale_resolution, scale_splats, scale_tiles
 from measuring.steps import step_section
 from measuring.watches import Patience
@@ -142,6 +142,7 @@ def measure(given: argparse.Namespace, command: str) -> None:
     machine = describe_machine(bench.device)
     say(", ".join(f"{key} {value}" for key, value in machine.items()))
     result = f"rasterizer_{bench.device.type}{'_quick' if given.quick else ''}"
+    read_sections(given.to / f"{result}.json")  # what cannot be added to is refused now, not after measuring
     written: list[Path] = []
     for name in names:
         say(f"{name} ...")

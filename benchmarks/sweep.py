@@ -4,19 +4,19 @@ Both take turns, round by round; the ratio of their times holds within a round. 
 """
 
 import argparse
-import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from measuring.machine import describe_machine, told_load
+from measuring.machine import describe_machine, shown_command, told_load
+from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.runs import gsx
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = 12
@@ -29,54 +29,42 @@ WAYS = {"one after the other": [], "processes": ["hydra/launcher=processes"]}
 def seconds(words: list[str], folder: Path) -> float:
     """Wall-clock time of the multirun, reports included."""
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "gsx", "-m", *SWEEP, *words, f"output={folder}"]
-    subprocess.run(command, check=True, capture_output=True)
+    gsx(["-m", *SWEEP, *words, f"output={folder}"], log=folder.with_suffix(".log"))
     return time.perf_counter() - begun
 
 
-def main() -> None:
+def main(words: Sequence[str]) -> None:
     """Measure and write results/sweep_cpu.{md,json}."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args()
-    load = told_load()
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
+    given = parser.parse_args(words)
+    machine, load = describe_machine(torch.device("cpu")), told_load()
+    read_sections(given.to / "sweep_cpu.json")  # what cannot be added to is refused before measuring
     times: dict[str, list[float]] = {way: [] for way in WAYS}
     with tempfile.TemporaryDirectory() as folder:
         for number in range(given.rounds):
-            for way, words in WAYS.items():
-                times[way].append(seconds(words, Path(folder) / f"{number}_{way.replace(' ', '_')}"))
+            for way, overrides in WAYS.items():
+                times[way].append(seconds(overrides, Path(folder) / f"{number}_{way.replace(' ', '_')}"))
                 print(f"round {number + 1}, {way}: {times[way][-1]:.1f} s", flush=True)
-    ratios = [alone / together for alone, together in zip(*times.values(), strict=True)]
-    result: dict[str, Any] = {
-        "date": time.strftime("%Y-%m-%d"),
-        "load_before": load,
-        "machine": describe_machine(torch.device("cpu")),
-        "command": f"gsx -m {' '.join(SWEEP)}",
-        "seconds": times,
-        "ratios": ratios,
-    }
-    (RESULTS / "sweep_cpu.json").write_text(json.dumps(result, indent=1) + "\n")
-    (RESULTS / "sweep_cpu.md").write_text(table(times, ratios, result["machine"]["cpu"]))
-    print(table(times, ratios, result["machine"]["cpu"]))
+    table = section(times, load, shown_command(words, "benchmarks/sweep.py"))
+    write_results(given.to, "sweep_cpu", machine, {"sweep": table})
+    print(text_table(table))
 
 
-def table(times: dict[str, list[float]], ratios: list[float], machine: str) -> str:
-    """The result in words and numbers."""
-    lines = [
-        f"# {RUNS} runs",
-        "",
-        f"`gsx -m {' '.join(SWEEP)}`, medians of {len(ratios)} rounds, {time.strftime('%Y-%m-%d')}, "
-        f"{machine}, {os.cpu_count()} cores.",
-        "",
-        "| | seconds | times as fast |",
-        "|---|--:|--:|",
-    ]
+def section(times: Mapping[str, Sequence[float]], load: float, command: str) -> Section:
+    """The table: medians over rounds, and ratios that hold within a round."""
+    alone = next(iter(times.values()))
+    rows: list[dict[str, Any]] = []
     for way, taken in times.items():
-        first = way == next(iter(times))
-        ratio = "" if first else f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
-        lines.append(f"| {way} | {statistics.median(taken):.1f} | {ratio} |")
-    return "\n".join(lines) + "\n"
+        ratios = [before / now for before, now in zip(alone, taken, strict=True)]
+        told = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+        row = {"way": way, "seconds": f"{statistics.median(taken):.1f}", "rounds": list(taken)}
+        rows.append(row | ({} if taken is alone else {"ratio": told}))
+    columns = [["way", "way"], ["seconds", "seconds"], ["ratio", "times as fast"]]
+    note = f"`gsx -m {' '.join(SWEEP)}`, medians of {len(alone)} rounds."
+    return stamped(f"{RUNS} runs", columns, rows, [note], load, command)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -1,11 +1,19 @@
 """Pictures to regenerate, and requests for them."""
 
+from collections.abc import Callable, Sequence
+from importlib.resources import as_file, files
+
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor
 
+from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
 from gsx.core.camera import Camera, look_at
+from gsx.core.config import typed
 from gsx.core.images import to_uint8
-from gsx.core.regenerator import Request, box_average
+from gsx.core.pseudo import Setting
+from gsx.core.regenerator import Checks, Material, Request, as_blocks, box_average
+from gsx.core.run import Run
 from gsx.core.scene import View
 
 EDGE = 48
@@ -43,3 +51,37 @@ def request(image: Tensor, scale: int = 2) -> Request:
         image=image, scale=scale, camera=seen, view=View("a", seen, Photo(to_uint8(image))), number=0, photo=True,
         seed=22, strength=0.0, strongest=0.0, prompt="", step=1,
     )  # fmt: skip
+
+
+def strict_checks() -> Checks:
+    """conf/checks/strict.yaml."""
+    with as_file(files("gsx.conf") / "checks" / "strict.yaml") as path:
+        return typed(Checks, OmegaConf.to_container(OmegaConf.load(path)), "checks")
+
+
+class Made:
+    """A regenerator made of a function."""
+
+    def __init__(self, enlarge: Callable[[Request], Tensor]) -> None:
+        self.enlarge = enlarge
+
+    def prepare(self, material: Material) -> dict[str, float]:
+        return {}
+
+    def regenerate(self, requests: Sequence[Request]) -> list[Tensor]:
+        return [self.enlarge(request) for request in requests]
+
+
+def through_an_autoencoder(request: Request) -> Tensor:
+    """The input, enlarged, with an error of 20 dB that no reduction takes out."""
+    generator = torch.Generator().manual_seed(request.number)
+    noise = torch.randn(request.image.shape, generator=generator)
+    noise -= noise.mean((1, 2), keepdim=True)
+    return as_blocks((request.image + 0.1 * noise).clamp(0, 1), request.scale)
+
+
+def noisy(options: PseudoOptions, name: str, run: Run) -> PseudoDetails:
+    """An augmenter by these options on the scene of a run, redrawn through an autoencoder."""
+    made = Made(through_an_autoencoder)
+    setting = Setting(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=lambda role: made)
+    return PseudoDetails(options, setting)

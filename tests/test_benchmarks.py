@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import rasterizer as benchmark
+from gsx.core.errors import InputError
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
 from measuring import naive, rival
@@ -18,7 +19,7 @@ from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, spl
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, backward_bytes, evaluation_limit, forward_bytes
 from measuring.memory import HostPeaks, peak_memory, unmeasurable
 from measuring.prototype import factors_of
-from measuring.results import cell, merged, scaling_plot
+from measuring.results import Section, cell, read_sections, scaling_plot, stamped, write_results
 from measuring.scaling import growth
 from measuring.watches import LEAST, Patience, Watch, take_turns
 
@@ -150,13 +151,65 @@ def test_every_section_runs_and_writes(tmp_path: Path, capsys: pytest.CaptureFix
     assert "gsplat: not runnable here" in capsys.readouterr().out
 
 
-def test_sections_of_earlier_runs_stay_on_the_same_machine(tmp_path: Path) -> None:
-    assert run(tmp_path, "--only", "tile") == 0
-    assert run(tmp_path, "--only", "overlap") == 0
-    found = results(tmp_path)
-    assert list(found["sections"]) == ["tile", "overlap"]
-    other = merged(tmp_path / "rasterizer_cpu_quick.json", found["machine"] | {"cpu": "another"}, {"step": {}})
-    assert list(other["sections"]) == ["step"]
+def a_section(value: str) -> Section:
+    return stamped("A table", [["x1", "x1"]], [{"x1": value}], ["a note"], 0.1, "python this.py")
+
+
+def test_a_section_measured_again_replaces_itself_alone_whatever_the_machine(tmp_path: Path) -> None:
+    one, two = {"cpu": "A", "threads": 1}, {"cpu": "A", "threads": 2}
+    write_results(tmp_path, "r", two, {"fox": a_section("29.19"), "demo": a_section("26.56")})
+    write_results(tmp_path, "r", one, {"demo": a_section("26.57")})
+    write_results(tmp_path, "r", one, {"lego": a_section("31.81")})
+    found = read_sections(tmp_path / "r.json")
+    told = {name: (part["rows"][0]["x1"], part["machine"]["threads"]) for name, part in found.items()}
+    assert told == {"fox": ("29.19", 2), "demo": ("26.57", 1), "lego": ("31.81", 1)}
+
+
+def test_the_page_names_with_each_section_what_machines_differ_in(tmp_path: Path) -> None:
+    write_results(tmp_path, "r", {"cpu": "A", "threads": 2}, {"fox": a_section("29.19")})
+    alone = (tmp_path / "r.md").read_text()
+    assert "* threads: 2" in alone
+    assert "Machine of this section" not in alone
+    write_results(tmp_path, "r", {"cpu": "A", "threads": 1, "gpu": "G"}, {"demo": a_section("26.57")})
+    top, fox, demo = (tmp_path / "r.md").read_text().split("## ")
+    assert "* cpu: A" in top
+    assert "threads" not in top
+    assert fox.rstrip().endswith("Machine of this section: threads 2.")
+    assert demo.rstrip().endswith("Machine of this section: threads 1, gpu G.")
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ('{"sections": {', "cannot be read"),
+        ("[]", "is no file of sections"),
+        ('{"machine": {}, "sections": {}}', "is no file of sections"),  # the machine of all, as it was once
+        ('{"sections": {"fox": {"rows": []}}}', "section 'fox' without columns, command, commit"),
+    ],
+)
+def test_files_that_cannot_be_added_to_are_refused_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, sentence: str
+) -> None:
+    path = tmp_path / "rasterizer_cpu_quick.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match="is left as it is"):
+        write_results(tmp_path, path.stem, {}, {"fox": a_section("29.19")})
+    assert run(tmp_path, "--only", "limits") == 2
+    told = capsys.readouterr().err
+    assert sentence in told
+    assert "limits ..." not in told
+    assert path.read_text() == content
+
+
+def test_committed_results_are_what_the_writer_reads_and_their_pages_are_theirs() -> None:
+    from measuring.results import markdown
+
+    files = sorted(benchmark.RESULTS.glob("*.json"))
+    assert files
+    for file in files:
+        sections = read_sections(file)
+        drawn = file.with_suffix(".svg").is_file()
+        assert file.with_suffix(".md").read_text() == markdown(file.stem, sections, drawn), file.name
 
 
 @pytest.mark.parametrize(
@@ -327,3 +380,60 @@ def test_controls_are_trained_before_what_branches_from_them() -> None:
         assert next(iter(augmenters.asked(family, False))) == "control"
         both = {**augmenters.asked(family, False), **augmenters.asked(family, True)}
         assert set(both) == {"control", *family.added}
+
+
+# -- whole commands ------------------------------------------------------------------------------------------------
+
+TINY = ["scene.width=32", "scene.height=24", "scene.points=50", "scene.train_views=2", "scene.test_views=1"]
+TINY += ["scene.samples=1", "iterations=2", "rasterizer=eager", "device=cpu"]
+
+
+def test_whole_commands_are_run_once_and_told_by_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import commands
+    from gsx.cli import main
+    from measuring import runs
+
+    asked: list[list[str]] = []
+
+    def gsx(words: list[str], *rest: object) -> None:
+        asked.append(words)
+        assert main(words) == 0  # here, which spares the start of a process
+
+    monkeypatch.setattr(runs, "gsx", gsx)
+    words = ["--only", "demo", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path), *TINY]
+    commands.main(words)
+    commands.main(words)
+    assert [words[0] for words in asked] == ["eval.zoom=[1,2,4]"]
+    [row] = read_sections(tmp_path / "commands_cpu.json")["commands"]["rows"]
+    evaluation = json.loads((tmp_path / "runs" / "demo" / "evaluation.json").read_text())
+    assert row["command"].startswith("`gsx 'eval.zoom=[1,2,4]' scene.width=32")
+    assert (row["state"], row["steps"], row["primitives"]) == ("ok", 2, evaluation["primitives"])
+    assert row["x1"] == f"{evaluation['psnr']:.2f}"
+    finest = evaluation["zoom"]["4"]
+    assert row["x4"] == f"{finest['psnr']:.2f} ({finest['enlarged_psnr']:.2f})"
+    assert 0 <= row["evaluating"] <= row["whole"]
+
+
+def test_seconds_of_evaluation_are_those_told_or_between_lines_of_the_log(tmp_path: Path) -> None:
+    from measuring.runs import evaluate_seconds
+
+    (tmp_path / "log.txt").write_text(
+        "2026-11-22 23:59:00,500 INFO evaluating 1 test views at zoom [1.0]\n"  # an earlier `gsx eval`
+        "2026-11-22 23:59:50,500 INFO evaluating 10 test views at zoom [1.0, 2.0]\n"
+        "2026-11-23 00:00:10,000 INFO held-out PSNR 11.47 dB\n"
+        "a line of a message that has several\n"
+    )
+    assert evaluate_seconds(tmp_path, {}) == 19.5
+    assert evaluate_seconds(tmp_path, {"evaluate_seconds": 3.25}) == 3.25
+    (tmp_path / "log.txt").write_text("nothing\n")
+    assert evaluate_seconds(tmp_path, {}) is None
+
+
+def test_a_multirun_over_processes_is_compared_within_its_rounds() -> None:
+    import sweep
+
+    table = sweep.section({"one after the other": [10.0, 30.0, 20.0], "processes": [5.0, 10.0, 16.0]}, 0.0, "")
+    alone, together = table["rows"]
+    assert (alone["seconds"], together["seconds"]) == ("20.0", "10.0")
+    assert "ratio" not in alone
+    assert together["ratio"] == "2.00 (1.25 to 3.00)"  # 10/5, 30/10, 20/16

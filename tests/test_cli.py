@@ -111,6 +111,13 @@ def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert "max_reprojection_px" in capsys.readouterr().out
 
 
+def test_values_that_follow_from_others_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene=colmap", "backbone=octree_scaffold", "budget=quick", "--cfg", "job", "--resolve"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert "length: 40000" in printed
+    assert "iterations: 2000" in printed
+
+
 def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["-sc", "install=bash"]) == 0
     assert "complete " in capsys.readouterr().out

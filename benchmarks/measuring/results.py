@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis, Plot, Series, axis_of, curve
+from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, replace_file, write_json
 from measuring.machine import commit
 
 Section = dict[str, Any]
-"""title, columns ([key, heading] each), rows, notes; and when, how and of what it was measured."""
+"""title, columns ([key, heading] each), rows, notes; and when, how, of what and, in a file, on what it was measured."""
+PARTS = {"title", "columns", "rows", "notes", "date", "commit", "load", "command", "machine"}
+"""Of a section in a file."""
 COLOURS = {"eager": "#3366aa", "compiled": "#d2601a", "naive": "#888888", "gsplat": "#2a8a4a"}
 STYLE = (
     "svg{font:11px system-ui,sans-serif;background:#fff}.grid{stroke:#ddd}.axis{stroke:#666}"
@@ -66,32 +69,70 @@ def markdown_table(section: Section) -> str:
     return "\n\n".join([f"## {section['title']}", table, *section["notes"], facts])
 
 
-def merged(path: Path, machine: dict[str, Any], sections: dict[str, Section]) -> dict[str, Any]:
-    """The new sections, and those that an earlier run on the very same machine has left in the file."""
-    old = read_json(path) if path.is_file() else {}
-    kept = old.get("sections", {}) if old.get("machine") == machine else {}
-    return {"machine": machine, "sections": {**kept, **sections}}
+def read_sections(path: Path) -> dict[str, Section]:
+    """The sections of a file of results, by name; none where there is no file.
+
+    Raises:
+        InputError: the file cannot be read, or is of another form.
+    """
+    if not path.exists():
+        return {}
+    try:
+        found = read_json(path)
+    except (OSError, ValueError) as error:
+        raise kept_as_it_is(path, f"cannot be read ({first_line(error)})") from error
+    if not isinstance(found, dict) or found.keys() != {"sections"} or not isinstance(found["sections"], dict):
+        raise kept_as_it_is(path, "is no file of sections")
+    for name, section in found["sections"].items():
+        lacking = PARTS - section.keys() if isinstance(section, dict) else PARTS
+        if lacking:
+            raise kept_as_it_is(path, f"has a section '{name}' without {', '.join(sorted(lacking))}")
+    return found["sections"]
+
+
+def kept_as_it_is(path: Path, reason: str) -> InputError:
+    """Why nothing is written."""
+    return InputError(f"{path} {reason} and is left as it is: move it away, or choose another folder with --to")
 
 
 def write_results(folder: Path, name: str, machine: dict[str, Any], sections: dict[str, Section]) -> list[Path]:
-    """Write `name`.json, .md and, with a scaling section, .svg; returns what was written."""
+    """Write `name`.json, .md and, with a scaling section, .svg; returns what was written.
+
+    Each section keeps the machine that it was measured on; those of earlier runs stay, but for the ones given now.
+
+    Raises:
+        InputError: the file that is there cannot be read, or is of another form; it stays as it is.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    results = merged(folder / f"{name}.json", machine, sections)
-    write_json(folder / f"{name}.json", results)
-    drawing = scaling_plot(results["sections"].get("splats", {"rows": []})["rows"])
+    new = {key: section | {"machine": machine} for key, section in sections.items()}
+    merged = read_sections(folder / f"{name}.json") | new
+    write_json(folder / f"{name}.json", {"sections": merged})
+    return [folder / f"{name}.json", *write_pages(folder, name, merged)]
+
+
+def write_pages(folder: Path, name: str, sections: dict[str, Section]) -> list[Path]:
+    """Write `name`.md and, with a scaling section, .svg."""
+    drawing = scaling_plot(sections.get("splats", {"rows": []})["rows"])
     if drawing:
         replace_file(folder / f"{name}.svg", drawing.encode())
-    page = markdown(name, results, bool(drawing))
-    replace_file(folder / f"{name}.md", page.encode())
-    return [folder / f"{name}{suffix}" for suffix in (".json", ".md", *([".svg"] if drawing else []))]
+    replace_file(folder / f"{name}.md", markdown(name, sections, bool(drawing)).encode())
+    return [folder / f"{name}{suffix}" for suffix in (".md", *([".svg"] if drawing else []))]
 
 
-def markdown(name: str, results: dict[str, Any], drawn: bool) -> str:
-    """The page."""
-    facts = "\n".join(f"* {key}: {value}" for key, value in results["machine"].items())
+def markdown(name: str, sections: dict[str, Section], drawn: bool) -> str:
+    """The page: what all sections have been measured on at the top, the rest of it with each section."""
+    machines = [section["machine"] for section in sections.values()]
+    common = {key: value for key, value in machines[0].items() if all(m.get(key) == value for m in machines)}
+    facts = "\n".join(f"* {key}: {value}" for key, value in common.items())
     picture = [f"![Time against pairs]({name}.svg)"] if drawn else []
-    tables = [markdown_table(section) for section in results["sections"].values()]
+    tables = [markdown_table(section) + own_facts(section["machine"], common) for section in sections.values()]
     return "\n\n".join([f"# {name.replace('_', ' ')}", facts, *picture, *tables]) + "\n"
+
+
+def own_facts(machine: dict[str, Any], common: dict[str, Any]) -> str:
+    """What a section was measured on, as far as others were not."""
+    own = [f"{key} {value}" for key, value in machine.items() if key not in common]
+    return f"\n\nMachine of this section: {', '.join(own)}." if own else ""
 
 
 # -- plot ----------------------------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
   gsx plugins               what is installed, from where, and what failed to load
 
-  gsx --cfg job             print the configuration instead of training
+  gsx --cfg job --resolve   print the configuration instead of training
   gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
   gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
   gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
@@ -64,6 +64,7 @@ HYDRA_FLAGS = (
     "-c",
     "-p",
     "--package",
+    "--resolve",
 )
 """Flags that are handed to Hydra as they are."""
 
@@ -350,17 +351,18 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.core.identity import claimed, place_of
+    from gsx.core.identity import claimed, place_of, scene_stamp
     from gsx.core.session import pursue
 
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
-    folder = place_of(settings.resolved)
+    stamp = scene_stamp(settings.resolved)
+    folder = place_of(settings.resolved, stamp)
     folders.append(folder)
     with claimed(folder) as alone:
         if not alone:
             raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
-        _, run = pursue(settings, loaded)
+        _, run = pursue(settings, loaded, stamp)
         if run is None:
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0

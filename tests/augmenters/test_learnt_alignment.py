@@ -94,7 +94,7 @@ def test_true_pixels_help_the_more_the_closer_and_displaced_ones_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half a pixel of displacement, let through: the checks that would drop it have tests of their own."""
-    monkeypatch.setattr(pseudo_details, "complaint", lambda request, result: "")
+    monkeypatch.setattr(pseudo_details, "strayed", lambda request, result, checks: {})
     control, perfect, displaced = (
         trained(tmp_path / name, pixels) for name, pixels in (("control", None), ("perfect", 0.0), ("displaced", 0.5))
     )

@@ -326,14 +326,20 @@ def test_only_the_first_cameras(tmp_path: Path) -> None:
 
 
 def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
-    """Level of detail counts distances in focal lengths: at twice the focal length a level more is drawn (1.4)."""
-    run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "augmenter=upscale_paper")
-    own = run.scene.train[0].camera
-    run.backbone.begin(80)
-    levels = [int(run.backbone.drawn(c).rows.numel()) for c in (own, own.crop(18, 13, 12, 9).zoom(4))]  # type: ignore[attr-defined]
-    full = run.backbone.table["level"][run.backbone.drawn(own.zoom(4)).rows].max()  # type: ignore[attr-defined]
-    assert full >= run.backbone.table["level"][run.backbone.drawn(own).rows].max()  # type: ignore[attr-defined]
-    assert levels[0] > 0
+    """Level of detail counts distances in focal lengths: at twice the focal length a level more is drawn (1.4).
+
+    Anchors of all levels stand together in the middle of a picture, where D / d = 2^1.3 asks for level 1.
+    """
+    run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "backbone.levels.count=6", "augmenter=upscale_paper")
+    own, backbone = run.scene.train[0].camera, run.backbone
+    table, distance = backbone.table, backbone.levels.farthest / 2**1.3  # type: ignore[attr-defined]
+    spot = (own.centre + distance * own.rotation[2]).float()
+    table.columns["anchors"] = spot.expand(len(table), 3).clone()
+    table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)
+    cameras = [own, *(augmenter_of(run).sketch(run, 44, 0, scale, 0).camera for scale in (2, 4))]
+    backbone.begin(80)
+    drawn = [table["level"][backbone.drawn(camera).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
+    assert drawn == [[0, 1], [0, 1, 2], [0, 1, 2, 3]]
 
 
 def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
@@ -466,13 +472,13 @@ def test_pictures_that_cannot_be_used_are_dropped_and_counted(
     augmenter = with_regenerator(run, Spoiling(3, SPOILT[reason]))
     augmenter.term(run, 45, 0)
     assert sum(map(len, augmenter.views.values())) == 12
-    assert "6 pictures dropped" in caplog.text
+    assert "6 of 18 x2 pictures dropped" in caplog.text
     assert reason in caplog.text
 
 
 def test_an_event_that_loses_most_pictures_is_an_error(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
-    with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at step 44.*regenerator/upscale"):
+    with pytest.raises(TrainingError, match=r"lost 18 of 18 pictures at x2, step 44.*regenerator/upscale"):
         with_regenerator(run, Spoiling(1, SPOILT["not finite"])).term(run, 45, 0)
 
 

@@ -487,9 +487,14 @@ def test_one_camera_has_no_extent_to_clamp_by() -> None:
 def test_the_cap_is_never_passed(name: str) -> None:
     count = len(small_anchors(name).table)
     backbone = judged(name, f"max_primitives={count + 2}")
-    assert backbone.adapt(1600)["grown"] == 2
-    full = judged(name, f"max_primitives={count - 7}")
-    assert full.adapt(1600) == {"grown": 0, "pruned": 5}
+    free = judged(name, "max_primitives=0").adapt(1600)
+    assert "withheld" not in free
+    capped = backbone.adapt(1600)
+    assert (capped["grown"], capped["pruned"]) == (2, 5)
+    assert capped["withheld"] >= free["grown"] - 2  # what found no room takes no finer anchor's cell either
+    full = judged(name, f"max_primitives={count - 7}").adapt(1600)
+    assert (full["grown"], full["pruned"]) == (0, 5)
+    assert full["withheld"] > 0
 
 
 @pytest.mark.parametrize(("quirk", "step", "opens"), [

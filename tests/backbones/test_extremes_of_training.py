@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small_scene import small_scene, spread
+from torch import Tensor
 
 from gsx.cli import plugins
 from gsx.core.backbone import Backbone, Beginning
@@ -102,33 +103,53 @@ def test_training_stays_finite(name: str, scene: str) -> None:
         assert bool(torch.isfinite(tensor.float()).all())
 
 
-def measured_in(scene: Scene, unit: float) -> Scene:
-    """The same scene with lengths in other units, as a careless reconstruction gives them."""
-    return in_units(scene, unit)
+def careless(count: int, unit: float) -> Scene:
+    """The scene of `small_scene` as a reconstruction in other units gives it: every length times `unit`, but near."""
+    scene = small_scene(unit * spread(count), extent=2.0 * unit)
+    eyes = [[0.1 * i * unit, -4.0 * unit, unit] for i in range(len(scene.train))]
+    cameras = [look_at(eye, [0, 0, 0], fov_x=0.9, width=24, height=16) for eye in eyes]
+    views = [replace(view, camera=camera) for view, camera in zip(scene.train, cameras, strict=True)]
+    return replace(scene, train=views[1:], test=views[:1])
 
 
-@pytest.mark.parametrize("unit", [2.0**-10, 2.0**13])  # powers of two: nothing is rounded on the way
+def picture_after_training(name: str, scene: Scene) -> Tensor:
+    """Of a training view."""
+    backbone, camera = built(name, scene), scene.train[0].camera
+    trained(backbone, scene)
+    with torch.no_grad():
+        return rasterize(backbone.splats(camera), camera, backbone.raster).image
+
+
 @pytest.mark.parametrize("name", BACKBONES)
-def test_units_make_no_difference_once_they_are_named(name: str, unit: float) -> None:
-    scene = small_scene(spread(40), extent=2.0)
-    other = in_units(measured_in(scene, unit), 1 / unit)
-    pictures = []
-    for given in (scene, other):
-        backbone = built(name, given)
-        trained(backbone, given)
-        camera = given.train[0].camera
-        with torch.no_grad():
-            pictures.append(rasterize(backbone.splats(camera), camera, backbone.raster).image)
-    assert torch.equal(pictures[1], pictures[0])
+def test_units_make_no_difference_once_they_are_named(name: str) -> None:
+    picture = picture_after_training(name, careless(40, 1.0))
+    assert picture.std() > 0.01, "the test needs something to see"
+    for unit in (2.0**-10, 2.0**13):  # powers of two: nothing is rounded on the way
+        assert torch.equal(picture_after_training(name, in_units(careless(40, unit), 1 / unit)), picture)
+
+
+def test_units_that_are_not_named_make_a_difference() -> None:
+    """The near plane is behind the scene."""
+    picture = picture_after_training("gs3d", careless(40, 2.0**-10))
+    assert not torch.allclose(picture, picture_after_training("gs3d", careless(40, 1.0)), atol=0.01)
+
+
+def test_a_unit_multiplies_every_length() -> None:
+    scene = in_units(careless(3, 1.0), 3.0)
+    assert torch.equal(scene.points.positions, 3 * spread(3))
+    assert scene.extent == 6.0
+    assert scene.notes == ["positions are multiplied by scene.unit=3"]
+    for i, view in enumerate([*scene.test, *scene.train]):
+        torch.testing.assert_close(view.camera.centre, torch.tensor([0.3 * i, -12.0, 3.0], dtype=torch.float64))
+        assert view.camera.near == 0.2
 
 
 def test_odd_units_are_noticed() -> None:
-    scene = small_scene(spread(200), extent=2.0)
-    assert not warned_of_units(scene).notes
-    (small,) = warned_of_units(replace(measured_in(scene, 1e-3), notes=[])).notes
+    assert not warned_of_units(careless(200, 1.0)).notes
+    (small,) = warned_of_units(careless(200, 1e-3)).notes
     assert "near planes hide 100% of the points" in small
     assert "try scene.unit=1000" in small
-    (large,) = warned_of_units(replace(measured_in(scene, 1e4), notes=[])).notes
+    (large,) = warned_of_units(careless(200, 1e4)).notes
     assert "the extent is 2e+04 scene units" in large
     assert "try scene.unit=0.0001" in large
 

@@ -76,7 +76,7 @@ def keep_all(monkeypatch: pytest.MonkeyPatch) -> None:
 def deepen(table: Table, representation, *, voxel: float = 1.0, early: bool = True, most: int = ALL, **changes) -> int:
     generator = torch.Generator().manual_seed(9)
     options = replace(PUBLISHED, **changes)
-    return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, most)
+    return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, most)[0]
 
 
 def grown(table: Table, before: int) -> list[tuple[float, ...]]:
@@ -268,7 +268,7 @@ def level_up(
     """`changes` are of quirks or of growth options."""
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
     options = replace(PUBLISHED, **{name: value for name, value in changes.items() if name not in CHOICES})
-    return grow_by_level(table, representation, options, levels or three_levels(), 40.0, quirks, gate, most)
+    return grow_by_level(table, representation, options, levels or three_levels(), 40.0, quirks, gate, most)[0]
 
 
 def grown_levels(table: Table, before: int) -> list[tuple]:

@@ -312,6 +312,7 @@ def test_a_cloud_about_to_vanish_stays() -> None:
         (5, [0, 1, 3, 2, 2]),
         (4, [0, 1, 2, 3]),
         (1, [0, 1, 2, 3]),
+        (0, [0, 1, 3, 1, 3, 2, 2]),  # none
     ],
 )
 def test_no_primitive_is_added_beyond_the_cap_and_strong_gradients_come_first(cap: int, expected: list[int]) -> None:
@@ -319,6 +320,7 @@ def test_no_primitive_is_added_beyond_the_cap_and_strong_gradients_come_first(ca
     done = backbone.adapt(600)
     assert labels(backbone) == expected
     assert done["cloned"] + done["split"] == len(expected) - 4
+    assert done.get("withheld", 0) == 7 - len(expected)
 
 
 # -- opacity reset -----------------------------------------------------------------------------------------------------

@@ -40,6 +40,42 @@ def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
     assert compose([*given, "scene.random_points=7"], plugins()).scene.options.random_points == 7
 
 
+@pytest.mark.parametrize(
+    ("words", "iterations"),
+    [
+        (["scene=colmap"], 30000),  # 3D-GS
+        (["scene=photos", "backbone=mip_splatting"], 30000),
+        (["scene=colmap", "backbone=scaffold"], 30000),
+        (["scene=colmap", "backbone=octree_scaffold"], 40000),  # Octree-GS
+        (["scene=transforms", "backbone=octree_gs3d"], 40000),
+        (["dataset=mipnerf360", "dataset.scene=garden", "backbone=octree_scaffold"], 40000),
+        (["scene=colmap", "backbone=octree_scaffold", "backbone.published_iterations=50000"], 50000),  # as a preset may
+        (["scene=colmap", "backbone=octree_scaffold", "budget=quick"], 2000),  # a twentieth
+        (["scene=colmap", "budget=quick"], 1500),
+        (["scene=colmap", "backbone=octree_scaffold", "scene.iterations=700"], 700),
+        (["scene=colmap", "variant=octree_ub"], 40000),
+        (["scene=colmap", "variant=up_3dgs"], 30000),
+        (["scene=colmap", "variant=octree_gs_8"], 80000),
+        (["scene=colmap", "variant=octree_ub", "iterations=5"], 5),
+        ([], 900),  # the built-in scene
+        (["backbone=octree_scaffold"], 900),
+        (["budget=quick"], 45),
+        (["dataset=demo", "variant=octree_ub", "budget=quick"], 2000),
+    ],
+)
+def test_a_run_is_as_long_as_its_method_was_published(words: list[str], iterations: int) -> None:
+    assert compose(words, plugins()).general.iterations == iterations
+
+
+def test_a_backbone_that_names_no_length_is_run_as_long_as_3d_gs() -> None:
+    assert compose_length(["scene=colmap", "~backbone.published_iterations"]) == 30000
+
+
+def compose_length(words: list[str]) -> int:
+    with Compositions(plugins()) as compositions:
+        return int(compositions.value(words, "iterations"))
+
+
 def test_published_values_of_gs3d() -> None:
     options = compose([], plugins()).backbone.options
     assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)

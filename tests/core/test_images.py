@@ -465,3 +465,22 @@ def test_source_decodes_once_per_size(tmp_path: Path) -> None:
     assert torch.equal(truth.image(whole.crop(1, 2, 3, 4)), first[:, 2:6, 1:4])
     with pytest.raises(InputError, match="does not exist"):
         truth.image(whole.zoom(0.5))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"rule": ResizeRule(filter="area", light="display", background=(1.0, 1.0, 1.0))},
+        {"rule": ResizeRule(filter="bicubic", light="display", background=(0.0, 0.0, 0.0))},
+        {"remap": lambda image: 255 - image},
+    ],
+)
+def test_pictures_made_otherwise_are_kept_apart(tmp_path: Path, other: dict[str, Any]) -> None:
+    """Two sources of one file and one cache: each gives what it gives alone."""
+    write_image(tmp_path / "a.png", photo((4, 40, 60)))
+    whole, cache = camera(60, 40), ImageCache(10**6)
+    half = whole.zoom(0.5)
+    alone = [source(tmp_path / "a.png", whole, **changes).image(half) for changes in ({}, other)]
+    shared = [source(tmp_path / "a.png", whole, cache=cache, **changes).image(half) for changes in ({}, other)]
+    assert not torch.equal(*alone)
+    assert all(torch.equal(a, b) for a, b in zip(alone, shared, strict=True))

@@ -1,6 +1,7 @@
 """What is planned for a table: which runs, which of them first, where states are left, what is finished."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,8 @@ import pytest
 
 from gsx.cli import plugins
 from gsx.core.config import Compositions, write_config
-from gsx.core.identity import claimed, composition_key, judging, place_of
+from gsx.core.identity import claimed, composition_key, finished, judging, place_of, scene_stamp
+from gsx.core.run_files import read_run
 from gsx.experiments.plan import Cell, Experiment, cells_of, planned, told
 from gsx.experiments.sweep import run_table
 
@@ -104,7 +106,7 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
     with Compositions(plugins()) as compositions:
 
         def key(*words: str) -> str:
-            return composition_key(compositions.settings(["scene=demo", *words]).resolved)
+            return composition_key(compositions.settings(["scene=demo", *words]).resolved, "")
 
         plain = key()
         for word in ("output=elsewhere", "device=cpu", "init=trunk", "trunk_at=[3]", "eval.zoom=[1,2]", "reuse=true",
@@ -119,7 +121,56 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         assert key("augmenter=upscale", "regenerator/upscale=lanczos") != upscaled
         assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
         config = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"]).resolved
-    assert place_of(config) == Path("o/my_scene/gs3d") / composition_key(config)
+    assert place_of(config, "s") == Path("o/my_scene/gs3d") / composition_key(config, "s")
+    assert place_of(config, "s") != place_of(config, "t")
+
+
+def own_scene(root: Path, content: str) -> Path:
+    """Not a scene that could be trained, but photos below a data_root, of a known time."""
+    photo = root / "yard" / "images" / "a.png"
+    photo.parent.mkdir(parents=True)
+    photo.write_text(content)
+    os.utime(photo, ns=(0, 10**9))
+    return photo
+
+
+def test_a_scene_is_what_its_folder_holds(tmp_path: Path) -> None:
+    """Not what the folder is called: by `dataset=own` two roots may have different scenes of one name."""
+    with Compositions(plugins()) as compositions:
+
+        def place(root: str, *words: str) -> Path:
+            given = ["dataset=own", "+dataset.scenes.yard=Yard", "dataset.scene=yard", f"data_root={tmp_path / root}"]
+            config = compositions.settings([*given, f"output={tmp_path / 'out'}", *words]).resolved
+            return place_of(config, scene_stamp(config))
+
+        own_scene(tmp_path / "a", "one")
+        photo = own_scene(tmp_path / "b", "another")
+        first, second = place("a"), place("b")
+        assert first != second
+        assert first == place("a", f"scene.path={tmp_path / 'a' / 'yard'}")
+        (tmp_path / "a").rename(tmp_path / "c")
+        assert place("c") == first
+        absent = place("a")
+        assert absent not in (first, second, place("nowhere"))
+        os.utime(photo, ns=(0, 10**9 + 1))
+        touched = place("b")
+        os.utime(photo, ns=(0, 10**9))
+        assert place("b") == second != touched
+        (tmp_path / "points.ply").write_text("1")
+        named = [place("b", "scene.images=../../points.ply")]
+        (tmp_path / "points.ply").write_text("22")
+        assert place("b", "scene.images=../../points.ply") not in named
+
+
+def test_a_run_is_compared_with_what_it_was_trained_on(tmp_path: Path) -> None:
+    table = experiment(only=["other"])
+    (cell,) = cells(table, tmp_path)
+    finish(cell)
+    files = read_run(cell.folder)
+    assert finished(files, cell.config, "")
+    (cell.folder / "environment.json").write_text(json.dumps({"scene": {"stamp": "earlier"}}))
+    assert not finished(read_run(cell.folder), cell.config, "")
+    assert finished(read_run(cell.folder), cell.config, "earlier")
 
 
 def test_a_folder_is_claimed_by_one_at_a_time(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from gsx.cli import main
+from gsx.core.images import write_image
 
 SMALL = ["scene.width=48", "scene.height=36", "scene.train_views=6", "scene.test_views=2", "scene.points=300",
          "scene.samples=1", "training.test_points=0", "device=cpu", "rasterizer=eager"]  # fmt: skip
@@ -153,6 +155,52 @@ def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
     assert stamp
     assert main([*words, f"folder={tmp_path / 'x'}"]) == 2
     assert "leave out folder=" in capsys.readouterr().err
+
+
+def photographs(folder: Path, seed: int) -> None:
+    """A NeRF-synthetic scene of noise: two training views and a test view, all from the same distance."""
+    generator = torch.Generator().manual_seed(seed)
+    for split, angles in (("train", (0.0, 1.0)), ("test", (0.5,))):
+        frames = []
+        for i, angle in enumerate(angles):
+            c, s = math.cos(angle), math.sin(angle)
+            pose = [[c, 0, s, 4 * s], [s, 0, -c, -4 * c], [0, 1, 0, 0], [0, 0, 0, 1]]
+            frames.append({"file_path": f"{split}/{i}", "transform_matrix": pose})
+            (folder / split).mkdir(parents=True, exist_ok=True)
+            write_image(folder / split / f"{i}.png", torch.rand(3, 30, 40, generator=generator))
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.9, "frames": frames}))
+
+
+def test_a_table_shows_the_scene_that_is_there_and_names_results_of_another_source(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two data roots with other photographs under one name; then one of them is moved, and a photo replaced."""
+    table = ["+experiment=table_frameworks", "dataset=own", "+dataset.scenes.yard=Yard", "scene=blender",
+             "experiment.only=[3D-GS]", "budget=smoke", "iterations=3", "scene.random_points=60", "device=cpu",
+             "rasterizer=eager", "training.test_points=0", "eval.zoom=[1]"]  # fmt: skip
+
+    def shown(root: str) -> tuple[str, bool]:
+        """PSNR in the table, and whether nothing was trained for it."""
+        main([*table, f"data_root={tmp_path / root}"])
+        (line,) = [line for line in rows(tmp_path) if line["row"] == "3D-GS"]
+        return line["ours"], "1 runs finished, 0 to train" in capsys.readouterr().err
+
+    photographs(tmp_path / "a" / "yard", 0)
+    photographs(tmp_path / "b" / "yard", 1)
+    (first, _), (second, found) = shown("a"), shown("b")
+    assert first != second
+    assert not found
+    (tmp_path / "a").rename(tmp_path / "moved")
+    for path in tmp_path.glob("outputs/yard/gs3d/*/environment.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"source": "0123456789abcdef"}))
+    assert shown("moved") == (first, True)
+    (markdown,) = tmp_path.glob("outputs/experiments/*/table.md")
+    assert "another revision of gsx's source (0123456789abcdef" in markdown.read_text()
+    run = [f"data_root={tmp_path / 'moved'}", "variant=3d_gs", "dataset.scene=yard", "reuse=true"]
+    assert main([*run, *(word for word in table if "experiment" not in word)]) == 0
+    assert "finished earlier by another revision of gsx's source (0123456789abcdef" in capsys.readouterr().err
+    write_image(tmp_path / "b" / "yard" / "test" / "0.png", torch.zeros(3, 30, 40))
+    assert shown("b")[1] is False
 
 
 def test_sigterm_leaves_a_checkpoint_and_its_own_exit_code(tmp_path: Path) -> None:

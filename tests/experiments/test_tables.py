@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from gsx.core.cache import source_revision
 from gsx.experiments.plan import Cell, Experiment
 from gsx.experiments.published import Published
 from gsx.experiments.table import Table, protocol_differences, table_of
@@ -133,6 +134,24 @@ def test_some_scenes_are_not_set_against_the_mean_of_all_nor_gains_taken_over_ot
     assert table.at("base", scope.title, "PSNR").difference is None
 
 
+def test_rows_of_another_revision_of_the_source_are_named(tmp_path: Path) -> None:
+    """One run of `base` and both of `more` are of others; `more` was begun by one and finished by another."""
+    cells = [cell(r, s, 0, tmp_path) for r in ("base", "more") for s in DATASET["scenes"]]
+    sources = [source_revision(), "0123456789abcdef", "0123456789abcdef", f"0123456789abcdef+{source_revision()}"]
+    for c, source in zip(cells, sources, strict=True):
+        write_run(c.folder, 20.0)
+        (c.folder / "environment.json").write_text(json.dumps({"source": source}))
+    experiment = Experiment(
+        name="t", title="T", published="", datasets=["set"], baseline="base", rows={"base": "b", "more": "m"}
+    )
+    said = as_markdown(table_of(experiment, {"set": DATASET}, cells, None, {}, []))
+    this = source_revision()
+    assert f"(0123456789abcdef, this is {this}): base (1 of 2 runs), more (1 of 2 runs)" in said
+    assert f"(0123456789abcdef+{this}, this is {this}): more (1 of 2 runs)" in said
+    (tmp_path / "base_two_0" / "environment.json").write_text(json.dumps({"source": this}))
+    assert "base (" not in as_text(table_of(experiment, {"set": DATASET}, cells[:2], None, {}, []))
+
+
 def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: Table) -> None:
     paper = {"iterations": 40, "eval": {"zoom": [1], "ssim": "inria"}, "augmenter": {"u": {"role": "upscale"}},
              "regenerator": {"upscale": {"name": "sd", "steps": 15}, "restore": {"name": "turbo"}},
@@ -149,3 +168,31 @@ def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: 
         "regenerator.upscale.name=lanczos (paper: sd)",  # of another component only its name; restore is not used
         "scene.max_width=400 (paper: 1600)",
     ]
+
+
+def test_what_happened_to_a_run_stands_beside_its_figures(tmp_path: Path) -> None:
+    cells = [cell("base", scene, 0, tmp_path) for scene in DATASET["scenes"]]
+    for c in cells:
+        write_run(c.folder, 20.0)
+    place = tmp_path / "base_two_0" / "evaluation.json"
+    incident = {
+        "withheld": {"step": 6, "primitives": 3},
+        "pseudo": {"up": {"asked": {"2": 8}, "dropped": {"2": 0.25}, "warned": {"agreement": {"2": 0.5}}}},
+        "left_out": 1.5,
+    }
+    place.write_text(json.dumps(json.loads(place.read_text()) | incident))
+    experiment = Experiment(name="t", title="T", published="p", datasets=["set"], baseline="base", rows={"base": "b"})
+    table = table_of(experiment, {"set": DATASET}, cells, None, {}, [])
+    told = [
+        "base, two: growth is held at backbone.max_primitives from step 6 on: the model may be too small",
+        "base, two: up lost 25.0% of its x2 pictures",
+        "base, two: 50.0% of up's x2 pictures disagree with their input",
+        "base, two: renders leave out 1.5 splats a view, whose values cannot be drawn",
+    ]
+    assert table.notes == [f"* {text}" for text in told]
+    assert table.at("base", "Scene Two", "PSNR").remarks == tuple(told)
+    assert table.at("base", "Scene One", "PSNR").remarks == ()
+    assert "20.00 *" in as_text(table).split("Scene Two")[1]
+    assert "20.00 *" not in as_text(table).split("Scene One")[1].split("Scene Two")[0]
+    line = next(n for n in csv.DictReader(io.StringIO(as_csv(table))) if n["scope"] == "Scene Two")
+    assert line["remarks"] == "; ".join(told)

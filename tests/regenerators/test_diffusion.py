@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from sealed import trained_sealed
 from small_scene import small_scene, spread
 from tiny import OVERRIDES, tiny_run
 from torch import Tensor
@@ -792,3 +793,13 @@ def test_a_model_that_cannot_be_loaded_costs_no_training(
     path.write_text(sound)
     assert main(["resume", str(folder)]) == 0
     assert json.loads((folder / "status.json").read_text()) == {"state": "ok", "reason": "", "step": 40}
+
+
+def test_the_whole_run_needs_no_held_out_picture(
+    whole: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does tuning, which measures itself on training views."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    smaller = ("scene.train_views=4", "scene.points=100", "iterations=16")
+    run = trained_sealed(tmp_path / "run", [*whole, *smaller], monkeypatch)
+    assert (run.folder / "regenerators" / "sdxl_turbo" / "adapter.json").is_file()

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from regenerating import EDGE, Photo, camera, request, stripes
+from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
 from gsx.core.errors import ConfigError
 from gsx.core.images import resize, to_uint8
-from gsx.core.regenerator import Material, Regenerator, box_average, complaint
+from gsx.core.regenerator import Material, Regenerator, box_average, strayed, unusable
 from gsx.core.scene import View
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at
 
@@ -80,7 +80,8 @@ def test_what_it_makes_reduces_to_what_it_was_given(learnt: SceneSR) -> None:
         (result,) = learnt.regenerate([given])
         assert result.shape == (3, 12 * scale, 12 * scale)
         assert float((box_average(result, scale) - low).abs().max()) < 2 / 255
-        assert complaint(given, result) == ""
+        assert unusable(given, result) == ""
+        assert strayed(given, result, strict_checks()) == {}
 
 
 def test_before_learning_it_is_the_bicubic_enlargement() -> None:

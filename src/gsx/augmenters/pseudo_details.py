@@ -6,6 +6,7 @@ regenerator redraw what is cut from the photograph or rendered there; compare wi
 
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,7 +37,17 @@ from gsx.core.images import to_uint8, write_image
 from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.regenerator import Checked, Request, as_blocks, box_average, colour_matched, complaint, projected
+from gsx.core.regenerator import (
+    Checked,
+    Checks,
+    Request,
+    as_blocks,
+    box_average,
+    colour_matched,
+    projected,
+    strayed,
+    unusable,
+)
 from gsx.core.run import Run
 from gsx.core.schedule import Schedule
 from gsx.core.seeds import derived_seed
@@ -50,7 +61,7 @@ BATCH = 64
 LEAST_WINDOW = 4
 """Narrowest window that shows anything, px."""
 MOST_DROPPED = 0.5
-"""An event that loses more than this share of its pictures is an error (spec 6.4)."""
+"""An event that loses more than this share of its pictures at one scale is an error (spec 6.4)."""
 MOST_TRIES = 10
 """Times that a place is drawn for a window until it shows enough of the scene (spec 1.7)."""
 SHOWN = 3
@@ -164,6 +175,8 @@ class PseudoOptions:
     """Of the mean difference between the reduced render and the known photograph, beside that of the pixels."""
     progressive: bool
     """The scales one after the other over the events, instead of all at once."""
+    checks: Checks
+    """Of redrawn pictures against what they were made from; those of the regenerator's role unless said otherwise."""
     coarser: list[int] = field(default_factory=list)
     """Training cameras also count at these fractions of their size, with box averages for pictures (Mipmap-GS)."""
 
@@ -218,6 +231,19 @@ class Sketch:
     seed: int
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Drawn:
+    """What has become of a sketch."""
+
+    scale: int
+    view: PseudoView | None
+    """None: its picture is dropped."""
+    problem: str
+    """Why it is dropped."""
+    warnings: dict[str, str]
+    """By check, what is told of a picture that is kept."""
+
+
 class PseudoDetails:
     """Pseudo views of one kind and their share in the loss."""
 
@@ -232,6 +258,7 @@ class PseudoDetails:
         self.refuse_impossible()
         self.event = 0
         self.views: dict[int, list[PseudoView]] = {}
+        self.facts: dict[str, Any] = {}
 
     def refuse_impossible(self) -> None:
         """Now, not when half of the run is over.
@@ -274,38 +301,56 @@ class PseudoDetails:
         """The pseudo views of the training view picked at this step, with their weights (spec 1.3)."""
         event = event_at(step, self.events, self.span)
         if event is None:
-            self.views, self.event = {}, 0
+            self.views, self.event, self.facts = {}, 0, {}
             return None
         if event != self.event:
-            self.views, self.event = by_parent(self.of_event(run, event, view)), event
+            found, self.facts = self.of_event(run, event, view)
+            self.views, self.event = by_parent(found), event
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
         return self.weighted(run, self.views.get(view, []), place, inside)
 
     def weighted(self, run: Run, views: Sequence[PseudoView], place: float, inside: float) -> Term | None:
-        """The term of these views, so far along the weights and inside the window; None for none."""
+        """The term of these views, so far along the weights and inside the window; None for none.
+
+        A view weighs the same whether others of its training view were dropped or not; what these would have taken of
+        the backbone's own loss stays there.
+        """
         options = self.options
         if not views:
             return None
         share = stepped(options.weights, place, options.weight_split)
         direct = options.mode == "direct" or (options.mode == "auto" and not list(run.backbone.shared()))
         each = options.gain * (options.direct_weight if direct else share)
-        count = len(views) if options.reduce == "all" else len({view.provenance["scale"] for view in views})
+        scales, pictures = self.planned()
+        count = pictures if options.reduce == "all" else scales
         frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and inside < 0.5)
         whole = run.scene.train[views[0].parent].camera
         return Term(
             name=self.setting.name,
             parts=[(view, each / count * (area_share(view, whole) if options.per_pixel else 1.0)) for view in views],
-            taken=0.0 if direct else share,
+            taken=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
             shared=not frozen,
             squared=options.loss == "l2",
         )
 
+    def planned(self) -> tuple[int, int]:
+        """(scales, pictures) of each training view at the event at hand, if none is dropped."""
+        options, scales = self.options, len(self.scales_of(self.event))
+        coarser = len(options.coarser)
+        return scales + coarser, scales * (options.variants + options.base) + coarser
+
+    def told(self, step: int) -> dict[str, Any]:
+        """Pictures asked for, dropped and warned of by scale, at the first step that asks for them; else nothing."""
+        if not self.facts or step != self.event + 1:
+            return {}
+        return {key: self.facts[key] for key in ("event", "asked", "dropped", "warned")}
+
     # -- events ----------------------------------------------------------------------------------------------------
 
-    def of_event(self, run: Run, event: int, view: int) -> list[PseudoView]:
-        """The pseudo views of an event: made now, or as the run made them before it was interrupted.
+    def of_event(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], dict[str, Any]]:
+        """(pseudo views, facts) of an event: made now, or as the run made them before it was interrupted.
 
         Only those that steps of its window will ask for, the first of them for `view` and the rest of its batch: the
         others are never looked at. Of several processes the first makes them all.
@@ -314,20 +359,20 @@ class PseudoDetails:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
         fresh = run.step == event
-        views = self.written(run, event, view) if fresh and run.ranks.first else None
+        made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
             run.ranks.everyone(None)  # the others wait for the file
-        return self.recalled(run, event) if views is None else views
+        return self.recalled(run, event) if made is None else made
 
-    def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
-        """The pseudo views of an event that begins with this step, made and written to its file."""
+    def written(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], dict[str, Any]]:
+        """(pseudo views, facts) of an event that begins with this step, made and written to its file."""
         steps = min(self.span, run.iterations - event)
         views, facts = self.made(run, event, {view, *run.sampler.taken} | run.sampler.coming(steps - 1))
         path = self.path(run, event)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_views(path, views, facts)
         self.forget(run, event)
-        return views
+        return views, facts
 
     def path(self, run: Run, event: int) -> Path:
         """Where the pseudo views of an event are kept while a checkpoint may need them."""
@@ -346,8 +391,8 @@ class PseudoDetails:
             if path not in kept:
                 path.unlink()
 
-    def recalled(self, run: Run, event: int) -> list[PseudoView]:
-        """The pseudo views that the run had made before it was interrupted.
+    def recalled(self, run: Run, event: int) -> tuple[list[PseudoView], dict[str, Any]]:
+        """(pseudo views, facts) that the run had made before it was interrupted.
 
         None where it was made longer since, so that its events and windows lie elsewhere: the next one goes on.
 
@@ -359,8 +404,8 @@ class PseudoDetails:
         try:
             if latest and (found := load_views(latest[0]))[1]["iterations"] != self.setting.iterations:
                 logger.info("%s rests until its next event: the run has become longer", self.setting.name)
-                return []
-            return found[0] if latest == [path] else load_views(path)[0]
+                return [], {}
+            return found if latest == [path] else load_views(path)
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "
@@ -371,7 +416,7 @@ class PseudoDetails:
         """(pseudo views of some training views, facts) of an event, from the model as it is now.
 
         Raises:
-            TrainingError: more than half of the pictures could not be used.
+            TrainingError: more than half of the pictures of a scale could not be used.
         """
         regenerator = self.setting.regenerator(self.options.role)
         learnt = regenerator.prepare(material_of(run, self.setting.seed))
@@ -379,33 +424,19 @@ class PseudoDetails:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.setting.name, event, told)
         sketches = list(self.sketches(run, event, parents))
-        views: list[PseudoView] = []
-        dropped: list[str] = []
-        shown = sorted({sketch.parent for sketch in sketches})[:SHOWN]
-        for first in range(0, len(sketches), BATCH):
-            for view, problem in self.drawn(run, event, sketches[first : first + BATCH], shown):
-                (views if view else dropped).append(view or problem)  # type: ignore[arg-type]
-            logger.info(
-                "%s at step %d: %d of %d pictures", self.setting.name, event, len(views) + len(dropped), len(sketches)
-            )
+        drawn = self.all_drawn(run, event, sketches)
+        views = [one.view for one in drawn if one.view is not None]
         views += [
             self.coarser_view(run, event, parent, factor)
             for parent in sorted({sketch.parent for sketch in sketches})
             for factor in self.options.coarser
         ]
-        if dropped:
-            logger.warning("%s: %d pictures dropped, the first because %s", self.setting.name, len(dropped), dropped[0])
-        if len(dropped) > MOST_DROPPED * len(sketches):
-            raise TrainingError(
-                f"augmenter {self.setting.name} lost {len(dropped)} of {len(sketches)} pictures at step {event}: "
-                f"{dropped[0]}; choose another regenerator/{self.options.role}{self.remedy}"
-            )
         facts: dict[str, Any] = {
             "event": event,
             "iterations": self.setting.iterations,
             "made": len(views),
-            "dropped": len(dropped),
             "learnt": learnt,
+            **self.judged(event, drawn),
         }
         trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
@@ -418,6 +449,39 @@ class PseudoDetails:
             facts["masked"] = masked
             logger.info("%s: %.1f%% of the pixels do not count", self.setting.name, 100 * masked)
         return views, facts
+
+    def all_drawn(self, run: Run, event: int, sketches: Sequence[Sketch]) -> list[Drawn]:
+        """What has become of each sketch, told batch by batch."""
+        drawn: list[Drawn] = []
+        shown = sorted({sketch.parent for sketch in sketches})[:SHOWN]
+        for first in range(0, len(sketches), BATCH):
+            drawn += self.drawn(run, event, sketches[first : first + BATCH], shown)
+            logger.info("%s at step %d: %d of %d pictures", self.setting.name, event, len(drawn), len(sketches))
+        return drawn
+
+    def judged(self, event: int, drawn: Sequence[Drawn]) -> dict[str, Any]:
+        """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
+
+        Raises:
+            TrainingError: more than half of the pictures of a scale could not be used.
+        """
+        name = self.setting.name
+        asked, dropped = by_scale(drawn), by_scale([one for one in drawn if one.view is None])
+        warned: dict[str, dict[str, int]] = {}
+        for scale, count in dropped.items():
+            reason = next(one.problem for one in drawn if one.problem and str(one.scale) == scale)
+            logger.warning("%s: %d of %d x%s pictures dropped: %s", name, count, asked[scale], scale, reason)
+            if count > MOST_DROPPED * asked[scale]:
+                raise TrainingError(
+                    f"augmenter {name} lost {count} of {asked[scale]} pictures at x{scale}, step {event}: {reason}; "
+                    f"choose another regenerator/{self.options.role}, or loosen augmenter.{name}.checks{self.remedy}"
+                )
+        for check in dict.fromkeys(check for one in drawn for check in one.warnings):
+            strays = [one for one in drawn if check in one.warnings]
+            warned[check] = by_scale(strays)
+            first = strays[0].warnings[check]
+            logger.warning("%s: %d of %d pictures kept although %s", name, len(strays), len(drawn), first)
+        return {"asked": asked, "dropped": dropped, "warned": warned}
 
     def sketches(self, run: Run, event: int, parents: Set[int]) -> Iterator[Sketch]:
         """Cameras of an event beside some training views, in the order of these, base before random."""
@@ -525,26 +589,34 @@ class PseudoDetails:
             return worst_window((rendered(run, pose).cpu() - view.image()).abs().mean(0), size)
         return centred_window(width, height, size)
 
-    def drawn(
-        self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]
-    ) -> list[tuple[PseudoView | None, str]]:
-        """(pseudo view, "") of each sketch, or (None, what is wrong with its picture); pictures of `shown` are kept."""
+    def drawn(self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]) -> list[Drawn]:
+        """What becomes of each sketch; pictures of the training views `shown` are kept to be looked at."""
         regenerator = self.setting.regenerator(self.options.role)
         requests = [self.request(run, event, sketch) for sketch in sketches]
-        results = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
-        out: list[tuple[PseudoView | None, str]] = []
-        for number, (sketch, request) in enumerate(zip(sketches, requests, strict=True)):
-            result = torch.stack([sample[number].detach().cpu().float() for sample in results]).mean(0)
-            if torch.isfinite(result).all() and result.shape[0] == 3:
-                result = colour_matched(request, result)
-            if self.options.project == "exact" and request.scale > 1 and result.shape == (3, *request.result_size):
-                result = projected(result, request.image.cpu(), request.scale)
-            problem = complaint(request, result)
-            view = None if problem else self.view(run, event, sketch, request, result)
-            if view is not None and sketch.parent in shown:
-                self.show(run.folder / "pseudo", sketch, request, view)
-            out.append((view, problem and f"{run.scene.train[sketch.parent].name}: {problem}"))
+        samples = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
+        out: list[Drawn] = []
+        for sketch, request, *results in zip(sketches, requests, *samples, strict=True):
+            result = torch.stack([result.detach().cpu().float() for result in results]).mean(0)
+            one = self.checked(run, event, sketch, request, result)
+            if one.view is not None and sketch.parent in shown:
+                self.show(run.folder / "pseudo", sketch, request, one.view)
+            out.append(one)
         return out
+
+    def checked(self, run: Run, event: int, sketch: Sketch, request: Request, result: Tensor) -> Drawn:
+        """The pseudo view of a result, if it may be used."""
+        problem, found = unusable(request, result), dict[str, str]()
+        if not problem:
+            result = colour_matched(request, result)
+            if self.options.project == "exact" and request.scale > 1:
+                result = projected(result, request.image.cpu(), request.scale)
+            found = strayed(request, result, self.options.checks)
+            dropped = [told for check, told in found.items() if getattr(self.options.checks, check).action == "drop"]
+            problem = "; ".join(dropped)
+        named = problem and f"{request.view.name}: {problem}"
+        view = None if problem else self.view(run, event, sketch, request, result)
+        warnings = {} if problem else {check: f"{request.view.name}: {told}" for check, told in found.items()}
+        return Drawn(scale=sketch.scale, view=view, problem=named, warnings=warnings)
 
     def request(self, run: Run, event: int, sketch: Sketch) -> Request:
         """What the regenerator is asked for."""
@@ -660,6 +732,12 @@ def reduced(window: Window, pose: Camera, scale: int) -> tuple[Window, Camera, C
     width, height = max(1, window.width // scale), max(1, window.height // scale)
     whole = Window(left=window.left, top=window.top, width=width * scale, height=height * scale).of(pose)
     return Window(left=0, top=0, width=width, height=height), whole.resize(width, height), whole
+
+
+def by_scale(drawn: Sequence[Drawn]) -> dict[str, int]:
+    """How many there are at each scale; keys as JSON has them."""
+    counts = Counter(one.scale for one in drawn)
+    return {str(scale): counts[scale] for scale in sorted(counts)}
 
 
 def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:

@@ -131,7 +131,7 @@ class AnchorOptions:
     """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
     filter: str
     max_primitives: int
-    """No anchor is added beyond this number."""
+    """No anchor is added beyond this number; 0: none is withheld."""
     volume_weight: float
     """Of the mean volume of the Gaussians drawn, in the loss (spec 1.3)."""
     voxel: float
@@ -147,6 +147,8 @@ class AnchorOptions:
         checked_filter(self.filter)
         checked_end(self.levels, self.published_iterations)
         resolved(self.quirks, self.fidelity)
+        if self.max_primitives < 0:
+            raise ValueError(f"backbone.max_primitives is {self.max_primitives}; give a number, or 0 for no cap")
         if self.voxel < 0:
             raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
 
@@ -408,15 +410,15 @@ class Anchors:
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
         enough, _ = eligible(self.table, visits / 2)
-        grown = self.grow(visits / 2)
+        grown, without_room = self.grow(visits / 2)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
         unit = math.log(self.extent) if self.quirks.clamp == "extent" and self.extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
-        return {"grown": grown, "pruned": pruned}
+        return {"grown": grown, "pruned": pruned} | ({"withheld": without_room} if without_room else {})
 
-    def grow(self, least: float) -> int:
-        """By depth without levels, by level with them; returns how many anchors grew."""
+    def grow(self, least: float) -> tuple[int, int]:
+        """By depth without levels, by level with them; (anchors that grew, anchors that found no room)."""
         shared, most = (self.table, self.representation, self.options.growth), self.options.max_primitives
         if self.levels is None:
             stop = self.quirks.early_stop == "yes"

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.levels import Levels, initial_nodes, kept, thresholds
+from gsx.backbones.levels import Levels, initial_nodes, thresholds
 from gsx.backbones.sampling import sampled_means
-from gsx.core.density import Table, within_room
+from gsx.core.density import Table
 from gsx.core.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
 
@@ -118,11 +118,6 @@ def small_children(
 def without_bias(rows: dict[str, Tensor]) -> dict[str, Tensor]:
     """New Gaussians are drawn from no farther than their level."""
     return rows | {"bias": torch.zeros_like(rows["bias"])}
-
-
-def chosen_places(new: dict[str, Tensor], gradient: Float[Tensor, "M"], levels: Levels, room: int) -> Bool[Tensor, "M"]:
-    """Of new Gaussians those that enough cameras would draw (spec 3.4), at most `room`: of the largest gradients."""
-    return within_room(kept(levels, new["means"], new["level"]), gradient, room)
 
 
 def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
-from gsx.core.density import Table, append_rows, keep_rows, within_room
+from gsx.core.density import Table, append_rows, keep_rows, room_under, within_room
 from gsx.core.shapes import Bool, Float, Int
 
 
@@ -183,7 +183,7 @@ def some(sprouts: Sprouts, keep: Bool[Tensor, "U"]) -> Sprouts:
 def strongest(sprouts: Sprouts, room: int) -> Sprouts:
     """At most `room` of them, those with the largest gradients."""
     everyone = torch.ones_like(sprouts.strength, dtype=torch.bool)
-    return some(sprouts, within_room(everyone, sprouts.strength, max(0, room)))
+    return some(sprouts, within_room(everyone, sprouts.strength, room))
 
 
 def offset_means(table: Table) -> Float[Tensor, "N k 3"]:
@@ -219,12 +219,13 @@ def sprout(
     )
 
 
-def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, most: int) -> int:
-    """Append the sprouts with fresh statistics, up to a table of `most` anchors; returns how many."""
-    sprouts = strongest(sprouts, most - len(table))
+def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, most: int) -> tuple[int, int]:
+    """Append the sprouts with fresh statistics, up to a table of `most` anchors; (how many, how many found no room)."""
+    wanted = len(sprouts.positions)
+    sprouts = strongest(sprouts, room_under(most, len(table)))
     count, like = len(sprouts.positions), table["anchors"]
     if count == 0:
-        return 0
+        return 0, wanted
     log_lengths = torch.full((count,), math.log(sprouts.size), dtype=like.dtype, device=like.device)
     rows = representation.rows(log_lengths, torch.full_like(sprouts.positions, 0.5))
     if sprouts.inherit:
@@ -234,7 +235,7 @@ def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, 
     if "level" in table.columns:
         rows["level"] = torch.full((count,), sprouts.level, dtype=torch.int16, device=like.device)
     append_rows(table, rows)
-    return count
+    return count, wanted - count
 
 
 def grow_by_depth(
@@ -246,10 +247,13 @@ def grow_by_depth(
     early_stop: bool,
     generator: torch.Generator,
     most: int,
-) -> int:
-    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9); returns how many grew."""
+) -> tuple[int, int]:
+    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9).
+
+    Returns how many grew, and how many did not for want of room.
+    """
     enough, gradient = eligible(table, least)
-    means, grown = offset_means(table), 0
+    means, grown, without_room = offset_means(table), 0, 0
     for depth in range(options.depths):
         multiple = options.coarsest // options.hierarchy**depth
         if multiple == 0:  # the reference divides by it (spec 2.9)
@@ -260,10 +264,11 @@ def grow_by_depth(
         size = voxel * multiple
         cells, taken = nodes_of(means[candidates], size), nodes_of(table["anchors"], size)
         found = sprout(table, candidates, gradient, cells, taken, 0.0, size)
-        grown += add_anchors(table, found, representation, most)
+        added, left = add_anchors(table, found, representation, most)
+        grown, without_room = grown + added, without_room + left
         if early_stop and grown == 0:
             break
-    return grown
+    return grown, without_room
 
 
 def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
@@ -280,16 +285,16 @@ def grow_by_level(
     quirks: Quirks,
     gate: bool,
     most: int,
-) -> int:
-    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (spec 3.8); how many grew.
+) -> tuple[int, int]:
+    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (spec 3.8).
 
-    `gate`: whether promotion and bias take place.
+    `gate`: whether promotion and bias take place. Returns how many grew, and how many did not for want of room.
     """
     enough, gradient = eligible(table, least)
     taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
     means, of = offset_means(table), table["level"].clone()
     mean_gradient = gradient.sum(1) / (enough.sum(1) + 1e-6)
-    grown = 0
+    grown, without_room = 0, 0
     for level in range(levels.count):
         own = of == level
         if not bool(own.any()):
@@ -299,8 +304,9 @@ def grow_by_level(
         for found in sprouts_of_level(
             table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
         ):
-            grown += add_anchors(table, found, representation, most)
-    return grown
+            added, left = add_anchors(table, found, representation, most)
+            grown, without_room = grown + added, without_room + left
+    return grown, without_room
 
 
 def bias_anchors(

@@ -14,7 +14,6 @@ from torch.nn.functional import logsigmoid, normalize
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
     bias_levels,
-    chosen_places,
     clones,
     judged,
     small_children,
@@ -29,6 +28,7 @@ from gsx.backbones.levels import (
     derive,
     drawn,
     facts_of,
+    kept,
     note_of,
     quantile,
     warnings_of,
@@ -45,8 +45,10 @@ from gsx.core.density import (
     keep_rows,
     reset_column,
     restored_table,
+    room_under,
     sightings,
     table_tensors,
+    withheld,
     within_room,
 )
 from gsx.core.errors import InputError
@@ -120,7 +122,7 @@ class GS3DOptions:
     sh_every: int
     initial_opacity: float
     max_primitives: int
-    """No primitive is added beyond this number."""
+    """No primitive is added beyond this number; 0: none is withheld."""
     rates: Rates
     density: Density
     mip: MipOptions
@@ -136,8 +138,8 @@ class GS3DOptions:
             raise ValueError(f"backbone.sh_degree is {self.sh_degree}; choose 0 to 3")
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"backbone.initial_opacity is {self.initial_opacity}; give a value between 0 and 1")
-        if self.published_iterations < 1 or self.max_primitives < 1:
-            raise ValueError("backbone.published_iterations and backbone.max_primitives must be at least 1")
+        if self.published_iterations < 1 or self.max_primitives < 0:
+            raise ValueError("backbone.published_iterations must be at least 1, backbone.max_primitives at least 0")
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
         checked_end(self.levels, self.published_iterations)
@@ -337,10 +339,10 @@ class GS3D:
 
     def heal(self) -> int:
         """Remove rows with a value that is not finite, with their statistics; returns how many."""
-        kept = finite_rows(self.table)
-        keep_rows(self.table, kept)
-        self.statistics = self.statistics.rows(kept)
-        return int((~kept).sum())
+        sound = finite_rows(self.table)
+        keep_rows(self.table, sound)
+        self.statistics = self.statistics.rows(sound)
+        return int((~sound).sum())
 
     def discard(self) -> None:
         """Forget the gradients and the picture they came from."""
@@ -375,13 +377,15 @@ class GS3D:
         """Clone small and split large primitives with large gradients, then prune (spec 7, order in one event)."""
         density = self.options.density
         gradient = self.statistics.mean_gradient()
-        chosen = self.within_cap(gradient, self.candidates(gradient))
+        wanted = self.candidates(gradient)
+        chosen = within_room(wanted, gradient, self.room())  # each adds one
         large = self.largest_scales() > density.split_extent * self.extent
         cloned, split = chosen & ~large, chosen & large
         self.clone_and_split(cloned, split)
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
-        return {"cloned": int(cloned.sum()), "split": int(split.sum()), "pruned": pruned}
+        done = {"cloned": int(cloned.sum()), "split": int(split.sum()), "pruned": pruned}
+        return done | withheld(wanted, chosen)
 
     def densify_levels(self, step: int, levels: Levels) -> dict[str, int]:
         """Copies of small Gaussians on their level, children of large ones a level finer, then prune (spec 4B)."""
@@ -402,12 +406,14 @@ class GS3D:
         cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
         children_made = small_children(raw, split, levels, control.shrink, self.generator)
         new = stacked([clones(raw, cloned), children_made])
-        keep = chosen_places(new, gradient[torch.cat([cloned, split])], levels, self.room())
+        seen = kept(levels, new["means"], new["level"])
+        keep = within_room(seen, gradient[torch.cat([cloned, split])], self.room())
         bias_levels(self.table, verdict.biased, control.bias_step)
         append_rows(self.table, {name: value[keep] for name, value in new.items()})
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
-        return {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum()), "pruned": pruned}
+        done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum()), "pruned": pruned}
+        return done | withheld(seen, keep)
 
     def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (spec 10.5).
@@ -421,13 +427,9 @@ class GS3D:
         quiet = 1 - int(chosen.sum()) / len(chosen)
         return chosen | ((absolute >= quantile(absolute, quiet)) & (absolute > 0))
 
-    def within_cap(self, gradient: Float[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Of the chosen, those with the largest gradients that fit under max_primitives (each adds one)."""
-        return within_room(chosen, gradient, self.room())
-
     def room(self) -> int:
         """Primitives that may be added under max_primitives."""
-        return max(0, self.options.max_primitives - len(self.table))
+        return room_under(self.options.max_primitives, len(self.table))
 
     def clone_and_split(self, cloned: Bool[Tensor, "N"], split: Bool[Tensor, "N"]) -> None:
         """Rows become: survivors, clones, first children, second children."""

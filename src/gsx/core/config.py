@@ -18,8 +18,10 @@ from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.evaluate import EvalOptions
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.regenerator import Checks
 from gsx.core.run import TrainingOptions
 
+OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
 OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
 MODULE = "gsx.conf"
@@ -45,7 +47,7 @@ class GeneralOptions:
     output: str
     folder: str
     length: int = 0
-    """Iterations of the whole run, of which a budget takes a share."""
+    """Iterations of the whole run, of which a budget takes a share: the variant's, the scene's or the backbone's."""
     variant: str = ""
     """Name of the published method that is composed; empty for others."""
     data_root: str = ""
@@ -351,6 +353,8 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}
+    for role, node in named_nodes(values.pop("checks", None), "checks").items():
+        typed(Checks, node, f"checks.{role}")  # augmenters have taken theirs over
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)
     if budget is not None:
         typed(Budget, budget, "budget")
@@ -369,7 +373,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
         trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
-        resolved={key: value for key, value in raw.items() if key != "experiment"},  # type: ignore[misc]
+        resolved={key: value for key, value in raw.items() if key not in ("experiment", "checks")},  # type: ignore[misc]
     )
 
 

@@ -5,6 +5,7 @@ removed with their moments; a group's step count is never reset (spec 7, "Adam s
 is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
 """
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -84,12 +85,23 @@ def keep_rows(table: Table, kept: Bool[Tensor, "N"]) -> None:
         table.columns[name] = column[kept]
 
 
+def room_under(cap: int, count: int) -> int:
+    """Rows that may be added to `count` of them under a cap; a cap of 0 is none."""
+    return max(0, cap - count) if cap else sys.maxsize
+
+
 def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
     """Of the chosen rows those with the largest gradients, at most `room`."""
     if int(chosen.sum()) <= room:
         return chosen
     ranked = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
     return torch.zeros_like(chosen).index_fill_(0, ranked, True)
+
+
+def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, int]:
+    """How many of the rows wanted a cap has kept out, for the changes of a step; nothing where it let all in."""
+    count = int(wanted.sum()) - int(chosen.sum())
+    return {"withheld": count} if count else {}
 
 
 def reset_column(table: Table, name: str, values: Tensor) -> None:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from gsx.core.cache import content_key
+from gsx.core.cache import content_key, tree_stamp
 from gsx.core.errors import InputError
 from gsx.core.run_files import RunFiles, part
 
@@ -20,16 +20,17 @@ OPERATING = ("cache_gb", "download", "offload", "batch_pixels", "slicing")
 """Keys of scenes and regenerators that say with which means, and change no result."""
 WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
 """Keys of `training` that change nothing at all."""
+ELSEWHERE = ("path", "iterations")
+"""Keys of scenes that count as what they lead to: what lies in the folder (`scene_stamp`), the length of the run."""
 
 
 def trained(config: dict[str, Any]) -> dict[str, Any]:
-    """What of a resolved composition decides what is trained."""
+    """What of a resolved composition decides what is trained, beside what its scene holds (`scene_stamp`)."""
     told = (*WHERE, *NAMES, *JUDGING, "regenerator")
     kept = {key: value for key, value in config.items() if key not in told}
     kept["regenerator"] = {role: without(node, OPERATING) for role, node in asked_for(config).items()}
-    kept["scene"] = without(part(config, "scene"), OPERATING)
-    if dataset := part(config, "dataset"):  # the same scene, wherever its folder lies
-        kept["scene"]["path"] = [dataset.get("name"), dataset.get("scene")]
+    scene = without(part(config, "scene"), OPERATING)
+    kept["scene"] = {key: value for key, value in scene.items() if key not in ELSEWHERE}
     kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
     return kept
 
@@ -48,9 +49,45 @@ def without(node: Any, keys: tuple[str, ...]) -> Any:
     return {key: without(value, keys) for key, value in node.items() if key not in keys}
 
 
-def composition_key(config: dict[str, Any]) -> str:
-    """A short digest: compositions that train the same have the same."""
-    return content_key(sorted_items(trained(config)))
+def scene_stamp(config: dict[str, Any]) -> str:
+    """What the scene of a composition holds: names, sizes and times of the files in its folder, wherever that lies.
+
+    Empty for scenes without a folder; `absent: FOLDER` where it is not there. Files outside of the folder count if an
+    option of the scene names them.
+    """
+    scene = part(config, "scene")
+    if not scene.get("path"):
+        return ""
+    path = Path(str(scene["path"])).expanduser()
+    if not path.exists():
+        return f"absent: {path}"
+    folder = path if path.is_dir() else path.parent
+    output = Path(str(config.get("output", "outputs")))
+    stamps = [tree_stamp(place, output) for place in (folder, *outside(scene, folder))]
+    return content_key("" if path.is_dir() else path.name, stamps)
+
+
+def outside(scene: dict[str, Any], folder: Path) -> list[Path]:
+    """Files and folders beyond the scene's own that its options name."""
+    values = [value for key, value in scene.items() if key != "path" and isinstance(value, str)]
+    leading = [value for value in values if Path(value).is_absolute() or value.startswith("..")]
+    return [folder / value for value in leading if (folder / value).exists()]
+
+
+def trained_on(files: RunFiles) -> str:
+    """The stamp of the scene when the run began."""
+    return str(part(files.environment, "scene").get("stamp", ""))
+
+
+def other_revision(files: RunFiles, this: str) -> str:
+    """The revision of gsx's source that trained a run, or several; empty if it is `this` one, or unknown."""
+    revision = str(files.environment.get("source") or "")
+    return "" if revision == this else revision
+
+
+def composition_key(config: dict[str, Any], stamp: str) -> str:
+    """A short digest: compositions that train the same have the same; `stamp`: of the scene (`scene_stamp`)."""
+    return content_key(sorted_items(trained(config)), stamp)
 
 
 def sorted_items(value: Any) -> Any:
@@ -66,13 +103,13 @@ def sorted_items(value: Any) -> Any:
     return [sorted_items(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def place_of(config: dict[str, Any]) -> Path:
-    """The folder of a composition: <output>/<scene>/<backbone>/<digest>."""
+def place_of(config: dict[str, Any], stamp: str) -> Path:
+    """The folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
     scene = part(config, "scene")
     name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
     backbone = str(part(config, "backbone").get("name"))
     output = Path(str(config.get("output", "outputs")))
-    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config)
+    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config, stamp)
 
 
 def judging(config: dict[str, Any]) -> dict[str, Any]:
@@ -80,13 +117,14 @@ def judging(config: dict[str, Any]) -> dict[str, Any]:
     return {key: config.get(key) for key in JUDGING}
 
 
-def finished(files: RunFiles, config: dict[str, Any]) -> bool:
-    """Whether a run folder holds all that a composition asks for: trained just so, to the end, and judged the same."""
+def finished(files: RunFiles, config: dict[str, Any], stamp: str) -> bool:
+    """Whether a run folder holds all that a composition asks for: trained to the end, just so and on a scene of that
+    stamp, and judged the same."""
     return (
         files.status.get("state") == "ok"
         and files.evaluation.get("step") == config["iterations"]
         and files.evaluation.get("judged") == judging(config)
-        and composition_key(files.config) == composition_key(config)
+        and composition_key(files.config, trained_on(files)) == composition_key(config, stamp)
     )
 
 

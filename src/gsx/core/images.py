@@ -213,7 +213,7 @@ class PhotoSource:
     expected_size: Size | None = None
     """(width, height) that the camera model states for the stored file; None: any."""
     remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C height width"]] | None = None
-    """Undistortion, applied to the decoded file."""
+    """Undistortion or a reduction, applied to the decoded file; those that do the same compare equal."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """The photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
@@ -228,7 +228,8 @@ class PhotoSource:
         top = round(self.whole.cy * down - camera.cy)
         if left < 0 or top < 0 or left + camera.width > width or top + camera.height > height:
             raise ValueError(f"a {camera.size} window at {left, top} reaches past '{self.path}' at {width, height}")
-        image = self.cache.get((str(self.path), width, height), lambda: self._resized(width, height))
+        made_by = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
+        image = self.cache.get(made_by, lambda: self._resized(width, height))
         return image[:, top : top + camera.height, left : left + camera.width]
 
     def max_zoom(self, camera: Camera) -> float:

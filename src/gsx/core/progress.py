@@ -110,7 +110,8 @@ class MetricsLog:
         """Write a line when due, or when something noteworthy happened."""
         points = run.training.test_points
         tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
-        if not (run.step % run.training.log_every == 0 or step.changes or step.skipped or tested or run.step == 1):
+        told = step.changes or step.pseudo or step.skipped
+        if not (run.step % run.training.log_every == 0 or told or tested or run.step == 1):
             return
         line = self.entry(run, step)
         if tested and run.scene.test:
@@ -131,6 +132,8 @@ class MetricsLog:
             "pairs": step.rendering.pairs,
             "memory_mb": round(peak_memory_mb(run.device), 1),
             **({"terms": step.terms} if step.terms else {}),
+            **({"pseudo": step.pseudo} if step.pseudo else {}),
+            **({"left_out": step.dropped} if step.dropped else {}),
             **step.changes,
         }
         return line | ({"skipped": step.skipped} if step.skipped else {})

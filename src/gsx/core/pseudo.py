@@ -75,6 +75,16 @@ class Augmenter(Protocol):
 
 
 @runtime_checkable
+class Telling(Protocol):
+    """An augmenter that tells what became of the pictures it asked for; metrics.jsonl and evaluations count them."""
+
+    def told(self, step: int) -> dict[str, Any]:
+        """At the first step that asks for new pictures their `event`, and by scale how many were `asked` for, how many
+        `dropped`, and `warned` of by check; else empty. JSON-serialisable."""
+        ...
+
+
+@runtime_checkable
 class Foretold(Protocol):
     """Options of an augmenter that tell, before there is a scene, where it begins; plans over many runs ask."""
 

@@ -1,5 +1,6 @@
 """What redraws a picture: an upscaler, a restorer. It knows nothing of Gaussians (spec 6.4)."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,19 +10,49 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
+from gsx.core.metrics import psnr
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 
 LARGEST_DRIFT = 2 / 255
-"""Largest change of a picture's mean colour (spec 6.4)."""
-LEAST_AGREEMENT = 30.0
-"""Least PSNR between an upscaled picture, box-averaged, and what it was made from, dB (spec 6.4)."""
+"""Mean colours that differ by more are put right (spec 6.4)."""
 LEAST_SLOPE = 1e-3
 """Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
 PROJECTIONS = 5
 """Rounds of projection and clamping; each halves what clamping undid (spec 5.3)."""
-LARGEST_SHIFT = 0.25
-"""Largest displacement, px of the input (spec 1.5)."""
+ACTIONS = ("drop", "warn", "off")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """A limit, and what happens to a picture beyond it."""
+
+    limit: float
+    action: str
+    """drop; warn: it is kept, counted and told; off: nothing is looked at."""
+
+    def __post_init__(self) -> None:
+        if self.action not in ACTIONS:
+            raise ValueError(f"the action of a check is '{self.action}'; choose drop, warn or off (in YAML 'off')")
+        if not self.limit >= 0:
+            raise ValueError(f"the limit of a check is {self.limit}; give at least 0")
+
+    @property
+    def active(self) -> bool:
+        """Whether anything happens beyond the limit."""
+        return self.action != "off"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checks:
+    """What a redrawn picture has to keep of what it was made from (spec 6.4); values in conf/checks."""
+
+    colour: Check
+    """Largest change of the mean colour, 8-bit levels, after `colour_matched`."""
+    agreement: Check
+    """Least PSNR between an enlarged picture, reduced again, and its input, dB."""
+    displacement: Check
+    """Largest displacement, px of the input."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,25 +154,28 @@ def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Te
     return result if float(drift.abs().max()) <= LARGEST_DRIFT else result.cpu() - drift[:, None, None]
 
 
-def complaint(request: Request, result: Tensor) -> str:
-    """Why a result cannot be used; empty for a sound one (spec 6.4)."""
+def unusable(request: Request, result: Tensor) -> str:
+    """Why a result is no picture of what was asked for; empty for one that is (spec 6.4)."""
     expected = (3, *request.result_size)
     if tuple(result.shape) != expected:
         return f"it is {tuple(result.shape)} and should be {expected}"
     if not bool(torch.isfinite(result).all()):
         return "it holds values that are not finite"
-    low = box_average(result.cpu().float().clamp(0, 1), request.scale)
-    given = request.image.cpu()
-    drift = float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
-    if drift > 2 * LARGEST_DRIFT:  # what colour matching and clamping leave
-        return f"its mean colour is {drift * 255:.1f} levels off"
-    error = float((low - given).square().mean())
-    if request.scale > 1 and error > 10 ** (-LEAST_AGREEMENT / 10):
-        return f"box-averaged it differs from its input by more than {LEAST_AGREEMENT:g} dB"
-    shift = displacement(low, given)
-    if shift > LARGEST_SHIFT:
-        return f"it is displaced by {shift:.2f} px"
     return ""
+
+
+def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
+    """How a result differs from its input by more than a check allows, in words by the check's name (spec 6.4)."""
+    low, given = box_average(result.cpu().float().clamp(0, 1), request.scale), request.image.cpu()
+    drift = 255 * float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
+    agreement = psnr(low, given) if request.scale > 1 else math.inf
+    shift = displacement(low, given) if checks.displacement.active else 0.0
+    words = {
+        "colour": (drift > checks.colour.limit, f"its mean colour is {drift:.1f} levels off"),
+        "agreement": (agreement < checks.agreement.limit, f"box-averaged it is {agreement:.1f} dB from its input"),
+        "displacement": (shift > checks.displacement.limit, f"it is displaced by {shift:.2f} px"),
+    }
+    return {name: told for name, (beyond, told) in words.items() if beyond and getattr(checks, name).active}
 
 
 def displacement(image: Float[Tensor, "3 h w"], reference: Float[Tensor, "3 h w"]) -> float:

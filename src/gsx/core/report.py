@@ -18,6 +18,7 @@ from gsx.core.files import replace_file
 from gsx.core.overview import common_folder, runs_in, write_overview
 from gsx.core.page import NONE, duration, fixed, template, time_unit
 from gsx.core.pictures import ERROR_COLOURS
+from gsx.core.remarks import remarks_of
 from gsx.core.run_files import RunFiles, gain_of, is_number, part, read_run, state_of
 
 __all__ = ["report_on", "write_overview", "write_report"]
@@ -76,6 +77,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "state": state,
         "reason": reason,
         "notes": part(environment, "scene").get("notes", []),
+        "remarks": remarks_of(evaluation),
         "facts": facts(run),
         "headline": headline(evaluation),
         "zoom": zoom_rows(evaluation),

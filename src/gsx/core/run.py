@@ -147,6 +147,8 @@ class Step:
     """What density control did."""
     terms: dict[str, float] = field(default_factory=dict)
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
+    pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By augmenter, what became of the pictures that it asked for at this step (`pseudo.Telling`); mostly none."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 

@@ -112,7 +112,18 @@ def sound_evaluation(content: dict[str, Any]) -> bool:
     """Whether the parts of an evaluation.json that there are have the form that gsx gives them."""
     zoom, groups = content.get("zoom", {}), content.get("groups", {})
     named = all(isinstance(node, dict) and rows(list(node.values())) for node in (zoom, groups))
-    return sound_step(content) and named and all(map(is_decimal, zoom)) and rows(content.get("views", []))
+    sound = sound_step(content) and named and all(map(is_decimal, zoom)) and rows(content.get("views", []))
+    return sound and sound_incidents(content)
+
+
+def sound_incidents(content: dict[str, Any]) -> bool:
+    """Whether what an evaluation tells of caps, lost pictures and splats left out has the form that gsx gives it."""
+    cap, pseudo, left_out = content.get("withheld", {}), content.get("pseudo", {}), content.get("left_out", 0)
+    if not (isinstance(cap, dict) and isinstance(pseudo, dict) and rows(list(pseudo.values())) and is_number(left_out)):
+        return False
+    by_scale = [node for facts in pseudo.values() for node in (facts.get("dropped"), *part(facts, "warned").values())]
+    numbers = all(isinstance(node, dict) and all(map(is_number, node.values())) for node in by_scale)
+    return numbers and (not cap or is_number(cap.get("step")))
 
 
 def sound_pictures(content: dict[str, Any]) -> bool:

@@ -16,11 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import gsx
 from gsx import __version__
 from gsx.core import checkpoint, trunk
 from gsx.core.backbone import Backbone, Beginning
-from gsx.core.cache import cache_root, source_digest
+from gsx.core.cache import cache_root, source_revision
 from gsx.core.camera import Camera
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
@@ -30,7 +29,7 @@ from gsx.core.evaluate import Evaluator, render_tiled
 from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.files import write_json
 from gsx.core.guard import Agreement, Guard
-from gsx.core.identity import composition_key, finished, judging, place_of
+from gsx.core.identity import composition_key, finished, judging, other_revision, place_of, scene_stamp, trained_on
 from gsx.core.images import write_image
 from gsx.core.lpips import load_lpips
 from gsx.core.metrics import psnr
@@ -42,9 +41,10 @@ from gsx.core.pseudo import Augmenter, Setting
 from gsx.core.pseudo_pictures import write_pseudo_pictures
 from gsx.core.rasterizer.prepare import decide, warm
 from gsx.core.regenerator import Regenerator
+from gsx.core.remarks import CapNotice, remarks_of
 from gsx.core.report import write_report
 from gsx.core.run import Run, Sampler, Step
-from gsx.core.run_files import read_run
+from gsx.core.run_files import RunFiles, read_run
 from gsx.core.scene import Scene, View
 from gsx.core.shapes import Float
 from gsx.core.tracking import build_trackers, telling_of_failure
@@ -193,13 +193,14 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "rasterizer": run.raster.path,
-        "source": source_digest(Path(gsx.__file__).parent)[:16],
+        "source": source_revision(),
         "device": device_name(run.device),
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
         "plan": plan_of(run),
         "scene": {
+            "stamp": scene_stamp(run.config),
             "train_views": len(run.scene.train),
             "test_views": len(run.scene.test),
             "points": len(run.scene.points),
@@ -319,8 +320,10 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     return run
 
 
-def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
+def pursue(settings: Settings, plugins: Plugins, stamp: str) -> tuple[Path, Run | None]:
     """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
+
+    `stamp`: of its scene.
 
     What was finished is not done again, what was interrupted goes on where it stopped, and what was judged otherwise is
     judged anew. To be called with the folder `claimed`.
@@ -328,16 +331,16 @@ def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
     """
-    folder = place_of(settings.resolved)
+    folder = place_of(settings.resolved, stamp)
     files = read_run(folder)
-    if finished(files, settings.resolved):
-        logger.info("finished earlier: %s", folder)
+    if finished(files, settings.resolved, stamp):
+        logger.info("finished earlier%s: %s", by_another(files), folder)
         return folder, None
     at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:
         if not checkpoint.sidecars(folder / "checkpoints"):
             raise CheckpointError(f"{folder} holds no checkpoint")
-        if composition_key(files.config) != composition_key(settings.resolved):
+        if composition_key(files.config, trained_on(files)) != folder.name:
             raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
         run = restored(settings, folder, training=True)
     except CheckpointError as error:
@@ -348,6 +351,28 @@ def pursue(settings: Settings, plugins: Plugins) -> tuple[Path, Run | None]:
     if settings.general.init == "trunk":
         run.trunk = trunk.trunk_folder(run, plugins.versions)
     return folder, run
+
+
+def by_another(files: RunFiles) -> str:
+    """Words for what another revision of the source has trained; none for what this one has."""
+    revision = other_revision(files, this := source_revision())
+    return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
+
+
+def say_what_changed(run: Run) -> None:
+    """Warn of a run that goes on with other files or another revision of the source than it began with.
+
+    environment.json then names this revision, too.
+    """
+    files = read_run(run.folder)
+    if trained_on(files) not in ("", scene_stamp(run.config)):
+        logger.warning("files of scene %s are not those that the run began with", run.scene.name)
+    revisions = str(files.environment.get("source", "")).split("+")
+    if files.environment and revisions[-1] != source_revision():
+        logger.warning("the run was begun%s", by_another(files))
+        write_json(
+            run.folder / "environment.json", files.environment | {"source": "+".join([*revisions, source_revision()])}
+        )
 
 
 def set_aside(folder: Path, reason: str) -> None:
@@ -434,6 +459,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         follow(run, plugins)
         return
     trackers = build_trackers(settings.trackers)
+    if not run.complete:
+        say_what_changed(run)
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
@@ -441,6 +468,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     listeners: list[object] = [
         Guard(),
         Agreement(),
+        CapNotice(),
         log,
         *trackers,
         Checkpointer(),
@@ -508,7 +536,7 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s, "
         f"{e['train_seconds']:.0f} s of training, peak memory {e['peak_memory_mb']:,.0f} MB",
     ]
-    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()]
+    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()] + remarks_of(e)
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from gsx.core.batch import added_up, merged, views_of_step
 from gsx.core.camera import Camera
 from gsx.core.losses import photometric
 from gsx.core.plugins import Plugins
-from gsx.core.pseudo import PseudoView, Term, pseudo_loss
+from gsx.core.pseudo import PseudoView, Telling, Term, pseudo_loss
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.run import Run, Step
 from gsx.core.scene import View
@@ -73,7 +74,15 @@ def backward(run: Run) -> Step:
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
         run.backbone.begin(number)
         steps = [of_view(run, number, *each) for each in zip(picked, terms, colours, strict=True)]
-        return steps[0] if len(batch) == 1 else merged(run, steps)
+        step = steps[0] if len(batch) == 1 else merged(run, steps)
+        return replace(step, pseudo=asked_for(run, number))
+
+
+def asked_for(run: Run, number: int) -> dict[str, dict[str, Any]]:
+    """By augmenter, what became of the pictures that it asked for at this step."""
+    named = zip(run.config.get("augmenter") or {}, run.augmenters, strict=False)
+    told = {name: augmenter.told(number) for name, augmenter in named if isinstance(augmenter, Telling)}
+    return {name: facts for name, facts in told.items() if facts}
 
 
 def terms_of(run: Run, number: int, picked: int) -> list[Term]:

@@ -12,13 +12,12 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-import gsx
 from gsx.core import checkpoint
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_digest, trim
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_revision, trim
 from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
-from gsx.core.identity import trained
+from gsx.core.identity import scene_stamp, trained
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run, Step
 
@@ -42,8 +41,9 @@ def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
         json.dumps(trained(without_augmenters(run.config)), sort_keys=True, default=str),
+        scene_stamp(run.config),  # test views are among the lines that are kept with a state
         seen_by(run),
-        source_digest(Path(gsx.__file__).parent),
+        source_revision(),
         sorted(plugins.items()),
         machine,
     )

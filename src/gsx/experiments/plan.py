@@ -13,7 +13,7 @@ from typing import Any
 from gsx.core.cache import content_key
 from gsx.core.config import Settings
 from gsx.core.errors import ConfigError, nearest
-from gsx.core.identity import finished, place_of, sorted_items, trained
+from gsx.core.identity import finished, place_of, scene_stamp, sorted_items, trained
 from gsx.core.pseudo import Foretold
 from gsx.core.run_files import read_run
 from gsx.core.trunk import without_augmenters
@@ -72,6 +72,8 @@ class Cell:
     seed: int
     overrides: list[str]
     settings: Settings
+    stamp: str
+    """Of its scene, when the table was planned."""
 
     @property
     def config(self) -> dict[str, Any]:
@@ -81,7 +83,12 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Where its run lies; other cells with the same composition share it."""
-        return place_of(self.config)
+        return place_of(self.config, self.stamp)
+
+    @property
+    def finished(self) -> bool:
+        """Whether its run is done."""
+        return finished(read_run(self.folder), self.config, self.stamp)
 
     @property
     def begins(self) -> int:
@@ -93,7 +100,7 @@ class Cell:
     @property
     def trunk(self) -> str:
         """What runs share that can branch from each other."""
-        return content_key(sorted_items(trained(without_augmenters(self.config))))
+        return content_key(sorted_items(trained(without_augmenters(self.config))), self.stamp)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,6 +132,7 @@ def cells_of(
     Raises:
         ConfigError: a composition is wrong.
     """
+    stamps: dict[str, str] = {}
     for name, dataset in datasets.items():
         for scene in dataset["scenes"]:
             if experiment.scenes and scene not in experiment.scenes:
@@ -134,7 +142,17 @@ def cells_of(
                     overrides = [f"dataset={name}", f"variant={variant}", *experiment.overrides, *words(variant)]
                     overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true"]
                     settings = compose(overrides)
-                    yield Cell(row=row, dataset=name, scene=scene, seed=seed, overrides=overrides, settings=settings)
+                    options = str(settings.resolved["scene"])  # folders may be large: each is looked at once
+                    stamps[options] = stamps.get(options) or scene_stamp(settings.resolved)
+                    yield Cell(
+                        row=row,
+                        dataset=name,
+                        scene=scene,
+                        seed=seed,
+                        overrides=overrides,
+                        settings=settings,
+                        stamp=stamps[options],
+                    )
 
 
 def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Cell], together: bool = False) -> Plan:
@@ -143,7 +161,7 @@ def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Ce
     One after the other each group is run as a whole, so that few states need be kept at a time.
     """
     runs = {cell.folder: cell for cell in reversed(cells)}  # of cells with one run the first
-    due = [cell for cell in cells if runs[cell.folder] is cell and not finished(read_run(cell.folder), cell.config)]
+    due = [cell for cell in cells if runs[cell.folder] is cell and not cell.finished]
     groups: dict[str, list[Cell]] = {}
     for cell in due:
         groups.setdefault(cell.trunk, []).append(cell)

@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gsx.core.cache import source_revision
 from gsx.core.control import spread
 from gsx.core.files import read_json
-from gsx.core.identity import NAMES, OPERATING, WATCHING, WHERE, asked_for, without
+from gsx.core.identity import NAMES, OPERATING, WATCHING, WHERE, asked_for, other_revision, without
 from gsx.core.overview import flattened
+from gsx.core.remarks import remarks_of
 from gsx.core.run_files import RunFiles, is_number, part, read_run, state_of
 from gsx.core.trunk import BRANCH
 from gsx.experiments.plan import Cell, Experiment
@@ -68,6 +70,8 @@ class Figure:
     paper_gain: float | None = None
     problem: str = ""
     """Why there is no figure."""
+    remarks: tuple[str, ...] = ()
+    """What a reader must know of the runs behind it."""
 
     @property
     def scenes(self) -> int:
@@ -206,7 +210,13 @@ def figure(
         paper=paper,
         difference=ours - paper if complete and ours is not None and paper is not None else None,
         problem="" if complete else problem_of(inside, files, lacking, metric),
+        remarks=tuple(dict.fromkeys(told for cell in inside for told in remarks_on(cell, files))),
     )
+
+
+def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
+    """What a reader must know of a run, with its row and scene."""
+    return [f"{cell.row}, {cell.scene}: {remark}" for remark in remarks_of(files[cell.folder].evaluation)]
 
 
 def measured(files: RunFiles, metric: str, group: str) -> float | None:
@@ -285,6 +295,7 @@ def notes_of(
 ) -> list[str]:
     """What a reader must know beside the figures."""
     notes = [f"{row}: {reason}" for row, reason in experiment.quoted.items()]
+    notes += dict.fromkeys(f"* {told}" for cell in cells for told in remarks_on(cell, files))
     notes += [f"corrected: {note}" for note in (published.notes if published else [])]
     shared: dict[Path, list[str]] = {}
     for cell in cells:
@@ -292,13 +303,30 @@ def notes_of(
             shared[cell.folder].append(cell.row)
     same = [" and ".join(rows) for rows in shared.values() if len(rows) > 1]
     notes += dict.fromkeys(f"{rows} are the same composition here" for rows in same)
-    codes = {str(run.environment.get("source")) for run in files.values() if run.environment}
-    if len(codes) > 1:
-        notes.append(f"these runs were trained by {len(codes)} different states of gsx's code")
+    notes += of_other_revisions(cells, files)
     devices = {str(run.environment.get("device")) for run in files.values() if run.environment}
     if len(devices) > 1:
         notes.append(f"these runs were trained on different devices: {', '.join(sorted(devices))}")
     return notes
+
+
+def of_other_revisions(cells: Sequence[Cell], files: dict[Path, RunFiles]) -> list[str]:
+    """Which rows hold results of another revision of gsx's source than this one, and in how many of their runs."""
+    this = source_revision()
+    found = {folder: other_revision(run, this) for folder, run in files.items() if run.evaluation}
+    notes = []
+    for revision in sorted({revision for revision in found.values() if revision}):
+        shares = [share_of(row, revision, cells, found) for row in dict.fromkeys(cell.row for cell in cells)]
+        told = ", ".join(share for share in shares if share)
+        notes.append(f"trained by another revision of gsx's source ({revision}, this is {this}): {told}")
+    return notes
+
+
+def share_of(row: str, revision: str, cells: Sequence[Cell], found: dict[Path, str]) -> str:
+    """How many results of a row are of that revision, in words; empty if none is. `found`: revisions by folder."""
+    own = [found[folder] for folder in {cell.folder for cell in cells if cell.row == row} if folder in found]
+    count = own.count(revision)
+    return f"{row} ({count} of {len(own)} runs)" if count else ""
 
 
 def protocol_differences(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:

@@ -10,7 +10,7 @@ from gsx.experiments.table import Figure, Scope, Table, rows_of
 DIGITS = {"PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1}
 FIELDS = (
     "row", "scope", "scenes", "of_scenes", "seeds", "metric", "ours", "spread", "paper", "difference", "gain",
-    "paper_gain", "problem",
+    "paper_gain", "problem", "remarks",
 )  # fmt: skip
 
 
@@ -30,12 +30,13 @@ def number(value: float | None, metric: str, sign: bool = False) -> str:
 
 
 def ours(figure: Figure) -> str:
-    """Our figure with its spread; in brackets where scenes are missing."""
+    """Our figure with its spread; in brackets where scenes are missing, with a star where a note tells more of it."""
     if figure.ours is None:
         return "-"
     text = number(figure.ours, figure.metric)
     if figure.spread is not None:
         text += f" ± {number(figure.spread, figure.metric)}"
+    text += " *" if figure.remarks else ""
     return text if figure.scenes == figure.of_scenes else f"({text}: {figure.scenes} of {figure.of_scenes})"
 
 
@@ -140,7 +141,7 @@ def as_csv(table: Table) -> str:
     writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
     writer.writeheader()
     for f in table.figures:
-        line = {key: getattr(f, key) for key in FIELDS}
+        line = {key: getattr(f, key) for key in FIELDS} | {"remarks": "; ".join(f.remarks)}
         writer.writerow({key: "" if value is None else value for key, value in line.items()})
     return stream.getvalue()
 

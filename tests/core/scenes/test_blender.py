@@ -15,10 +15,11 @@ from synthetic_colmap import shipped
 from gsx.cli import plugins
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.evaluate import Evaluator
 from gsx.core.images import resize, write_image
 from gsx.core.ply import write_ply
 from gsx.core.scenes.blender import BlenderOptions, box_averaged, load
-from gsx.core.session import execute, start
+from gsx.core.session import execute, open_run, start
 
 FOV = 2 * math.atan(0.5)  # the focal length is the width
 # looks along +y from (0, -4, 0) with z up: right is +x, up is +z, back is -y
@@ -255,6 +256,22 @@ def test_test_views_are_grouped_by_scale(folder: Path) -> None:
     assert "scales" not in load(options(folder)).provenance
 
 
+@pytest.mark.parametrize("first", ["x1/2", "x1"])
+def test_views_from_afar_and_views_of_smaller_images_have_truths_of_their_own(folder: Path, first: str) -> None:
+    """test_scales=[1,2] beside eval.zoom=[1,0.5]: both are 20 x 15, one reduced bicubically, one by box averages."""
+    by_scale = {view.group: view for view in load(options(folder, test_scales=[1, 2])).test}
+    order = [first, *(name for name in by_scale if name != first)]
+    cameras = {name: by_scale[name].camera.zoom(0.5 if name == "x1" else 1) for name in order}
+    truths = {name: by_scale[name].source.image(cameras[name]) for name in order}
+    rgba = picture(0).long()
+    blocks = (rgba[:, ::2, ::2] + rgba[:, 1::2, ::2] + rgba[:, ::2, 1::2] + rgba[:, 1::2, 1::2]) // 4
+    colour, alpha = blocks[:3], blocks[3:]
+    behind = (colour * alpha + 255 * (255 - alpha)) // 255  # over white, truncated
+    assert (truths["x1/2"].long() - behind).abs().max() <= 1
+    whole = by_scale["x1"].source.image(by_scale["x1"].camera)
+    assert torch.equal(truths["x1"], resize(whole, 20, 15))  # which is Pillow's bicubic
+
+
 def test_a_scale_given_twice_is_trained_on_twice_and_moves_no_camera(folder: Path) -> None:
     scene, plain = load(options(folder, scales=[1, 1, 2])), load(options(folder))
     assert [view.camera.width for view in scene.train] == [40, 40, 40, 40, 20, 20]
@@ -311,7 +328,8 @@ def test_one_image_at_many_scales_is_still_one(folder: Path) -> None:
 def test_figures_by_scale_are_in_the_evaluation(folder: Path, tmp_path: Path) -> None:
     write(folder, "train", [FRONT, SIDE, FRONT])
     words = ["scene=blender", f"scene.path={folder}", "scene.random_points=50", "scene.scales=[1,1,2]", "device=cpu"]
-    words += ["scene.test_scales=[1,2]", "iterations=2", f"folder={tmp_path / 'run'}", "backbone=mip_splatting"]
+    words += ["scene.test_scales=[1,2]", "eval.zoom=[1,0.5]", "iterations=2", f"folder={tmp_path / 'run'}"]
+    words += ["backbone=mip_splatting"]
     settings = compose(words, plugins())
     execute(start(settings, plugins()), settings, plugins())
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
@@ -319,3 +337,5 @@ def test_figures_by_scale_are_in_the_evaluation(folder: Path, tmp_path: Path) ->
     by_scale = [evaluation["groups"][name]["psnr"] for name in ("x1", "x1/2")]
     assert evaluation["psnr"] == pytest.approx(sum(by_scale) / 2)
     assert "<td>x1/2</td>" in (tmp_path / "run" / "report.html").read_text()
+    again, judging = open_run(tmp_path / "run", plugins(), ["scene.cache_gb=0"])  # nothing is shared
+    assert Evaluator(again, judging.evaluation).zoom(0.5) == evaluation["zoom"]["0.5"]

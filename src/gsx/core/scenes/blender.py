@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +108,18 @@ def reduced(view: View, factor: int, grouped: bool = False) -> View:
             f"Image '{source.path}' of {width} x {height} does not divide by {factor}: leave that scale out."
         )
     size = width // factor, height // factor
-    smaller = replace(source, whole=source.whole.resize(*size), remap=partial(box_averaged, factor=factor))
+    smaller = replace(source, whole=source.whole.resize(*size), remap=BoxAverage(factor))
     return View(f"{view.name} {name}", view.camera.resize(*size), smaller, group)
+
+
+@dataclass(frozen=True)
+class BoxAverage:
+    """`box_averaged` as what is done to a decoded file; equal factors are one reduction, whose pictures are shared."""
+
+    factor: int
+
+    def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C height width"]:
+        return box_averaged(image, self.factor)
 
 
 def box_averaged(image: UInt8[Tensor, "C H W"], factor: int) -> UInt8[Tensor, "C height width"]:

@@ -11,8 +11,9 @@ class SceneOptions:
     """Name of the format, which is also the name of its file in conf/scene."""
     background: list[float]
     """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (spec 2.2)."""
-    iterations: int = 30000
-    """Length of a run unless the top-level `iterations` says otherwise (3D-GS: 30,000)."""
+    iterations: int = 0
+    """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
+    published one."""
     path: str = ""
     """Folder of the scene."""
     downscale: int = 1
