@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
-from gsx.core.distributed import Ranks
 from gsx.core.errors import InputError
 from gsx.core.evaluate import render_tiled
 from gsx.core.files import replace_file
@@ -73,18 +72,18 @@ def without(run: Run, half: int, steps: int, seed: int) -> Run:
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
-    return replace(
-        run,
+    backbone = run.anew(scene, steps, generator)
+    return Run(
+        config=run.config,
+        folder=run.folder,
         scene=scene,
-        backbone=run.anew(scene, steps, generator),
+        backbone=backbone,
+        raster=backbone.raster,
+        training=run.training,
         iterations=steps,
+        device=run.device,
         generator=generator,
         sampler=Sampler(len(views), own, batch=run.training.batch),
-        augmenters=(),
-        ranks=Ranks(),
-        step=0,
-        trunk=None,
-        curves=[],
     )
 
 
