@@ -1,4 +1,4 @@
-"""Which Gaussians touch the picture at all, without drawing it."""
+"""Which Gaussians touch the picture at all, and how large they are there, without drawing it."""
 
 import torch
 from torch import Tensor
@@ -20,10 +20,24 @@ def touches(
     settings: RasterSettings,
 ) -> Bool[Tensor, "N"]:
     """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (spec 3.1)."""
+    return screen_radii(means, scales, quats, camera, settings) >= 0
+
+
+@torch.no_grad()
+def screen_radii(
+    means: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    camera: Camera,
+    settings: RasterSettings,
+) -> Float[Tensor, "N"]:
+    """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
     opaque = Splats(
         means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
     )
     screen = project(opaque, camera, settings)
     first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
-    mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    return mask.index_fill_(0, screen.ids[on_raster(first, last, camera)], True)
+    on = on_raster(first, last, camera)
+    xx, xy, yy = (screen.covariances[on] - settings.dilation * means.new_tensor([1, 0, 1])).unbind(1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], largest.clamp_min(0).sqrt())
