@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from tiny import OVERRIDES, tiny_run, words
 from gsx import __version__
 from gsx.cli import main
 from gsx.core.images import write_image
+from gsx.core.rasterizer import RasterSettings
 
 GSX = [sys.executable, "-m", "gsx"]
 
@@ -70,6 +72,42 @@ def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pyt
     assert "identical" in capsys.readouterr().err
     assert main(["report", str(run_folder)]) == 0
     assert main(["report", str(run_folder.parent)]) == 0
+
+
+def test_eval_draws_by_the_path_of_training_and_names_it(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(run_folder, tmp_path / "run"))
+    environment = json.loads((folder / "environment.json").read_text())
+    assert environment["rasterizer"] == "eager"  # so short a run is not compiled for
+    (folder / "environment.json").write_text(json.dumps(environment | {"rasterizer": "compiled"}))
+    asked: list[str] = []
+
+    def takes(settings: RasterSettings, *rest: object) -> bool:
+        asked.append(settings.path)
+        return False  # drawn eagerly after all: this test is not about compiling
+
+    monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
+    monkeypatch.setattr("gsx.core.rasterizer.prepare.takes", lambda settings, **rest: settings.path == "compiled")
+    monkeypatch.setattr("gsx.core.rasterizer.prepare.compiles", lambda settings, device: False)
+
+    def evaluated(*overrides: str) -> tuple[str, set[str], str]:
+        asked.clear()
+        assert main(["eval", str(folder), *overrides]) == 0
+        told = json.loads((folder / "evaluation.json").read_text())
+        err = capsys.readouterr().err
+        assert f"renders/s ({told['render_path']})" in err
+        assert f"at training size, {told['render_path']} path" in (folder / "report.html").read_text()
+        return told["render_path"], set(asked), err
+
+    path, drawn, told = evaluated()
+    assert (path, drawn) == ("compiled", {"compiled"})
+    assert "renders/s are now by the compiled path; the evaluation before had" in told
+    path, drawn, told = evaluated("eval.zoom=[1,2]")
+    assert (path, drawn, "are now by" in told) == ("compiled", {"compiled"}, False)
+    path, drawn, told = evaluated("rasterizer.path=eager")
+    assert (path, drawn) == ("eager", {"eager"})
+    assert re.search(r"renders/s are now by the eager path; .* had [\d.]+ by the compiled path", told)
 
 
 def test_trade_of_a_run_a_file_and_the_built_in_scene(

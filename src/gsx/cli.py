@@ -414,12 +414,15 @@ def verb_resume(words: list[str]) -> int:
 
 def verb_eval(words: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
+    from gsx.core.rasterizer.prepare import warm
     from gsx.core.report import write_report
-    from gsx.core.session import evaluate, finish, open_run
+    from gsx.core.session import as_trained, evaluate, finish, open_run
 
     folder, overrides = run_words("eval", words)
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
+    run.raster = as_trained(run)
+    warm(run.raster, run.device)
     if run.complete:
         finish(run, settings, loaded)
     else:

@@ -61,7 +61,7 @@ def test_evaluation_has_the_published_layout(finished: Path) -> None:
     evaluation = json.loads((finished / "evaluation.json").read_text())
     assert evaluation.keys() >= {
         "protocol", "psnr", "ssim", "lpips", "primitives", "visible_primitives", "megabytes", "render_fps",
-        "train_seconds", "peak_memory_mb", "groups", "zoom", "views",
+        "render_path", "train_seconds", "evaluate_seconds", "peak_memory_mb", "groups", "zoom", "views",
     }  # fmt: skip
     assert evaluation["lpips"] is None
     assert len(evaluation["protocol"]["hash"]) == 16

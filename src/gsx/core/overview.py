@@ -26,7 +26,8 @@ DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
-    "primitives", "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
+    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "protocol",
+    "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 
@@ -132,7 +133,16 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
         "iterations": run.iterations,
         **{
             key: e.get(key)
-            for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
+            for key in (
+                "psnr",
+                "ssim",
+                "lpips",
+                "primitives",
+                "megabytes",
+                "render_fps",
+                "render_path",
+                "peak_memory_mb",
+            )
         },
         "seconds": e.get("train_seconds"),
         "gains": gains,
