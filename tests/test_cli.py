@@ -17,7 +17,7 @@ import torch
 from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
-from gsx.cli import main
+from gsx.cli import VERBS, main
 from gsx.core.images import write_image
 from gsx.core.rasterizer import RasterSettings
 
@@ -142,6 +142,31 @@ def test_trade_help_lists_its_options(capsys: pytest.CaptureFixture[str]) -> Non
             main(asked)
         assert end.value.code == 0
         assert "--max-error" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("asked", ["--help", "-h"])
+def test_every_verb_prints_its_own_help(verb: str, asked: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([verb, asked])
+    told = capsys.readouterr().out
+    assert end.value.code == 0
+    assert told.startswith(f"usage: gsx {verb}")
+    assert "start here" not in told, "this is the help of gsx"
+
+
+def test_help_of_a_verb_does_not_import_torch() -> None:
+    code = "import sys; from gsx.cli import VERBS\nfor verb in VERBS:\n try: VERBS[verb](['--help'])\n"
+    code += " except SystemExit: pass\nsys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("name", ["x.spz", "x.splat", "x", "x.ply.gz"])
+def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path / "no_run"), str(tmp_path / name)]) == 2
+    told = capsys.readouterr().err
+    assert f"{name} is not written: gsx writes .ply alone" in told
+    assert len(told.splitlines()) == 1
 
 
 def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,6 +50,8 @@ def test_a_run_leaves_everything_documented(finished: Path) -> None:
         "point_cloud.ply", "checkpoints", "renders",
     }  # fmt: skip
     assert json.loads((finished / "status.json").read_text())["state"] == "ok"
+    header = (finished / "point_cloud.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "\ncomment SplatRenderMode: default\n" in header
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["step"] == 24
     assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs density events"

@@ -7,7 +7,6 @@ that loses to it adds artefacts, not detail.
 import hashlib
 import json
 import math
-import resource
 import statistics
 import sys
 import time
@@ -81,10 +80,14 @@ def render_seconds(times: Sequence[float]) -> float:
     return statistics.median(times[1:11] or times)
 
 
-def peak_memory_mb(device: torch.device) -> float:
-    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes)."""
+def peak_memory_mb(device: torch.device) -> float | None:
+    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes); None where Python is not told it."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
@@ -112,6 +115,11 @@ def mean(values: Sequence[float | None]) -> float | None:
     """Mean, or None where a value is missing."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+def highest(values: Sequence[float | None]) -> float | None:
+    """The largest known value, or None where none is known."""
+    return max((value for value in values if value is not None), default=None)
 
 
 def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
@@ -267,7 +275,7 @@ class Evaluator:
             "render_fps": 1 / render_seconds(self.times),
             "render_path": path_of(run.raster, run.device),
             "train_seconds": run.seconds,
-            "peak_memory_mb": max([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
+            "peak_memory_mb": highest([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
             "groups": {name: group_figures(vs) for name, vs in by_group.items()},
             "zoom": self.zooms(views, drawing, advance),
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],

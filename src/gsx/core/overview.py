@@ -133,17 +133,9 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
         "iterations": run.iterations,
         **{
             key: e.get(key)
-            for key in (
-                "psnr",
-                "ssim",
-                "lpips",
-                "primitives",
-                "megabytes",
-                "render_fps",
-                "render_path",
-                "peak_memory_mb",
-            )
+            for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
         },
+        "render_path": e.get("render_path"),
         "seconds": e.get("train_seconds"),
         "gains": gains,
         "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},

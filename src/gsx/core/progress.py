@@ -111,10 +111,11 @@ class Progress:
 
     def line(self, run: Run) -> str:
         """The line as shown."""
-        a, primitives = self.averages, run.backbone.size()[0]
+        a, primitives, memory = self.averages, run.backbone.size()[0], peak_memory_mb(run.device)
+        megabytes = "" if memory is None else f"{memory:,.0f} MB  "
         return (
             f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
-            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {peak_memory_mb(run.device):,.0f} MB  "
+            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {megabytes}"
             f"ETA {clock((run.iterations - run.step) / a['speed'])}"
         )
 
@@ -158,6 +159,7 @@ class MetricsLog:
 
     def entry(self, run: Run, step: Step) -> dict:
         """One line of metrics.jsonl."""
+        memory = peak_memory_mb(run.device)
         line = {
             "step": run.step,
             "seconds": round(run.seconds, 3),
@@ -165,7 +167,7 @@ class MetricsLog:
             "psnr": step.psnr(),
             "primitives": run.backbone.size()[0],
             "pairs": step.rendering.pairs,
-            "memory_mb": round(peak_memory_mb(run.device), 1),
+            "memory_mb": None if memory is None else round(memory, 1),
             **({"terms": step.terms} if step.terms else {}),
             **step.changes,
         }

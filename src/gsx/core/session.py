@@ -520,11 +520,12 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
     """The result in a few lines."""
     e, path = evaluation, evaluation["render_path"]
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
     lines = [
         f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}",
         f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s ({path}), "
         f"{e['train_seconds']:.0f} s of training, {e['evaluate_seconds']:.0f} s of evaluation, "
-        f"peak memory {e['peak_memory_mb']:,.0f} MB",
+        f"peak memory {memory}",
     ]
     return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()]
 
@@ -551,6 +552,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *run.backbone.export_notes(),
+        *([f"SplatRenderMode: {render_mode(run.raster)}"] if camera is not None or run.backbone.standard_file else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
     if camera is None:
@@ -558,6 +560,14 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
     else:
         run.backbone.begin(max(1, run.step))
         write_gaussians(path, run.backbone.explicit(camera), comments)
+
+
+def render_mode(raster: RasterSettings) -> str:
+    """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
+
+    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads (spec B6 of splat formats).
+    """
+    return "mip" if raster.compensate else "default"
 
 
 def unit_of(run: Run) -> float:
