@@ -36,7 +36,7 @@ wheel: $(READY_DEV)
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gsx needs Python 3.11 or newer; set PYTHON=...")'
-	@echo "Setting up $(VENV), once: some 300 MB to fetch, 1 GB on disk."
+	@echo "Setting up $(VENV), once: 1.2 GB on disk, more with CUDA."
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) setuptools wheel
 	index=; if ! command -v nvidia-smi > /dev/null && $(ANSWERS) 2> /dev/null; then index="--extra-index-url $(CPU_TORCH)"; \

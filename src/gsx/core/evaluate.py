@@ -41,6 +41,8 @@ class EvalOptions:
     ssim: str
     tile_pixels: int
     lpips: LpipsOptions
+    remedy: str = ""
+    """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:

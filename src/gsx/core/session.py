@@ -501,7 +501,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "judged": judging(settings.resolved)}
     tell_of_paths(read_run(run.folder).evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
-    for line in summary(evaluation):
+    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)
     return evaluation
 
@@ -528,6 +528,16 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         f"peak memory {memory}",
     ]
     return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()]
+
+
+def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
+    """What to try where a render zoomed in loses to the enlarged one, and is not yet compensated for dilation."""
+    lost = [
+        factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
+    ]
+    if not lost or not remedy or run.raster.compensate:
+        return []
+    return [f"a model that is filtered for zooming in: the same command with {remedy}"]
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:
