@@ -14,6 +14,17 @@ from gsx.core.sh import colours_of
 from gsx.core.shapes import Float
 from gsx.core.splats import Splats
 
+SUFFIXES = (".ply",)
+"""Of the files that are written."""
+
+
+def refuse_suffix(path: Path) -> None:
+    """Raise InputError if the name promises a format that is not written."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {path.stem}{SUFFIXES[0]}"
+        )
+
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
     """Properties by name in file order; f_rest is channel-major: all red coefficients, then green, then blue."""
