@@ -23,6 +23,7 @@ from gsx.core.lpips import LpipsOptions, load_lpips
 from gsx.core.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer import RasterSettings, rasterize_pieces
 from gsx.core.rasterizer.prepare import path_of
+from gsx.core.remarks import gathered
 from gsx.core.run import Run
 from gsx.core.scene import View
 from gsx.core.shapes import Float
@@ -60,6 +61,8 @@ class Tiled:
     image: Float[Tensor, "3 H W"]
     visible: int
     """Splats with a radius on the whole raster."""
+    dropped: int
+    """Splats left out because a value of theirs cannot be drawn."""
 
 
 def render_tiled(
@@ -67,7 +70,7 @@ def render_tiled(
 ) -> Tiled:
     """Render in pieces of at most `pixels`, so that memory does not grow with the picture; clamped to [0, 1]."""
     mosaic = rasterize_pieces(splats, camera, raster, background=background, pixels=pixels)
-    return Tiled(mosaic.image.clamp_(0, 1), int(mosaic.visible.sum()))
+    return Tiled(mosaic.image.clamp_(0, 1), int(mosaic.visible.sum()), mosaic.dropped)
 
 
 @torch.no_grad()
@@ -195,6 +198,7 @@ class Evaluator:
             "ssim": ssim(image, truth, self.options.ssim),
             "lpips": None if self.lpips is None else self.lpips.distance(image, truth),
             "visible": tiled.visible,
+            "left_out": tiled.dropped,
         }
 
     def whole(self, view: View) -> Float[Tensor, "3 H W"]:
@@ -273,6 +277,8 @@ class Evaluator:
             **{key: mean([v[key] for v in views]) for key in figures},
             "primitives": primitives,
             "visible_primitives": statistics.fmean(v["visible"] for v in views),
+            "left_out": statistics.fmean(v["left_out"] for v in views),
+            **gathered(run.curves),
             "megabytes": size / 1e6,
             "render_fps": 1 / render_seconds(self.times),
             "render_path": path_of(run.raster, run.device),
