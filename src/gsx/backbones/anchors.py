@@ -328,18 +328,19 @@ class Anchors:
         volumes = self.last[0].splats.scales.prod(1)
         return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
         growth = self.options.growth
         if self.last is None or not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
             return {}
         decoded, taking_part = self.last
-        seen = sightings(rendering.screen, decoded.slots)
+        seen = sightings(rendering.screen, decoded.slots, weight)
         return {
             "rows": taking_part.rows,
             "opacities": decoded.opacities,
             "slots": seen["rows"],
             "gradients": seen["gradient"].to(decoded.opacities),
+            "weight": seen["weight"].to(decoded.opacities),
         }
 
     def record(self, seen: Observation) -> None:

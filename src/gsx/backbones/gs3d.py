@@ -292,11 +292,11 @@ class GS3D:
         volumes = self.last[1].prod(1)
         return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Screen gradients, which count until density control ends (spec 7, cadence)."""
         if step >= self.schedule.step(self.options.density.stop):
             return {}
-        return sightings(rendering.screen, self.last[0].rows if self.last else None)
+        return sightings(rendering.screen, self.last[0].rows if self.last else None, weight)
 
     def record(self, seen: Observation) -> None:
         """Add screen gradients to the statistics."""

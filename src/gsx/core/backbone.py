@@ -16,7 +16,7 @@ from gsx.core.shapes import Float
 from gsx.core.splats import Splats
 
 Observation: TypeAlias = dict[str, Tensor]
-"""What density control learns from one render, as tensors by name; empty: nothing."""
+"""What density control learns from one render, as tensors by name, none of them 0-dimensional; empty: nothing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,12 +80,16 @@ class Backbone(Protocol):
         """A term to add to the loss for the splats handed out last, or None."""
         ...
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
-        """What density control learns from the render of the splats handed out last, after its backward pass."""
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
+        """What density control learns from the render of the splats handed out last, after its backward pass.
+
+        `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
+        photograph (`density.Statistics`).
+        """
         ...
 
     def record(self, seen: Observation) -> None:
-        """Count an observation in: one of this process, or of another that trains the same model."""
+        """Count an observation in by its weight: one of this process, or of another that trains the same model."""
         ...
 
     def adapt(self, step: int) -> dict[str, int]:
