@@ -513,6 +513,26 @@ def test_the_cap_holds_with_levels_too() -> None:
     assert len(table) == 33
 
 
+NOWHERE = ([math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 0.0], [1e30, 0.0, 0.0])
+
+
+@pytest.mark.usefixtures("keep_all")
+@pytest.mark.parametrize(("levels", "gradient"), [(None, 1.6e-3), ([0], 2.1e-4)])
+def test_offsets_without_a_place_grow_nothing(levels: list[int] | None, gradient: float) -> None:
+    """Their cells have no number; the others grow as if these were not there."""
+    offsets = [[4.0, 0.0, 0.0], [0.0, 40.0, 0.0]]
+    wanted: list[tuple[float, ...]] = []
+    for places in (offsets, [*offsets, *NOWHERE]):
+        table, neural = cloud([[0.0, 0, 0]], [places], [[gradient] * len(places)], levels=levels)
+        if levels is None:
+            deepen(table, neural, early=False)
+        else:
+            level_up(table, neural)
+        assert len(table) > 1
+        wanted = wanted or grown(table, 1)
+        assert grown(table, 1) == wanted
+
+
 # -- statistics --------------------------------------------------------------------------------------------------------
 
 

@@ -137,7 +137,8 @@ class Neural:
             drawn.view,
         )
         opacities = raw * drawn.weights[:, None]
-        chosen = (opacities.detach() > 0).view(-1).nonzero()[:, 0]
+        # what is not a number is handed on: the render counts it
+        chosen = (~(opacities.detach() <= 0)).view(-1).nonzero()[:, 0]
         owner = chosen // k
         size = lengths(take_rows(table["log_scales"], rows)).index_select(0, owner)
         shape = take_rows(shapes.reshape(-1, 7), chosen)

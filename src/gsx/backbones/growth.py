@@ -17,6 +17,9 @@ from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.density import Table, append_rows, keep_rows, mean_of, within_room
 from gsx.core.shapes import Bool, Float, Int
 
+LARGEST_CELL = 2.0**53
+"""Integers up to this are exact in float64."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthOptions:
@@ -254,6 +257,7 @@ def grow_by_depth(
     """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9); returns how many grew."""
     enough, gradient = eligible(table, least)
     means, grown = offset_means(table), 0
+    enough = enough & on_grid(means, voxel)
     for depth in range(options.depths):
         multiple = options.coarsest // options.hierarchy**depth
         if multiple == 0:  # the reference divides by it (spec 2.9)
@@ -268,6 +272,11 @@ def grow_by_depth(
         if early_stop and grown == 0:
             break
     return grown
+
+
+def on_grid(means: Float[Tensor, "N k 3"], size: float) -> Bool[Tensor, "N k"]:
+    """Places whose cells of that size have a number: False for those that are not finite, or beyond 2^53 cells."""
+    return (means.double().abs() < LARGEST_CELL * size).all(2)
 
 
 def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
@@ -293,6 +302,7 @@ def grow_by_level(
     taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
     means, of = offset_means(table), table["level"].clone()
     mean_gradient = gradient.sum(1) / (enough.sum(1) + 1e-6)
+    enough = enough & on_grid(means, levels.size(levels.count - 1))
     grown = 0
     for level in range(levels.count):
         own = of == level

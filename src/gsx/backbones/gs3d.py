@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +52,8 @@ from gsx.core.density import (
 from gsx.core.errors import InputError
 from gsx.core.export import columns_of
 from gsx.core.neighbours import mean_square_distance
-from gsx.core.rasterizer import Rendering, take_rows
+from gsx.core.quaternions import make_identity_where_zero
+from gsx.core.rasterizer import Rendering, drawable, take_rows
 from gsx.core.scene import PointCloud
 from gsx.core.schedule import log_linear
 from gsx.core.sh import colours_of, constant_from_colour
@@ -321,6 +322,7 @@ class GS3D:
         if rest.grad is None and self.table["sh_constant"].grad is not None:
             rest.grad = torch.zeros_like(rest)
         self.table.optimiser.step()
+        make_identity_where_zero(self.table["quats"])
         self.discard()
 
     def parameters(self) -> Iterable[tuple[str, Parameter]]:
@@ -335,12 +337,25 @@ class GS3D:
         """Every Gaussian has a colour of its own."""
         return ()
 
-    def heal(self) -> int:
-        """Remove rows with a value that is not finite, with their statistics; returns how many."""
+    @torch.no_grad()
+    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+        """Remove rows with a value that is not finite, or without a splat for a camera, with their statistics."""
         kept = finite_rows(self.table)
+        for camera in cameras:
+            kept &= self.usable_for(camera)
+        if bool(kept.all()) or not bool(kept.any()):
+            return 0
         keep_rows(self.table, kept)
         self.statistics = self.statistics.rows(kept)
         return int((~kept).sum())
+
+    def usable_for(self, camera: Camera) -> Bool[Tensor, "N"]:
+        """Rows that the camera draws or has no business with: False for splats or volumes that are out of range."""
+        splats, rows = self.splats(camera), self.shown(camera).rows
+        good = drawable(splats, camera, self.raster) & torch.isfinite(splats.scales.prod(1))
+        return (
+            good if rows is None else torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, rows, good)
+        )
 
     def discard(self) -> None:
         """Forget the gradients and the picture they came from."""

@@ -336,8 +336,10 @@ def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tenso
 
 
 def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Primitives that enough training cameras draw (spec 3.4)."""
-    return seen_fraction(levels, positions, of) > levels.threshold
+    """Primitives that enough training cameras draw (spec 3.4); none without a finite place."""
+    placed = torch.isfinite(positions).all(1)
+    places = torch.where(placed[:, None], positions, 0.0)
+    return (seen_fraction(levels, places, of) > levels.threshold) & placed
 
 
 def drawn(
@@ -356,8 +358,9 @@ def drawn(
     shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
     distances = (positions.detach() + shift - camera.centre.to(positions)).norm(dim=1)
     ideal = levels.ideal(distances, levels.coarseness(camera))
-    top, weight = whole_level(ideal + bias.detach(), levels.mode, highest)
-    return of <= top, torch.where(of == top, weight, 1.0)
+    known = torch.isfinite(distances)  # the others are handed on: the render counts what it cannot draw
+    top, weight = whole_level(torch.where(known, ideal + bias.detach(), 0.0), levels.mode, highest)
+    return (of <= top) | ~known, torch.where((of == top) & known, weight, 1.0)
 
 
 # -- schedules over levels -------------------------------------------------------------------------------------------

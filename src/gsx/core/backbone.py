@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
@@ -108,8 +108,12 @@ class Backbone(Protocol):
         """Name and gradient of every parameter that has one."""
         ...
 
-    def heal(self) -> int:
-        """Remove primitives with values that are not finite; returns how many. Called when a render left some out."""
+    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+        """Remove primitives with values that are not finite, or that one of the cameras cannot draw; returns how many.
+
+        Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
+        gradients included; nor where nothing would be left.
+        """
         ...
 
     def discard(self) -> None:

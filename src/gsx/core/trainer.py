@@ -52,15 +52,19 @@ def take_step(run: Run, plugins: Plugins) -> Step:
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:
     """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
-    reason = healed(run, step) or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
-    return next(filter(None, run.ranks.everyone(reason)), "")
+    removed = healed(run, step) if step.dropped else ""
+    reason = removed or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    reason = next(filter(None, run.ranks.everyone(reason)), "")
+    return reason if removed or not reason else "; ".join(filter(None, [reason, healed(run, step)]))
 
 
 def healed(run: Run, step: Step) -> str:
-    """Removes primitives that the render had to leave out; a reason to skip the step if there were any."""
-    removed = run.backbone.heal() if step.dropped else 0
+    """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
+    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken])
     if removed:
-        logger.warning("step %d: removed %d primitives with values that are not finite", step.number, removed)
+        logger.warning(
+            "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
+        )
     return f"removed {removed} primitives" if removed else ""
 
 
