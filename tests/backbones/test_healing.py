@@ -135,9 +135,11 @@ def test_anchors_are_not_blamed_for_their_networks(name: str, tmp_path: Path) ->
     with torch.no_grad():
         backbone.heads.get_submodule("opacity.2").get_parameter("bias")[0] = torch.nan
     count = len(backbone.table)
-    with guarded() as plugins, pytest.raises(TrainingError, match="3 steps in a row"):
-        for _ in range(3):
+    with guarded() as plugins:
+        for _ in range(2):
             assert "removed" not in take_step(run, plugins).skipped
+        with pytest.raises(TrainingError, match="3 steps in a row"):
+            take_step(run, plugins)
     assert len(backbone.table) == count
 
 

@@ -36,7 +36,7 @@ from gsx.backbones.levels import (
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
 from gsx.core.backbone import Beginning, Gaussians, Observation
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.density import (
     Statistics,
     Table,
@@ -244,7 +244,7 @@ class GS3D:
         """The Gaussians that the camera draws, with their colours as seen from there."""
         shown = self.shown(camera)
         values = shown.values
-        offsets = values["means"] - camera.centre.to(values["means"])
+        offsets = offsets_from(values["means"], camera.centre)
         scales, log_opacities = self.extents(shown)
         self.last = (shown, scales)
         return Splats(

@@ -90,8 +90,7 @@ def refuse_unusable(camera: Camera, lens: Float[Tensor, "4"], margin: float) -> 
 
 def camera_points(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
     """Positions in the camera's frame, in float64: float32 is too coarse far from the origin or through a long lens."""
-    means = splats.means.double()
-    return means @ camera.rotation.T.to(means) + camera.translation.to(means)
+    return camera.to_camera(splats.means)
 
 
 @torch.no_grad()
