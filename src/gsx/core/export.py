@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.backbone import Gaussians
+from gsx.core.camera import offsets_from
 from gsx.core.errors import InputError
 from gsx.core.ply import read_ply, write_ply
 from gsx.core.sh import colours_of
@@ -98,7 +99,7 @@ def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats
         colours=colours_of(
             gaussians.sh_constant[:, None],
             gaussians.sh_rest,
-            gaussians.means - camera_centre.to(gaussians.means),
+            offsets_from(gaussians.means, camera_centre),
             degree,
         ),
     )

@@ -21,7 +21,7 @@ from gsx import __version__
 from gsx.core import checkpoint, trunk
 from gsx.core.backbone import Beginning
 from gsx.core.cache import cache_root, source_revision
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
 from gsx.core.distributed import placed, ranks_here, refuse_uneven
@@ -414,7 +414,7 @@ def measured(scene: Scene) -> Scene:
     """The scene; one whose training cameras stand in one place takes its extent from the points' median distance."""
     if scene.extent > 0 or len(scene.points) == 0:
         return scene
-    distance = (scene.points.positions - scene.train[0].camera.centre.float()).norm(dim=1)
+    distance = offsets_from(scene.points.positions, scene.train[0].camera.centre).norm(dim=1)
     extent = 1.1 * float(distance.median())
     note = f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance"
     return replace(scene, extent=extent, notes=[*scene.notes, note])
