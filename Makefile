@@ -1,8 +1,15 @@
-# make demo: set up, train the built-in scene, say where the report is. make test: set up, run the tests.
+# make demo: set up what a run needs, train the built-in scene, say where the report is.
+# make test: set up what the tests need as well, run them.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_DEV := $(VENV)/.ready-dev
+PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
+# PyTorch's builds without CUDA, gigabytes smaller than those of PyPI for Linux: taken where there is no NVIDIA GPU and
+# that index answers; elsewhere torch comes from the indexes that pip knows.
+CPU_TORCH := https://download.pytorch.org/whl/cpu
+ANSWERS := $(BIN)/python -c 'from urllib.request import urlopen; urlopen("$(CPU_TORCH)/torch/", timeout=10)'
 # As many processes as cores, up to eight, with one thread each; a file's tests stay together and share what they set up.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
@@ -13,25 +20,32 @@ demo: $(READY)
 	$(BIN)/gsx 'eval.zoom=[1,2,4]'
 	@echo "Open the report named in the last line above."
 
-test: $(READY)
+test: $(READY_DEV)
 	$(PYTEST)
 
-test-slow: $(READY)
+test-slow: $(READY_DEV)
 	$(PYTEST) -m slow
 
-lint: $(READY)
+lint: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-wheel: $(READY)
+wheel: $(READY_DEV)
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gsx needs Python 3.11 or newer; set PYTHON=...")'
+	@echo "Setting up $(VENV), once: 1.2 GB on disk, more with CUDA."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools wheel torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	$(PIP) setuptools wheel
+	index=; if ! command -v nvidia-smi > /dev/null && $(ANSWERS) 2> /dev/null; then index="--extra-index-url $(CPU_TORCH)"; \
+	fi; $(PIP) torch $$index
+	$(PIP) --no-build-isolation --editable .
+	touch $@
+
+$(READY_DEV): $(READY)
+	$(PIP) --no-build-isolation --editable '.[dev]'
 	touch $@
 
 clean:

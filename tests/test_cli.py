@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,9 @@ import torch
 from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
-from gsx.cli import main
+from gsx.cli import VERBS, main
 from gsx.core.images import write_image
+from gsx.core.rasterizer import RasterSettings
 
 GSX = [sys.executable, "-m", "gsx"]
 
@@ -72,6 +74,42 @@ def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pyt
     assert main(["report", str(run_folder.parent)]) == 0
 
 
+def test_eval_draws_by_the_path_of_training_and_names_it(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(run_folder, tmp_path / "run"))
+    environment = json.loads((folder / "environment.json").read_text())
+    assert environment["rasterizer"] == "eager"  # so short a run is not compiled for
+    (folder / "environment.json").write_text(json.dumps(environment | {"rasterizer": "compiled"}))
+    asked: list[str] = []
+
+    def takes(settings: RasterSettings, *rest: object) -> bool:
+        asked.append(settings.path)
+        return False  # drawn eagerly after all: this test is not about compiling
+
+    monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
+    monkeypatch.setattr("gsx.core.rasterizer.prepare.takes", lambda settings, **rest: settings.path == "compiled")
+    monkeypatch.setattr("gsx.core.rasterizer.prepare.compiles", lambda settings, device: False)
+
+    def evaluated(*overrides: str) -> tuple[str, set[str], str]:
+        asked.clear()
+        assert main(["eval", str(folder), *overrides]) == 0
+        told = json.loads((folder / "evaluation.json").read_text())
+        err = capsys.readouterr().err
+        assert f"renders/s ({told['render_path']})" in err
+        assert f"at training size, {told['render_path']} path" in (folder / "report.html").read_text()
+        return told["render_path"], set(asked), err
+
+    path, drawn, told = evaluated()
+    assert (path, drawn) == ("compiled", {"compiled"})
+    assert "renders/s are now by the compiled path; the evaluation before had" in told
+    path, drawn, told = evaluated("eval.zoom=[1,2]")
+    assert (path, drawn, "are now by" in told) == ("compiled", {"compiled"}, False)
+    path, drawn, told = evaluated("rasterizer.path=eager")
+    assert (path, drawn) == ("eager", {"eager"})
+    assert re.search(r"renders/s are now by the eager path; .* had [\d.]+ by the compiled path", told)
+
+
 def test_trade_of_a_run_a_file_and_the_built_in_scene(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +142,31 @@ def test_trade_help_lists_its_options(capsys: pytest.CaptureFixture[str]) -> Non
             main(asked)
         assert end.value.code == 0
         assert "--max-error" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("asked", ["--help", "-h"])
+def test_every_verb_prints_its_own_help(verb: str, asked: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([verb, asked])
+    told = capsys.readouterr().out
+    assert end.value.code == 0
+    assert told.startswith(f"usage: gsx {verb}")
+    assert "start here" not in told, "this is the help of gsx"
+
+
+def test_help_of_a_verb_does_not_import_torch() -> None:
+    code = "import sys; from gsx.cli import VERBS\nfor verb in VERBS:\n try: VERBS[verb](['--help'])\n"
+    code += " except SystemExit: pass\nsys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("name", ["x.spz", "x.splat", "x", "x.ply.gz"])
+def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path / "no_run"), str(tmp_path / name)]) == 2
+    told = capsys.readouterr().err
+    assert f"{name} is not written: gsx writes .ply alone" in told
+    assert len(told.splitlines()) == 1
 
 
 def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:

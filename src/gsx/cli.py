@@ -45,7 +45,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
   gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
   torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/clusters.md)
-  gsx --version, gsx --help
+  gsx --version, gsx --help, gsx VERB --help
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
 """
@@ -141,7 +141,7 @@ def dispatch_together(words: list[str]) -> int:
 
 def dispatch(words: list[str]) -> int:
     """Find the verb and run it."""
-    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in ("render", "report", "trade")):
+    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in VERBS):
         sys.stdout.write(HELP)
         return 0
     if words == ["--version"]:
@@ -391,19 +391,24 @@ def onwards(run: "Run") -> str:
     return "the same command" if run.config.get("reuse") else f"gsx resume {run.folder}"
 
 
-def run_words(verb: str, words: list[str]) -> tuple[Path, list[str]]:
+def run_words(verb: str, words: list[str], description: str) -> tuple[Path, list[str]]:
     """The run folder and the overrides after it."""
-    if not words or "=" in words[0]:
+    parser = Parser(prog=f"gsx {verb}", usage="%(prog)s RUN [KEY=VALUE ...]", description=description)
+    parser.add_argument("run", metavar="RUN", help="run folder")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
+    given = parser.parse_args(words)
+    if "=" in given.run and not Path(given.run).exists():
         raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
-    return Path(words[0]), words[1:]
+    return Path(given.run), given.overrides
 
 
 def verb_resume(words: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...]"""
+    told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
+    folder, overrides = run_words("resume", words, told)
     from gsx.core.config import write_config
     from gsx.core.session import open_run
 
-    folder, overrides = run_words("resume", words)
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides, training=True)
     if run.complete and (folder / "evaluation.json").is_file():
@@ -416,12 +421,16 @@ def verb_resume(words: list[str]) -> int:
 
 def verb_eval(words: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
+    told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
+    folder, overrides = run_words("eval", words, told)
+    from gsx.core.rasterizer.prepare import warm
     from gsx.core.report import write_report
-    from gsx.core.session import evaluate, finish, open_run
+    from gsx.core.session import as_trained, evaluate, finish, open_run
 
-    folder, overrides = run_words("eval", words)
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
+    run.raster = as_trained(run)
+    warm(run.raster, run.device)
     if run.complete:
         finish(run, settings, loaded)
     else:
@@ -463,8 +472,11 @@ def verb_export(words: list[str]) -> int:
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     given = parser.parse_args(words)
+    from gsx.core.export import refuse_suffix
     from gsx.core.session import export, open_run, reimport_psnr, view_named
 
+    if given.file:
+        refuse_suffix(given.file)
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
@@ -490,17 +502,25 @@ def verb_report(words: list[str]) -> int:
 
 def verb_scenes(words: list[str]) -> int:
     """gsx scenes PATH"""
-    if len(words) != 1:
-        raise InputError("gsx scenes needs one folder: gsx scenes PATH")
+    parser = Parser(prog="gsx scenes", description="What a folder is: format, cameras, images, points, problems.")
+    parser.add_argument("path", type=Path, metavar="PATH", help="folder of a scene")
+    given = parser.parse_args(words)
     from gsx.core.scenes.inspect import describe
 
-    lines = describe(Path(words[0]))
+    lines = describe(given.path)
     sys.stdout.write("\n".join(lines) + "\n")
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
 def verb_datasets(words: list[str]) -> int:
     """gsx datasets [NAME ...] [data_root=FOLDER]"""
+    parser = Parser(
+        prog="gsx datasets",
+        usage="%(prog)s [NAME ...] [data_root=FOLDER]",
+        description="The paper's datasets: what is expected below data_root=FOLDER, what is found, what is missing.",
+    )
+    parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
+    words = parser.parse_args(words).words
     from gsx.core.config import Compositions
     from gsx.experiments.datasets import described
 
@@ -634,6 +654,7 @@ def verb_trade(words: list[str]) -> int:
 
 def verb_plugins(words: list[str]) -> int:
     """gsx plugins"""
+    Parser(prog="gsx plugins", description="What is installed, from where, and what failed to load.").parse_args(words)
     from gsx.core.plugins import KINDS
 
     loaded = plugins()

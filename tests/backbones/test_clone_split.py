@@ -211,6 +211,16 @@ def test_what_too_few_cameras_would_draw_is_not_made() -> None:
         assert 0 < int(keep.sum()) < len(everyone)
 
 
+@pytest.mark.parametrize("place", [math.nan, math.inf, -math.inf])
+def test_a_child_without_a_place_is_not_made(place: float) -> None:
+    backbone = small_octree()
+    raw = raw_of(backbone)
+    kept = chosen_places(raw, torch.ones(len(raw["means"])), levels_of(backbone), 10**6)
+    raw["means"][5, 1] = place
+    kept[5] = False
+    assert torch.equal(chosen_places(raw, torch.ones(len(kept)), levels_of(backbone), 10**6), kept)
+
+
 def test_room_goes_to_the_largest_gradients_of_those_that_are_seen() -> None:
     backbone = small_octree()
     levels, raw = replace(levels_of(backbone), threshold=0.5), raw_of(backbone)

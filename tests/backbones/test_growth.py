@@ -513,25 +513,46 @@ def test_the_cap_holds_with_levels_too() -> None:
     assert len(table) == 33
 
 
+NOWHERE = ([math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 0.0], [1e30, 0.0, 0.0])
+
+
+@pytest.mark.usefixtures("keep_all")
+@pytest.mark.parametrize(("levels", "gradient"), [(None, 1.6e-3), ([0], 2.1e-4)])
+def test_offsets_without_a_place_grow_nothing(levels: list[int] | None, gradient: float) -> None:
+    """Their cells have no number; the others grow as if these were not there."""
+    offsets = [[4.0, 0.0, 0.0], [0.0, 40.0, 0.0]]
+    wanted: list[tuple[float, ...]] = []
+    for places in (offsets, [*offsets, *NOWHERE]):
+        table, neural = cloud([[0.0, 0, 0]], [places], [[gradient] * len(places)], levels=levels)
+        if levels is None:
+            deepen(table, neural, early=False)
+        else:
+            level_up(table, neural)
+        assert len(table) > 1
+        wanted = wanted or grown(table, 1)
+        assert grown(table, 1) == wanted
+
+
 # -- statistics --------------------------------------------------------------------------------------------------------
 
 
 def test_statistics_are_sums_over_pictures() -> None:
-    """Visits of anchors, opacities summed over offsets, gradients of the Gaussians on screen: as a loop counts them."""
+    """Visits of anchors, opacities summed over offsets, gradients of the Gaussians on screen: as a loop counts them,
+    each picture by its weight, which gradients carry already."""
     table = table_of(6, 3, **fresh_statistics(6, 3, "cpu"))
     generator, wanted = torch.Generator().manual_seed(1), [[0.0] * 6, [0.0] * 6, [0.0] * 18, [0.0] * 18]
-    for _ in range(5):
+    for weight in (1.0, 1.0, 0.25, 1.0, 0.85):
         rows = torch.randperm(6, generator=generator)[:4]
         opacities = torch.rand(4, 3, generator=generator)
         on_screen = [row * 3 + j for row in rows.tolist() for j in range(3) if (row + j) % 2]
         gradients = torch.rand(len(on_screen), generator=generator)
-        observe(table, rows, opacities, torch.tensor(on_screen), gradients)
+        observe(table, rows, opacities, torch.tensor(on_screen), gradients, torch.tensor([weight]))
         for i, row in enumerate(rows.tolist()):
-            wanted[0][row] += 1
-            wanted[1][row] += sum(opacities[i].tolist())
+            wanted[0][row] += weight
+            wanted[1][row] += weight * sum(opacities[i].tolist())
         for slot, gradient in zip(on_screen, gradients.tolist(), strict=True):
             wanted[2][slot] += gradient
-            wanted[3][slot] += 1
+            wanted[3][slot] += weight
     names = ("visits", "opacity_sum", "gradient_sum", "gradient_count")
     for name, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(table[name].flatten(), torch.tensor(values))

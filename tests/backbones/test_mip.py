@@ -505,6 +505,7 @@ def test_the_exported_file_names_its_filters(finished: Path) -> None:
     header = (finished / "point_cloud.ply").read_bytes().split(b"end_header")[0].decode()
     assert "comment screen dilation 0.1 px^2, with opacity compensation" in header
     assert "comment 3D filter fused into scales and opacities" in header
+    assert "comment SplatRenderMode: mip" in header
 
 
 def test_the_exported_file_renders_the_same(finished: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Several views in one step: gradients, losses and statistics by hand from single views; order, failures, resuming."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +152,7 @@ def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Pa
 def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) -> None:
     run = fresh(tmp_path / "run", "training.batch=2", "backbone.density.gradient=1e9")
     count = run.backbone.size()[0]
-    sums, seen = torch.zeros(count), torch.zeros(count, dtype=torch.int32)
+    sums, seen = torch.zeros(count), torch.zeros(count)
     for view in (4, 1):
         screen = alone(run, view)[1].screen
         assert screen.shift.grad is not None
@@ -161,9 +162,93 @@ def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) ->
         gradients(run)
     take_step(run, plugins())
     statistics = run.backbone.statistics  # type: ignore[attr-defined]
-    assert torch.equal(statistics.count, seen)
-    torch.testing.assert_close(statistics.gradient, sums, rtol=1e-6, atol=0)
+    assert torch.equal(statistics.count, seen / 2)
+    torch.testing.assert_close(statistics.mean_gradient(), sums / seen.clamp_min(1), rtol=1e-6, atol=0)
     assert float(sums.max()) > 0
+
+
+class Judge:
+    """A run in the middle of density control, asked again and again from the same state what it learns from steps."""
+
+    def __init__(self, folder: Path, backbone: str) -> None:
+        absolute = ("backbone.density.absolute=true",) if backbone == "mip_splatting" else ()
+        self.run = fresh(folder, f"backbone={backbone}", *absolute)
+        self.run.step = 8
+        self.start = {name: value.clone() for name, value in self.run.backbone.tensors().items()}
+
+    def learnt(self, *augmenters: Any, batch: int = 1, steps: int = 1, ssim_weight: float = 0.2) -> dict[str, Tensor]:
+        """Statistics after so many steps over views 4, 1, 5, 0 that move nothing."""
+        run = self.run
+        run.backbone.restore({name: value.clone() for name, value in self.start.items()})
+        run.training = replace(run.training, batch=batch, ssim_weight=ssim_weight)
+        run.sampler.order, run.sampler.batch, run.augmenters = [0, 5, 1, 4], batch, augmenters
+        for _ in range(steps):
+            for seen in backward(run).seen:
+                run.backbone.record(seen)
+            run.backbone.discard()
+        names = ("statistics", "columns.visits", "columns.opacity_sum", "columns.gradient")
+        return {name: value.clone() for name, value in run.backbone.tensors().items() if name.startswith(names)}
+
+
+@pytest.fixture(scope="module", params=["gs3d", "mip_splatting", "scaffold", "octree_gs3d"])
+def judge(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Judge:
+    return Judge(tmp_path_factory.mktemp("judge") / "run", request.param)
+
+
+def test_a_batch_counts_as_one_step_and_judges_as_its_views_one_by_one(judge: Judge) -> None:
+    """Sums of a batch of n are those of n steps over n, so that visits are steps; mean gradients are the same."""
+    for views in (1, 2, 4):
+        wanted, found = judge.learnt(steps=views), judge.learnt(batch=views)
+        assert found.keys() == wanted.keys()
+        assert len(wanted) >= 2
+        for name, value in wanted.items():
+            assert value.any(), name
+            torch.testing.assert_close(found[name], value / views, rtol=2e-6, atol=0, msg=f"{views} {name}")
+        steps = found["columns.visits"] if "columns.visits" in found else found["statistics.count"]
+        assert float(steps.max()) == 1.0
+
+
+class Again:
+    """An augmenter: every training view once more with its own photograph as truth, at a weight."""
+
+    def __init__(self, weight: float, taken: float = 0.0, *, observed: bool = True, shared: bool = True) -> None:
+        self.weight, self.taken, self.observed, self.shared = weight, taken, observed, shared
+
+    def term(self, run: Run, step: int, view: int) -> Term | None:
+        seen = run.scene.train[view]
+        pseudo = PseudoView(camera=seen.camera, target=to_uint8(seen.image()), parent=view)
+        kind = {"observed": self.observed, "shared": self.shared}
+        return Term(name="again", parts=[(pseudo, self.weight)], taken=self.taken, **kind)
+
+    def begins(self) -> int:
+        return 0
+
+    def plan(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_pseudo_view_counts_by_its_weight(judge: Judge, shared: bool, batch: int) -> None:
+    """One that equals its photograph adds no more evidence than its weight: means stay, drawn together or apart.
+
+    0.9 of the photograph and 0.25 of the pseudo view are 1.15 of a step.
+    """
+    wanted = judge.learnt(batch=batch, ssim_weight=0.0)
+    found = judge.learnt(Again(0.25, 0.1, shared=shared), batch=batch, ssim_weight=0.0)
+    for name, value in wanted.items():
+        torch.testing.assert_close(found[name], 1.15 * value, rtol=1e-4, atol=1e-9, msg=name)
+
+
+def test_what_is_not_observed_leaves_no_trace_in_density_control(judge: Judge) -> None:
+    """Also where the pseudo view sees just what the photograph does: bit for bit the control's statistics."""
+    wanted = judge.learnt()
+    assert_same(judge.learnt(Again(0.5, observed=False)), wanted)
+    assert_same(judge.learnt(Again(0.0)), wanted)
+
+
+def test_photographs_that_are_left_no_weight_do_not_count(judge: Judge) -> None:
+    assert not any(value.any() for value in judge.learnt(Again(0.5, 1.0, observed=False)).values())
 
 
 def test_a_primitive_that_any_view_left_out_is_healed_and_the_step_skipped(tmp_path: Path) -> None:

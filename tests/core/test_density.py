@@ -273,6 +273,15 @@ def test_statistics_are_means_of_norms_in_ndc_over_the_views_that_saw_the_row() 
     torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([0.0, 6.0, 0.0, 5.0]))
 
 
+def test_sightings_count_by_their_weight() -> None:
+    """Gradients carry the weight already: 4 at weight 1 and 2 of 8 at weight 1/4 have the mean 6 / 1.25."""
+    statistics = Statistics.zeros(2, "cpu")
+    statistics.add(sightings(screen([0], [1], [[0.4, 0.0]], (20, 8))))
+    statistics.add(sightings(screen([0, 1], [1, 1], [[0.2, 0.0], [0.0, 0.25]], (20, 8)), weight=0.25))
+    assert statistics.count.tolist() == [1.25, 0.25]
+    torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([6 / 1.25, 4.0]))
+
+
 def test_a_view_without_gradient_still_counts() -> None:
     statistics = Statistics.zeros(2, "cpu")
     unused = ScreenStatistics(

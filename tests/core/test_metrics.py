@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from gsx.core import metrics
 from gsx.core.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 
 
@@ -44,6 +45,14 @@ def test_psnr_agrees_with_torchmetrics() -> None:
 @pytest.mark.parametrize("noise", [0.02, 0.4])
 def test_whole_windows_agree_with_pytorch_msssim(height: int, width: int, noise: float) -> None:
     image, target = (picture.double() for picture in pictures(height, width, noise))
+    theirs = pytorch_msssim.ssim(image[None], target[None], data_range=1.0, win_size=11, win_sigma=1.5)
+    assert ssim(image, target, "valid") == pytest.approx(float(theirs), abs=1e-6)
+
+
+@pytest.mark.parametrize("pixels", [1, 100, 400, 1 << 16])
+def test_strips_of_any_height_add_up_to_the_picture(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "STRIP_PIXELS", pixels)
+    image, target = (picture.double() for picture in pictures(33, 40))
     theirs = pytorch_msssim.ssim(image[None], target[None], data_range=1.0, win_size=11, win_sigma=1.5)
     assert ssim(image, target, "valid") == pytest.approx(float(theirs), abs=1e-6)
 

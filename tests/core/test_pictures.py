@@ -2,7 +2,9 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +13,22 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core import pictures
+from gsx.core import evaluate, pictures
 from gsx.core.backbone import Gaussians
 from gsx.core.camera import Camera, look_at
-from gsx.core.evaluate import EvalOptions, render_view
+from gsx.core.evaluate import EvalOptions, Evaluator, render_view
 from gsx.core.images import image_size, linear_from_display, read_image
 from gsx.core.lpips import LpipsOptions
-from gsx.core.metrics import bicubic, psnr, quantise
+from gsx.core.metrics import bicubic, psnr, quantise, ssim
 from gsx.core.pictures import (
+    Pictures,
     colour_ramp,
-    cropped,
-    enlarged_window,
     error_map,
     extremes,
     file_names,
     most_detailed,
     reduced,
-    resized_window,
     spread,
-    write_pictures,
 )
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.run import Run, Sampler, TrainingOptions
@@ -177,6 +176,16 @@ def figures(run: Run, *, zoom: tuple[float, ...] = (1, 2, 4), psnrs: list[float]
     return {"views": views, "zoom": {str(factor): {"psnr": 20.0} for factor in zoom}}
 
 
+def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -> None:
+    """Draw a run as an evaluation does that has found these figures."""
+    evaluator = Evaluator(run, replace(options, zoom=[float(factor) for factor in evaluation["zoom"]]))
+    drawing = Pictures(run.folder / "renders", run.step)
+    evaluator.views()
+    drawing.choose(evaluation["views"])
+    evaluator.zooms(evaluation["views"], drawing)
+    drawing.write_index()
+
+
 def read_index(run: Run) -> dict[str, Any]:
     return json.loads((run.folder / "renders" / "index.json").read_text())
 
@@ -308,6 +317,60 @@ def test_equal_images_have_no_number_in_json(tmp_path: Path) -> None:
     assert [entry["psnr"] for entry in read_index(run)["views"]] == [None, 20, 21]
 
 
+def test_nothing_is_rendered_or_traced_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: Counter[tuple[int, int]] = Counter()
+    traced: Counter[tuple[int, int]] = Counter()
+
+    def counted(run: Run, view: View, pixels: int) -> Any:
+        rendered[view.camera.size] += 1
+        return render_view(run, view, pixels)
+
+    def image(self: Stripes, camera: Camera) -> Tensor:
+        traced[camera.size] += 1
+        return plain(self, camera)
+
+    plain = Stripes.image
+    monkeypatch.setattr(evaluate, "render_view", counted)
+    monkeypatch.setattr(Stripes, "image", image)
+    run = make_run(tmp_path)
+    Evaluator(run, OPTIONS).evaluate(Pictures(tmp_path / "renders", run.step))
+    assert rendered == {(80, 64): 3, (160, 128): 3, (320, 256): 3}
+    assert traced[160, 128] == traced[320, 256] == 3
+
+
+def test_progress_tells_of_all_work(tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    for finest, work in ((math.inf, 3 * (1 + 4 + 16)), (2, 3 * (1 + 4))):
+        evaluator = Evaluator(make_run(tmp_path, finest=finest), OPTIONS)
+        evaluator.evaluate(advance=lambda amount, part: told.append((amount, part)))
+        assert evaluator.work() == sum(amount for amount, _ in told) == work
+        told.clear()
+
+
+def test_figures_are_those_of_each_picture_by_itself(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    evaluation = Evaluator(run, OPTIONS).evaluate()
+    views = run.scene.test
+    small = {view: quantise(render_view(run, view, 1 << 20).image) for view in views}
+    for factor in (1, 2, 4):
+        expected = []
+        for view in views:
+            finer = view.zoom(factor)
+            assert finer is not None
+            render = quantise(render_view(run, finer, 1 << 20).image)
+            enlarged = quantise(bicubic(small[view], *finer.camera.size))
+            expected.append([f(i, finer.image()) for i in (render, enlarged) for f in (psnr, inria)])
+        entry = evaluation["zoom"][str(factor)]
+        means = [sum(column) / len(views) for column in zip(*expected, strict=True)]
+        told = [entry[key] for key in ("psnr", "ssim", "enlarged_psnr", "enlarged_ssim")]
+        assert told == pytest.approx(means, abs=1e-9)
+        assert entry["beats_enlarged"] == (None if factor == 1 else means[0] > means[2])
+
+
+def inria(image: Tensor, truth: Tensor) -> float:
+    return ssim(image, truth, "inria")
+
+
 # -- parts ---------------------------------------------------------------------------------------------------------
 
 
@@ -340,27 +403,6 @@ def test_the_most_detailed_window() -> None:
     assert most_detailed(image, 500) == Window(0, 0, 120, 100)
     assert most_detailed(image[:, :56, 31:98], 48) == Window(67 - 48, 56 - 48, 48, 48)
     assert most_detailed(image[:, :3, :5], 48) == Window(0, 0, 5, 3)
-
-
-@pytest.mark.parametrize("factor", [2, 3, 8])
-@pytest.mark.parametrize("window", [Window(0, 0, 20, 20), Window(37, 21, 23, 19), Window(60, 40, 20, 24)])
-def test_an_enlarged_window_is_the_window_of_the_enlarged(factor: int, window: Window) -> None:
-    picture = torch.rand(3, 32, 40, generator=torch.Generator().manual_seed(3))
-    whole = bicubic(picture, 40 * factor, 32 * factor)
-    assert torch.allclose(enlarged_window(picture, factor, window), window.cut(whole), atol=1e-5)
-
-
-@pytest.mark.parametrize("size", [(80, 64), (60, 48), (20, 16), (10, 8)])
-def test_a_resized_window_is_the_window_of_the_resized(size: tuple[int, int]) -> None:
-    picture = torch.rand(3, 32, 40, generator=torch.Generator().manual_seed(3))
-    window, whole = Window(3, 2, 7, 5), bicubic(picture, *size)
-    assert torch.allclose(resized_window(picture, size, size[0] / 40, window), window.cut(whole), atol=1e-5)
-
-
-def test_a_view_through_a_window_sees_its_part_of_the_truth() -> None:
-    view = View("a", cameras(1)[0], Stripes())
-    window = Window(10, 20, 30, 25)
-    assert torch.equal(cropped(view, window).image(), window.cut(view.image()))
 
 
 def test_large_pictures_are_reduced_and_light() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from tiny import tiny_run, tiny_settings
 from gsx.cli import main, plugins
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.export import read_gaussians
-from gsx.core.session import execute, open_run, start
+from gsx.core.session import execute, open_run, remedies, start
 
 
 def final_tensors(folder: Path) -> dict[str, torch.Tensor]:
@@ -50,6 +51,8 @@ def test_a_run_leaves_everything_documented(finished: Path) -> None:
         "point_cloud.ply", "checkpoints", "renders",
     }  # fmt: skip
     assert json.loads((finished / "status.json").read_text())["state"] == "ok"
+    header = (finished / "point_cloud.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "\ncomment SplatRenderMode: default\n" in header
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["step"] == 24
     assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs density events"
@@ -61,7 +64,7 @@ def test_evaluation_has_the_published_layout(finished: Path) -> None:
     evaluation = json.loads((finished / "evaluation.json").read_text())
     assert evaluation.keys() >= {
         "protocol", "psnr", "ssim", "lpips", "primitives", "visible_primitives", "megabytes", "render_fps",
-        "train_seconds", "peak_memory_mb", "groups", "zoom", "views",
+        "render_path", "train_seconds", "evaluate_seconds", "peak_memory_mb", "groups", "zoom", "views",
     }  # fmt: skip
     assert evaluation["lpips"] is None
     assert len(evaluation["protocol"]["hash"]) == 16
@@ -70,6 +73,21 @@ def test_evaluation_has_the_published_layout(finished: Path) -> None:
     assert [view["name"] for view in evaluation["views"]] == evaluation["protocol"]["test_views"]
     gaussians = read_gaussians(finished / "point_cloud.ply")
     assert len(gaussians.means) == evaluation["primitives"]
+
+
+def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> None:
+    run, settings = open_run(finished, plugins())
+    assert settings.evaluation.remedy == "backbone=mip_splatting"  # whose runs are compensated, and get no such advice
+
+    def told(remedy: str = "backbone=mip_splatting", **beats: bool | None) -> list[str]:
+        zoom = {factor.strip("x"): {"beats_enlarged": won} for factor, won in beats.items()}
+        return remedies(run, {"zoom": zoom | {"8": {"unavailable": "no truth"}}}, remedy)
+
+    (line,) = told(x1=None, x2=True, x4=False)
+    assert line.endswith("the same command with backbone=mip_splatting")
+    assert told(x1=None, x2=True, x4=True) == told(**{"x0.5": False}) == told("", x4=False) == []
+    run.raster = replace(run.raster, compensate=True)
+    assert told(x4=False) == []
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,10 +59,11 @@ from gsx.core.density import (
 )
 from gsx.core.errors import InputError
 from gsx.core.neighbours import mean_square_distance
-from gsx.core.rasterizer import Rendering, touches
+from gsx.core.quaternions import make_identity_where_zero
+from gsx.core.rasterizer import Rendering, drawable, touches
 from gsx.core.scene import PointCloud
 from gsx.core.schedule import log_linear
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 from gsx.core.splats import Splats
 
 logger = logging.getLogger(__name__)
@@ -330,18 +331,19 @@ class Anchors:
         volumes = self.last[0].splats.scales.prod(1)
         return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
         growth = self.options.growth
         if self.last is None or not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
             return {}
         decoded, taking_part = self.last
-        seen = sightings(rendering.screen, decoded.slots)
+        seen = sightings(rendering.screen, decoded.slots, weight)
         return {
             "rows": taking_part.rows,
             "opacities": decoded.opacities,
             "slots": seen["rows"],
             "gradients": seen["gradient"].to(decoded.opacities),
+            "weight": seen["weight"].to(decoded.opacities),
         }
 
     def record(self, seen: Observation) -> None:
@@ -364,6 +366,8 @@ class Anchors:
             for parameter in moved:
                 parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         self.table.optimiser.step()
+        if "quats" in self.table.parameters:
+            make_identity_where_zero(self.table["quats"])
         if self.head_optimiser is not None:
             self.head_optimiser.step()
         self.discard()
@@ -384,11 +388,28 @@ class Anchors:
         """The colour network, if there is one."""
         return () if self.heads is None else self.heads.colour.parameters()
 
-    def heal(self) -> int:
-        """Remove anchors with a value that is not finite; returns how many."""
+    @torch.no_grad()
+    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+        """Remove anchors with a value that is not finite, or with a Gaussian that a camera cannot draw."""
         kept = finite_rows(self.table)
+        for camera in cameras:
+            kept &= self.usable_for(camera)
+        if bool(kept.all()) or not bool(kept.any()):
+            return 0
         keep_rows(self.table, kept)
         return int((~kept).sum())
+
+    def usable_for(self, camera: Camera) -> Bool[Tensor, "N"]:
+        """Anchors that the camera draws or has no business with: False for Gaussians or volumes out of range.
+
+        Where none of those in view can be drawn the networks are to blame, and no anchor.
+        """
+        decoded, everyone = self.decoded(camera), torch.ones(len(self.table), dtype=torch.bool, device=self.device)
+        splats = decoded.splats
+        lost = ~(drawable(splats, camera, self.raster) & torch.isfinite(splats.scales.prod(1)))
+        owners = decoded.slots // self.representation.offsets
+        usable = everyone.index_fill(0, owners[lost], False)
+        return usable if bool(usable[owners].any()) else everyone
 
     def discard(self) -> None:
         """Forget the gradients and the picture they came from."""

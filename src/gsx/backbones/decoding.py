@@ -12,7 +12,7 @@ from gsx.backbones.heads import Heads
 from gsx.backbones.levels import Levels
 from gsx.backbones.mip import logit_of_log, smoothed
 from gsx.core.backbone import Gaussians
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.density import Table
 from gsx.core.rasterizer import take_rows
 from gsx.core.sh import colours_of, constant_from_colour
@@ -132,12 +132,13 @@ class Neural:
         anchors = table["anchors"][rows]
         raw, shapes, colours = self.heads(
             take_rows(table["features"], rows),
-            anchors - drawn.camera.centre.to(anchors),
+            offsets_from(anchors, drawn.camera.centre),
             table["level"][rows, None].to(anchors) if "level" in table.columns else torch.zeros_like(anchors[:, :1]),
             drawn.view,
         )
         opacities = raw * drawn.weights[:, None]
-        chosen = (opacities.detach() > 0).view(-1).nonzero()[:, 0]
+        # what is not a number is handed on: the render counts it
+        chosen = (~(opacities.detach() <= 0)).view(-1).nonzero()[:, 0]
         owner = chosen // k
         size = lengths(take_rows(table["log_scales"], rows)).index_select(0, owner)
         shape = take_rows(shapes.reshape(-1, 7), chosen)
@@ -211,7 +212,7 @@ class Explicit:
         opacities = log_opacities.detach().exp()[:, None]
         if filters is not None:
             scales, log_opacities = smoothed(scales, log_opacities, filters)
-        offsets = means - drawn.camera.centre.to(means)
+        offsets = offsets_from(means, drawn.camera.centre)
         splats = Splats(
             means=means,
             scales=scales,

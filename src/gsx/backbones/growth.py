@@ -14,8 +14,11 @@ from torch import Tensor
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
-from gsx.core.density import Table, append_rows, keep_rows, room_under, within_room
+from gsx.core.density import Table, append_rows, keep_rows, mean_of, room_under, within_room
 from gsx.core.shapes import Bool, Float, Int
+
+LARGEST_CELL = 2.0**53
+"""Integers up to this are exact in float64."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +30,8 @@ class GrowthOptions:
     stop: int
     every: int
     success: float
-    """Fraction of an interval's steps in which an anchor must have been visited before it is judged; offsets: half."""
+    """Fraction of an interval's steps in which an anchor must have been visited before it is judged; offsets: half.
+    Of a step's views each counts by its weight in the loss."""
     gradient: float
     """Mean NDC gradient above which an offset grows an anchor."""
     prune_opacity: float
@@ -129,22 +133,25 @@ def observe(
     opacities: Float[Tensor, "A k"],
     slots: Int[Tensor, "M"],
     gradients: Float[Tensor, "M"],
+    weight: Float[Tensor, "1"],
 ) -> None:
     """Count one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (spec 2.8).
 
-    `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets.
+    `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets. All
+    but gradients, which carry it already, are counted by the picture's weight in the step's loss (see
+    `density.Statistics`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
     """
-    table["opacity_sum"][rows] += opacities.sum(1)
-    table["visits"][rows] += 1
+    table["opacity_sum"][rows] += weight * opacities.sum(1)
+    table["visits"][rows] += weight
     table["gradient_sum"].view(-1).index_add_(0, slots, gradients)
-    table["gradient_count"].view(-1).index_add_(0, slots, torch.ones_like(gradients))
+    table["gradient_count"].view(-1).index_add_(0, slots, weight.expand(len(slots)))
 
 
 def eligible(table: Table, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
-    """(offsets seen more than `least` times, their mean gradients; 0 for the others) (spec 2.9)."""
+    """(offsets seen in more than `least` steps, their mean gradients; 0 for the others) (spec 2.9)."""
     count = table["gradient_count"]
     enough = count > least
-    return enough, torch.where(enough, table["gradient_sum"] / count.clamp_min(1), 0.0)
+    return enough, torch.where(enough, mean_of(table["gradient_sum"], count), 0.0)
 
 
 # -- growing ---------------------------------------------------------------------------------------------------------
@@ -254,6 +261,7 @@ def grow_by_depth(
     """
     enough, gradient = eligible(table, least)
     means, grown, without_room = offset_means(table), 0, 0
+    enough = enough & on_grid(means, voxel)
     for depth in range(options.depths):
         multiple = options.coarsest // options.hierarchy**depth
         if multiple == 0:  # the reference divides by it (spec 2.9)
@@ -269,6 +277,11 @@ def grow_by_depth(
         if early_stop and grown == 0:
             break
     return grown, without_room
+
+
+def on_grid(means: Float[Tensor, "N k 3"], size: float) -> Bool[Tensor, "N k"]:
+    """Places whose cells of that size have a number: False for those that are not finite, or beyond 2^53 cells."""
+    return (means.double().abs() < LARGEST_CELL * size).all(2)
 
 
 def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
@@ -294,6 +307,7 @@ def grow_by_level(
     taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
     means, of = offset_means(table), table["level"].clone()
     mean_gradient = gradient.sum(1) / (enough.sum(1) + 1e-6)
+    enough = enough & on_grid(means, levels.size(levels.count - 1))
     grown, without_room = 0, 0
     for level in range(levels.count):
         own = of == level

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ from gsx.backbones.levels import (
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
 from gsx.core.backbone import Beginning, Gaussians, Observation
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.density import (
     Statistics,
     Table,
@@ -54,7 +54,8 @@ from gsx.core.density import (
 from gsx.core.errors import InputError
 from gsx.core.export import columns_of
 from gsx.core.neighbours import mean_square_distance
-from gsx.core.rasterizer import Rendering, take_rows
+from gsx.core.quaternions import make_identity_where_zero
+from gsx.core.rasterizer import Rendering, drawable, take_rows
 from gsx.core.scene import PointCloud
 from gsx.core.schedule import log_linear
 from gsx.core.sh import colours_of, constant_from_colour
@@ -245,7 +246,7 @@ class GS3D:
         """The Gaussians that the camera draws, with their colours as seen from there."""
         shown = self.shown(camera)
         values = shown.values
-        offsets = values["means"] - camera.centre.to(values["means"])
+        offsets = offsets_from(values["means"], camera.centre)
         scales, log_opacities = self.extents(shown)
         self.last = (shown, scales)
         return Splats(
@@ -294,11 +295,11 @@ class GS3D:
         volumes = self.last[1].prod(1)
         return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Screen gradients, which count until density control ends (spec 7, cadence)."""
         if step >= self.schedule.step(self.options.density.stop):
             return {}
-        return sightings(rendering.screen, self.last[0].rows if self.last else None)
+        return sightings(rendering.screen, self.last[0].rows if self.last else None, weight)
 
     def record(self, seen: Observation) -> None:
         """Add screen gradients to the statistics."""
@@ -323,6 +324,7 @@ class GS3D:
         if rest.grad is None and self.table["sh_constant"].grad is not None:
             rest.grad = torch.zeros_like(rest)
         self.table.optimiser.step()
+        make_identity_where_zero(self.table["quats"])
         self.discard()
 
     def parameters(self) -> Iterable[tuple[str, Parameter]]:
@@ -337,12 +339,25 @@ class GS3D:
         """Every Gaussian has a colour of its own."""
         return ()
 
-    def heal(self) -> int:
-        """Remove rows with a value that is not finite, with their statistics; returns how many."""
+    @torch.no_grad()
+    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+        """Remove rows with a value that is not finite, or without a splat for a camera, with their statistics."""
         sound = finite_rows(self.table)
+        for camera in cameras:
+            sound &= self.usable_for(camera)
+        if bool(sound.all()) or not bool(sound.any()):
+            return 0
         keep_rows(self.table, sound)
         self.statistics = self.statistics.rows(sound)
         return int((~sound).sum())
+
+    def usable_for(self, camera: Camera) -> Bool[Tensor, "N"]:
+        """Rows that the camera draws or has no business with: False for splats or volumes that are out of range."""
+        splats, rows = self.splats(camera), self.shown(camera).rows
+        good = drawable(splats, camera, self.raster) & torch.isfinite(splats.scales.prod(1))
+        return (
+            good if rows is None else torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, rows, good)
+        )
 
     def discard(self) -> None:
         """Forget the gradients and the picture they came from."""

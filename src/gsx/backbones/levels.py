@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import new_cells
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.schedule import Schedule
 from gsx.core.shapes import Bool, Float, Int
 
@@ -110,7 +110,7 @@ class Viewpoints:
     """Where the training cameras stand, and how coarsely each samples."""
 
     centres: Float[Tensor, "V 3"]
-    """World, float32."""
+    """World, float64."""
     coarseness: Float[Tensor, "V"]
     """s: largest focal length over this camera's; a camera of half the focal length acts as if twice as far."""
     focal: float
@@ -121,7 +121,7 @@ def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
     """The training cameras as levels of detail see them."""
     focal = max(camera.fx for camera in cameras)
     return Viewpoints(
-        centres=torch.stack([camera.centre.double() for camera in cameras]).float(),
+        centres=torch.stack([camera.centre.double() for camera in cameras]),
         coarseness=torch.tensor([focal / camera.fx for camera in cameras]),
         focal=focal,
     )
@@ -239,8 +239,8 @@ def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
     """(near, far) distances between cameras and points, in units of the finest camera (spec 3.1)."""
     found = []
-    for centre, coarseness in zip(views.centres.to(points), views.coarseness.tolist(), strict=True):
-        distances = (points - centre).norm(dim=1)
+    for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
+        distances = offsets_from(points, centre).norm(dim=1)
         found += [coarseness * quantile(distances, q) for q in (fraction, 1 - fraction)]
     listed = torch.tensor(found, dtype=torch.float64)
     return quantile(listed, 1 - fraction), quantile(listed, fraction)
@@ -329,15 +329,17 @@ def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int
 def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
     """Fraction of the training cameras that would draw each primitive, by distance alone (spec 3.4)."""
     views, counts = levels.views, torch.zeros_like(positions[:, 0])
-    for centre, coarseness in zip(views.centres.to(positions), views.coarseness.tolist(), strict=True):
-        ideal = levels.ideal((positions - centre).norm(dim=1), coarseness)
+    for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
+        ideal = levels.ideal(offsets_from(positions, centre).norm(dim=1), coarseness)
         counts += of <= whole_level(ideal, levels.mode, levels.count - 1)[0]
     return counts / len(views.centres)
 
 
 def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Primitives that enough training cameras draw (spec 3.4)."""
-    return seen_fraction(levels, positions, of) > levels.threshold
+    """Primitives that enough training cameras draw (spec 3.4); none without a finite place."""
+    placed = torch.isfinite(positions).all(1)
+    places = torch.where(placed[:, None], positions, 0.0)
+    return (seen_fraction(levels, places, of) > levels.threshold) & placed
 
 
 def drawn(
@@ -354,10 +356,11 @@ def drawn(
     Neither result carries gradients.
     """
     shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
-    distances = (positions.detach() + shift - camera.centre.to(positions)).norm(dim=1)
+    distances = (offsets_from(positions.detach(), camera.centre) + shift).norm(dim=1)
     ideal = levels.ideal(distances, levels.coarseness(camera))
-    top, weight = whole_level(ideal + bias.detach(), levels.mode, highest)
-    return of <= top, torch.where(of == top, weight, 1.0)
+    known = torch.isfinite(distances)  # the others are handed on: the render counts what it cannot draw
+    top, weight = whole_level(torch.where(known, ideal + bias.detach(), 0.0), levels.mode, highest)
+    return (of <= top) | ~known, torch.where((of == top) & known, weight, 1.0)
 
 
 # -- schedules over levels -------------------------------------------------------------------------------------------

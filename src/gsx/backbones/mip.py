@@ -62,7 +62,7 @@ def seen_depths(
     points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
 ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
     """(depth z, whether the camera counts as seeing the point) (spec 10.1)."""
-    local = points @ camera.rotation.T.to(points) + camera.translation.to(points)
+    local = camera.to_camera(points).to(points)
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
     column = local[:, 0] / depth * camera.fx + camera.cx
     row = local[:, 1] / depth * camera.fy + camera.cy

@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
@@ -16,7 +16,7 @@ from gsx.core.shapes import Float
 from gsx.core.splats import Splats
 
 Observation: TypeAlias = dict[str, Tensor]
-"""What density control learns from one render, as tensors by name; empty: nothing."""
+"""What density control learns from one render, as tensors by name, none of them 0-dimensional; empty: nothing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,12 +80,16 @@ class Backbone(Protocol):
         """A term to add to the loss for the splats handed out last, or None."""
         ...
 
-    def observe(self, rendering: Rendering, step: int) -> Observation:
-        """What density control learns from the render of the splats handed out last, after its backward pass."""
+    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
+        """What density control learns from the render of the splats handed out last, after its backward pass.
+
+        `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
+        photograph (`density.Statistics`).
+        """
         ...
 
     def record(self, seen: Observation) -> None:
-        """Count an observation in: one of this process, or of another that trains the same model."""
+        """Count an observation in by its weight: one of this process, or of another that trains the same model."""
         ...
 
     def adapt(self, step: int) -> dict[str, int]:
@@ -104,8 +108,12 @@ class Backbone(Protocol):
         """Name and gradient of every parameter that has one."""
         ...
 
-    def heal(self) -> int:
-        """Remove primitives with values that are not finite; returns how many. Called when a render left some out."""
+    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+        """Remove primitives with values that are not finite, or that one of the cameras cannot draw; returns how many.
+
+        Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
+        gradients included; nor where nothing would be left.
+        """
         ...
 
     def discard(self) -> None:

@@ -59,6 +59,11 @@ class Camera:
         """Camera centre in world coordinates, -R^T t."""
         return -self.rotation.T @ self.translation
 
+    def to_camera(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        """World points in the camera's frame, float64: far from the origin float32 is too coarse."""
+        points = points.double()
+        return points @ self.rotation.T.to(points) + self.translation.to(points)
+
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) in pixels."""
@@ -107,10 +112,18 @@ class Camera:
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
         """Pixel positions and depths of world points; positions mean nothing where depth <= 0."""
-        camera_points = points @ self.rotation.T.to(points) + self.translation.to(points)
+        camera_points = self.to_camera(points)
         depth = camera_points[:, 2]
-        focal, centre = points.new_tensor([self.fx, self.fy]), points.new_tensor([self.cx, self.cy])
-        return camera_points[:, :2] / depth[:, None] * focal + centre, depth
+        focal, centre = depth.new_tensor([self.fx, self.fy]), depth.new_tensor([self.cx, self.cy])
+        return (camera_points[:, :2] / depth[:, None] * focal + centre).to(points), depth.to(points)
+
+
+def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "P 3"]:
+    """points - centre, subtracted in float64 and then rounded to the dtype of the points; differentiable in both.
+
+    Far from the origin the centre itself, rounded first, would move by a grain of the coordinates (docs/numerics.md).
+    """
+    return (points.double() - centre.to(points.device, torch.float64)).to(points)
 
 
 def resized(frame: Frame, sx: float, sy: float) -> Frame:

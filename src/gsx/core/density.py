@@ -160,52 +160,66 @@ def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device
     return table
 
 
-def sightings(screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None) -> dict[str, Tensor]:
+def sightings(
+    screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
+) -> dict[str, Tensor]:
     """Of one render after its backward pass the visible primitives, and the norms of their gradients (spec 4).
 
-    `drawn`: rows of the splats that were rendered; None: splat n is row n.
+    `drawn`: rows of the splats that were rendered; None: splat n is row n. `weight`: see `Statistics`.
     """
     visible = screen.visible
     ids = screen.ids[visible]
     seen = {
         "rows": ids if drawn is None else drawn[ids],
         "gradient": screen.ndc_gradient(screen.shift)[visible].norm(dim=1),
+        "weight": screen.shift.new_tensor([weight]),
     }
     return seen if screen.probe is None else seen | {"absolute": screen.ndc_gradient(screen.probe)[visible].sum(1)}
 
 
+def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """Sums over sums of weights; where nothing was counted the sum itself, which is 0."""
+    return sums / torch.where(counts > 0, counts, 1.0)
+
+
 @dataclass(eq=False)
 class Statistics:
-    """Per-primitive sums over the training renders since the last density event."""
+    """Per-primitive sums over the renders since the last density event, each counted by its weight in a step's loss.
+
+    The photograph of a step of one view weighs 1; of n views each weighs 1 / n; a pseudo view weighs what its mean
+    difference does in the loss, and photographs what is left to them. Gradients are those of the step's loss, so they
+    carry that weight too: sums of both have a mean as large as that of single photographs, which published thresholds
+    are made for, whatever the batch and the augmenters.
+    """
 
     gradient: Float[Tensor, "N"]
     """Sum of the norm of the screen gradient in NDC units."""
-    count: Int[Tensor, "N"]
-    """Renders in which the primitive was visible."""
+    count: Float[Tensor, "N"]
+    """Sum of the weights of the renders in which the primitive was visible: steps, where all see it."""
     absolute: Float[Tensor, "N"] | None = None
     """Sum of |g_x| + |g_y| over pixels, NDC units, where it is gathered (Mip-Splatting of 2024, spec 10.5)."""
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> "Statistics":
         """Fresh statistics of `count` primitives."""
-        sums, seen = torch.zeros(count, device=device), torch.zeros(count, dtype=torch.int32, device=device)
-        return Statistics(sums, seen, torch.zeros_like(sums) if absolute else None)
+        sums = torch.zeros(count, device=device)
+        return Statistics(sums, torch.zeros_like(sums), torch.zeros_like(sums) if absolute else None)
 
     def add(self, seen: dict[str, Tensor]) -> None:
         """Count in what `sightings` found in one render."""
         rows = seen["rows"]
         self.gradient.index_add_(0, rows, seen["gradient"].to(self.gradient))
-        self.count[rows] += 1
+        self.count[rows] += seen["weight"].to(self.count)
         if self.absolute is not None and "absolute" in seen:
             self.absolute.index_add_(0, rows, seen["absolute"].to(self.absolute))
 
     def mean_gradient(self) -> Float[Tensor, "N"]:
-        """Mean norm over the renders that saw the primitive; 0 for unseen ones."""
-        return self.gradient / self.count.clamp_min(1)
+        """Weighted mean norm over the renders that saw the primitive; 0 for unseen ones."""
+        return mean_of(self.gradient, self.count)
 
     def mean_absolute(self) -> Float[Tensor, "N"]:
         """The same of the absolute gradients; 0 where they are not gathered."""
-        return torch.zeros_like(self.gradient) if self.absolute is None else self.absolute / self.count.clamp_min(1)
+        return torch.zeros_like(self.gradient) if self.absolute is None else mean_of(self.absolute, self.count)
 
     def rows(self, kept: Bool[Tensor, "N"]) -> "Statistics":
         """Those of the marked primitives."""

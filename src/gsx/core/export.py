@@ -8,11 +8,23 @@ import torch
 from torch import Tensor
 
 from gsx.core.backbone import Gaussians
+from gsx.core.camera import offsets_from
 from gsx.core.errors import InputError
 from gsx.core.ply import read_ply, write_ply
 from gsx.core.sh import colours_of
 from gsx.core.shapes import Float
 from gsx.core.splats import Splats
+
+SUFFIXES = (".ply",)
+"""Of the files that are written."""
+
+
+def refuse_suffix(path: Path) -> None:
+    """Raise InputError if the name promises a format that is not written."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {path.stem}{SUFFIXES[0]}"
+        )
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
@@ -87,7 +99,7 @@ def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats
         colours=colours_of(
             gaussians.sh_constant[:, None],
             gaussians.sh_rest,
-            gaussians.means - camera_centre.to(gaussians.means),
+            offsets_from(gaussians.means, camera_centre),
             degree,
         ),
     )

@@ -8,6 +8,7 @@ from typing import IO, Any
 
 from gsx.core.cache import content_key, tree_stamp
 from gsx.core.errors import InputError
+from gsx.core.locks import lock
 from gsx.core.run_files import RunFiles, part
 
 WHERE = ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
@@ -142,15 +143,10 @@ def locked(stream: IO[str], folder: Path) -> bool:
     Raises:
         InputError: the file system knows no locks.
     """
-    import fcntl
-
     try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):
-        return False
+        return lock(stream)
     except OSError as error:
         raise InputError(
             f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
             "training the same run: choose another place, output=FOLDER"
         ) from error
-    return True

@@ -26,7 +26,8 @@ DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
-    "primitives", "megabytes", "seconds", "render_fps", "peak_memory_mb", "zoom_gains", "protocol", "comparable",
+    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "protocol",
+    "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 
@@ -134,6 +135,7 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
             key: e.get(key)
             for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
         },
+        "render_path": e.get("render_path"),
         "seconds": e.get("train_seconds"),
         "gains": gains,
         "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},

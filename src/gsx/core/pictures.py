@@ -6,7 +6,6 @@ Everything goes to the run's `renders/`, listed in `index.json`, from which the 
 import math
 import re
 from collections.abc import Iterable, Sequence, Set
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from gsx.core.evaluate import EvalOptions, render_view
+from gsx.core.evaluate import Zoomed
 from gsx.core.files import read_json, write_json
 from gsx.core.images import write_image
-from gsx.core.metrics import bicubic, psnr, quantise
-from gsx.core.run import Run
+from gsx.core.metrics import psnr
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 from gsx.core.window import Window
@@ -33,8 +31,6 @@ WINDOW = 192
 """Edge of a zoomed crop on the finer raster, px: the report shows three side by side at twice that."""
 WINDOW_STEP = 8
 """Crops are looked for on a grid of this many px."""
-REACH = 4
-"""Pixels around a window that its enlargement draws on: 2 for Keys' cubic, the others for windows between pixels."""
 ERROR_FULL = 0.2
 """Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
 ERROR_COLOURS = (
@@ -50,76 +46,56 @@ ERROR_COLOURS = (
 """Error divided by ERROR_FULL and its display RGB. CIE lightness rises evenly, so equal steps look equal."""
 
 
-def write_pictures(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -> None:
-    """Draw up to SHOWN test views and their zoomed crops; `evaluation` is the content of evaluation.json."""
-    folder = run.folder / "renders"
-    folder.mkdir(parents=True, exist_ok=True)
-    forget(folder)
-    figures = evaluation["views"]
-    best, worst = extremes([figure["psnr"] for figure in figures])
-    roles = {worst: "worst", best: "best"} if best != worst else {}
-    shown = spread(len(figures), SHOWN, {best, worst})
-    names = file_names([figures[i]["name"] for i in shown])
-    zooms = {float(key): entry for key, entry in evaluation["zoom"].items()}
-    factors = [factor for factor, entry in zooms.items() if factor != 1 and "unavailable" not in entry]
-    views, crops = [], []
-    for i, name in zip(shown, names, strict=True):
-        view, drawn = run.scene.test[i], Draw(run, options, folder, name)
-        picture = drawn.render(view)
-        views.append(figures[i] | drawn.whole(view, picture) | {"role": roles.get(i, "")})
-        crops += [crop for factor in factors if (crop := drawn.crop(view, picture, factor)) is not None]
-    index = {"error_full": ERROR_FULL, "step": run.step, "views": views, "zoom": crops}
-    write_json(folder / "index.json", index)
+class Pictures:
+    """Draws up to SHOWN test views and their zoomed crops, and lists them (implements `gsx.core.evaluate.Drawing`)."""
 
+    def __init__(self, folder: Path, step: int) -> None:
+        self.folder, self.step = folder, step
+        self.shown: dict[int, dict[str, Any]] = {}
+        """What is known of the views to be drawn."""
+        self.names: dict[int, str] = {}
+        """Their file names."""
+        self.views: list[dict[str, Any]] = []
+        self.crops: list[dict[str, Any]] = []
 
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """Writes the pictures of one view under one file name."""
+    def choose(self, figures: Sequence[dict[str, Any]]) -> None:
+        """Best and worst are among the views drawn; pictures of an earlier evaluation are removed."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        forget(self.folder)
+        best, worst = extremes([figure["psnr"] for figure in figures])
+        roles = {worst: "worst", best: "best"} if best != worst else {}
+        numbers = spread(len(figures), SHOWN, {best, worst})
+        told = ("name", "group", "psnr", "ssim", "lpips")
+        self.shown = {i: {key: figures[i][key] for key in told} | {"role": roles.get(i, "")} for i in numbers}
+        self.names = dict(zip(numbers, file_names([figures[i]["name"] for i in numbers]), strict=True))
 
-    run: Run
-    options: EvalOptions
-    folder: Path
-    name: str
-
-    def render(self, view: View) -> Float[Tensor, "3 H W"]:
-        """The run's model from a view's camera."""
-        return self.measured(render_view(self.run, view, self.options.tile_pixels).image)
-
-    def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """The picture as metrics see it."""
-        return quantise(image) if self.options.quantise else image
-
-    def whole(self, view: View, picture: Float[Tensor, "3 H W"]) -> dict[str, Any]:
-        """Truth, render and error of a view; returns their entry in the index."""
+    def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
+        """Truth, render and error of a view."""
+        if number not in self.shown:
+            return
         truth = view.image()
-        images = {"truth": truth, "render": picture, "error": error_map(picture, truth)}
-        files = {kind: self.save(f"{self.name}.{kind}", reduced(image)) for kind, image in images.items()}
-        return {"size": list(view.camera.size), "files": files}
+        images = {"truth": truth, "render": render, "error": error_map(render, truth)}
+        files = {kind: self.save(f"{self.names[number]}.{kind}", reduced(image)) for kind, image in images.items()}
+        self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
 
-    def crop(self, view: View, picture: Float[Tensor, "3 H W"], factor: float) -> dict[str, Any] | None:
-        """The window with most detail at `factor` times the resolution: truth, render and the x1 render resized.
-
-        Returns its entry in the index, or None where there is no truth.
-        """
-        finer = view.zoom(factor)
-        if finer is None:
-            return None
-        whole = finer.image()
-        window = most_detailed(whole, WINDOW)
-        images = {
-            "truth": window.cut(whole),
-            "render": self.render(cropped(finer, window)),
-            "enlarged": self.measured(resized_window(picture, finer.camera.size, factor, window)),
-        }
-        files = {kind: self.save(f"{self.name}.x{factor:g}.{kind}", image, True) for kind, image in images.items()}
-        return {
-            "view": view.name,
-            "factor": factor,
-            "window": [window.left, window.top, window.width, window.height],
-            "psnr": psnr(images["render"], images["truth"]),
-            "enlarged_psnr": psnr(images["enlarged"], images["truth"]),
-            "files": files,
-        }
+    def zoomed(self, number: int, zoomed: Zoomed) -> None:
+        """The window with most detail: truth, render and the x1 render resized."""
+        if number not in self.shown:
+            return
+        window = most_detailed(zoomed.truth, WINDOW)
+        whole = {"truth": zoomed.truth, "render": zoomed.render, "enlarged": zoomed.enlarged}
+        images = {kind: window.cut(image) for kind, image in whole.items()}
+        stem = f"{self.names[number]}.x{zoomed.factor:g}"
+        self.crops.append(
+            {
+                "view": zoomed.view.name,
+                "factor": zoomed.factor,
+                "window": [window.left, window.top, window.width, window.height],
+                "psnr": psnr(images["render"], images["truth"]),
+                "enlarged_psnr": psnr(images["enlarged"], images["truth"]),
+                "files": {kind: self.save(f"{stem}.{kind}", image, True) for kind, image in images.items()},
+            }
+        )
 
     def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False) -> str:
         """Write one picture and return its file name."""
@@ -127,6 +103,11 @@ class Draw:
         file = f"{stem}.png" if lossless or small else f"{stem}.jpg"
         write_image(self.folder / file, image)
         return file
+
+    def write_index(self) -> None:
+        """List what was drawn."""
+        index = {"error_full": ERROR_FULL, "step": self.step, "views": self.views, "zoom": self.crops}
+        write_json(self.folder / "index.json", index)
 
 
 def forget(folder: Path) -> None:
@@ -212,29 +193,3 @@ def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
     energy[:, :-1] += (image[:, :, 1:] - image[:, :, :-1]).square().sum(0)
     energy[:-1] += (image[:, 1:] - image[:, :-1]).square().sum(0)
     return energy
-
-
-def cropped(view: View, window: Window) -> View:
-    """The view through a window of its raster."""
-    return replace(view, camera=window.of(view.camera))
-
-
-def resized_window(
-    picture: Float[Tensor, "3 H W"], size: tuple[int, int], factor: float, window: Window
-) -> Float[Tensor, "3 h w"]:
-    """A window of the picture resized to (width, height) `size` by `metrics.bicubic`; `factor` says how many times."""
-    if factor != round(factor):
-        return window.cut(bicubic(picture, *size))
-    return enlarged_window(picture, round(factor), window)
-
-
-def enlarged_window(picture: Float[Tensor, "3 H W"], factor: int, window: Window) -> Float[Tensor, "3 h w"]:
-    """A window of the picture enlarged `factor` times by `metrics.bicubic`.
-
-    Only its surroundings are enlarged: it may be a small part of a huge raster.
-    """
-    left, top = max(0, window.left // factor - REACH), max(0, window.top // factor - REACH)
-    right, bottom = (window.left + window.width) // factor + REACH, (window.top + window.height) // factor + REACH
-    part = picture[:, top:bottom, left:right]
-    larger = bicubic(part, part.shape[2] * factor, part.shape[1] * factor)
-    return replace(window, left=window.left - left * factor, top=window.top - top * factor).cut(larger)

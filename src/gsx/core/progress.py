@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import IO, Any, TextIO
+from typing import IO, Any
 
 from gsx.core.evaluate import EvalOptions, peak_memory_mb, quick_psnr
 from gsx.core.files import replace_file
@@ -25,16 +25,62 @@ def clock(seconds: float) -> str:
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"
 
 
+class Line:
+    """One line that is written over on a terminal; plain lines elsewhere, less often."""
+
+    def __init__(self) -> None:
+        self.stream = sys.stderr
+        self.live = self.stream.isatty()
+        self.shown = time.monotonic() - PLAIN_SECONDS
+        self.width = 0
+
+    def due(self) -> bool:
+        """Whether it is time to show another; then the time counts from now on."""
+        now = time.monotonic()
+        due = now - self.shown >= (LIVE_SECONDS if self.live else PLAIN_SECONDS)
+        self.shown = now if due else self.shown
+        return due
+
+    def show(self, text: str) -> None:
+        """Write over the last line on a terminal, below it elsewhere."""
+        end, start = ("", "\r") if self.live else ("\n", "")
+        self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
+        self.stream.flush()
+        self.width = len(text)
+
+    def end(self) -> None:
+        """Leave the last line standing."""
+        if self.live and self.width:
+            self.stream.write("\n")
+            self.width = 0
+
+
+class Countdown:
+    """Shows how far a piece of work has come, and the time left if the rest of it goes as fast."""
+
+    def __init__(self, what: str, total: float) -> None:
+        self.what, self.total, self.line = what, total, Line()
+        self.done, self.begun = 0.0, time.monotonic()
+
+    def advance(self, amount: float, part: str) -> None:
+        """So much more of `total` is done, the last of it `part`."""
+        self.done += amount
+        left = max(0.0, self.total - self.done)
+        last = left < 1e-6 * self.total
+        if self.line.due() or last:
+            seconds = (time.monotonic() - self.begun) * left / self.done
+            self.line.show(f"{self.what} {self.done / self.total:.0%}  {part}  ETA {clock(seconds)}")
+        if last:
+            self.line.end()
+
+
 class Progress:
     """Listener: shows step, speed, loss, PSNR, primitives, memory and time left."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self.stream = sys.stderr if stream is None else stream
-        self.live = self.stream.isatty()
-        self.shown = time.monotonic() - PLAIN_SECONDS
+    def __init__(self) -> None:
+        self.output = Line()
         self.done = (0, 0.0)
         self.averages: dict[str, float] = {}
-        self.width = 0
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
@@ -44,22 +90,19 @@ class Progress:
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
         """Show the line when it is time."""
-        now = time.monotonic()
-        if now - self.shown < (LIVE_SECONDS if self.live else PLAIN_SECONDS) and not run.complete:
+        if not self.output.due() and not run.complete:
             return
-        self.shown = now
         self.average("loss", float(step.loss))
         self.average("psnr", step.psnr())
         steps, seconds = run.step - self.done[0], run.seconds - self.done[1]
         self.average("speed", steps / max(seconds, 1e-9))
         self.done = (run.step, run.seconds)
-        self.show(self.line(run))
+        self.output.show(self.line(run))
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
         """Leave the last line standing."""
-        if self.live:
-            self.stream.write("\n")
+        self.output.end()
 
     def average(self, name: str, value: float) -> None:
         """Exponential average of what was shown."""
@@ -68,19 +111,13 @@ class Progress:
 
     def line(self, run: Run) -> str:
         """The line as shown."""
-        a, primitives = self.averages, run.backbone.size()[0]
+        a, primitives, memory = self.averages, run.backbone.size()[0], peak_memory_mb(run.device)
+        megabytes = "" if memory is None else f"{memory:,.0f} MB  "
         return (
             f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
-            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {peak_memory_mb(run.device):,.0f} MB  "
+            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {megabytes}"
             f"ETA {clock((run.iterations - run.step) / a['speed'])}"
         )
-
-    def show(self, text: str) -> None:
-        """Write over the last line on a terminal, below it elsewhere."""
-        end, start = ("", "\r") if self.live else ("\n", "")
-        self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
-        self.stream.flush()
-        self.width = len(text)
 
 
 def read_curves(folder: Path) -> list[dict[str, Any]]:
@@ -123,6 +160,7 @@ class MetricsLog:
 
     def entry(self, run: Run, step: Step) -> dict:
         """One line of metrics.jsonl."""
+        memory = peak_memory_mb(run.device)
         line = {
             "step": run.step,
             "seconds": round(run.seconds, 3),
@@ -130,7 +168,7 @@ class MetricsLog:
             "psnr": step.psnr(),
             "primitives": run.backbone.size()[0],
             "pairs": step.rendering.pairs,
-            "memory_mb": round(peak_memory_mb(run.device), 1),
+            "memory_mb": None if memory is None else round(memory, 1),
             **({"terms": step.terms} if step.terms else {}),
             **({"pseudo": step.pseudo} if step.pseudo else {}),
             **({"left_out": step.dropped} if step.dropped else {}),

@@ -47,7 +47,8 @@ class Term:
     taken: float
     """Share of the backbone's own loss that this term takes the place of; 0: it is added (spec 1.3)."""
     observed: bool
-    """Whether the renders count in density control (the authors' code does so)."""
+    """Whether the renders count in density control (the authors' code does so), each by its weight in `parts`. That is
+    the weight of the mean difference whatever its kind: squares, or what is known at a lower resolution beside it."""
     shared: bool
     """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
     squared: bool = False

@@ -125,6 +125,7 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
     views = len(e.get("views", []))
     lpips = fixed(e.get("lpips"), 4)
     visible = e.get("visible_primitives")
+    paths = [f"{e['render_path']} path"] if e.get("render_path") else []
 
     def card(label: str, value: str, unit: str = "", remark: str = "") -> dict[str, str]:
         return {"label": label, "value": value, "unit": unit, "remark": remark}
@@ -135,8 +136,9 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
         card("LPIPS", lpips, "", "no weights" if lpips == NONE else str(protocol.get("lpips", ""))),
         card("Primitives", fixed(e.get("primitives"), 0), "", f"{fixed(visible, 0)} in a view" if visible else ""),
         card("Size", fixed(e.get("megabytes"), 1), "MB", "needed to render"),
-        card("Rendering", fixed(e.get("render_fps"), 1), "fps", "at training size"),
+        card("Rendering", fixed(e.get("render_fps"), 1), "fps", ", ".join(["at training size", *paths])),
         card("Training", duration(e.get("train_seconds")), "", "steps alone"),
+        card("Evaluation", duration(e.get("evaluate_seconds")), "", "all zooms and pictures"),
         card("Peak memory", fixed(e.get("peak_memory_mb"), 0), "MB", ""),
     ]
 

@@ -6,6 +6,7 @@ import os
 import platform
 import shutil
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -20,7 +21,7 @@ from gsx import __version__
 from gsx.core import checkpoint, trunk
 from gsx.core.backbone import Backbone, Beginning
 from gsx.core.cache import cache_root, source_revision
-from gsx.core.camera import Camera
+from gsx.core.camera import Camera, offsets_from
 from gsx.core.config import Settings, read_config, write_config
 from gsx.core.device import device_name
 from gsx.core.distributed import placed, ranks_here, refuse_uneven
@@ -34,12 +35,13 @@ from gsx.core.images import write_image
 from gsx.core.lpips import load_lpips
 from gsx.core.metrics import psnr
 from gsx.core.orbit import orbit_cameras, write_animation
-from gsx.core.pictures import file_names, write_pictures
+from gsx.core.pictures import Pictures, file_names
 from gsx.core.plugins import Plugins, hookimpl
-from gsx.core.progress import MetricsLog, Progress, read_curves
+from gsx.core.progress import Countdown, MetricsLog, Progress, read_curves
 from gsx.core.pseudo import Augmenter, Setting
 from gsx.core.pseudo_pictures import write_pseudo_pictures
-from gsx.core.rasterizer.prepare import decide, warm
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer.prepare import decide, path_of, warm
 from gsx.core.regenerator import Regenerator
 from gsx.core.remarks import CapNotice, remarks_of
 from gsx.core.report import write_report
@@ -192,7 +194,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "rasterizer": run.raster.path,
+        "rasterizer": path_of(run.raster, run.device),
         "source": source_revision(),
         "device": device_name(run.device),
         "processes": run.ranks.size,
@@ -417,7 +419,7 @@ def measured(scene: Scene) -> Scene:
     """The scene; one whose training cameras stand in one place takes its extent from the points' median distance."""
     if scene.extent > 0 or len(scene.points) == 0:
         return scene
-    distance = (scene.points.positions - scene.train[0].camera.centre.float()).norm(dim=1)
+    distance = offsets_from(scene.points.positions, scene.train[0].camera.centre).norm(dim=1)
     extent = 1.1 * float(distance.median())
     note = f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance"
     return replace(scene, extent=extent, notes=[*scene.notes, note])
@@ -504,6 +506,12 @@ def follow(run: Run, plugins: Plugins) -> None:
         train(run, plugins)
 
 
+def as_trained(run: Run) -> RasterSettings:
+    """The rules a run is drawn by, with path=auto as its training decided it, so that times are those of one path."""
+    path = read_run(run.folder).environment.get("rasterizer")
+    return replace(run.raster, path=path) if run.raster.path == "auto" and path == "compiled" else run.raster
+
+
 def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
     """Evaluate, export, draw and report a trained run."""
     evaluation = evaluate(run, settings)
@@ -517,26 +525,52 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
 
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run."""
-    logger.info("evaluating %d test views at zoom %s", len(run.scene.test), settings.evaluation.zoom)
-    evaluation = Evaluator(run, settings.evaluation).evaluate() | {"judged": judging(settings.resolved)}
+    options, begun = settings.evaluation, time.perf_counter()
+    logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
+    evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
+    evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
+    pictures.write_index()
+    write_pseudo_pictures(run, options)
+    evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "judged": judging(settings.resolved)}
+    tell_of_paths(read_run(run.folder).evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
-    write_pictures(run, settings.evaluation, evaluation)
-    write_pseudo_pictures(run, settings.evaluation)
-    for line in summary(evaluation):
+    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)
     return evaluation
 
 
+def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Say so if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
+    path = before.get("render_path")
+    if path and path != now["render_path"]:
+        logger.warning(
+            "renders/s are now by the %s path; the evaluation before had %.1f by the %s path, which are not comparable",
+            now["render_path"], before["render_fps"], path,
+        )  # fmt: skip
+
+
 def summary(evaluation: dict[str, Any]) -> list[str]:
     """The result in a few lines."""
-    e = evaluation
+    e, path = evaluation, evaluation["render_path"]
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
     lines = [
         f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}",
-        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s, "
-        f"{e['train_seconds']:.0f} s of training, peak memory {e['peak_memory_mb']:,.0f} MB",
+        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s ({path}), "
+        f"{e['train_seconds']:.0f} s of training, {e['evaluate_seconds']:.0f} s of evaluation, "
+        f"peak memory {memory}",
     ]
     return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()] + remarks_of(e)
+
+
+def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
+    """What to try where a render zoomed in loses to the enlarged one, and is not yet compensated for dilation."""
+    lost = [
+        factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
+    ]
+    if not lost or not remedy or run.raster.compensate:
+        return []
+    return [f"a model that is filtered for zooming in: the same command with {remedy}"]
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:
@@ -561,6 +595,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *run.backbone.export_notes(),
+        *([f"SplatRenderMode: {render_mode(run.raster)}"] if camera is not None or run.backbone.standard_file else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
     if camera is None:
@@ -568,6 +603,14 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
     else:
         run.backbone.begin(max(1, run.step))
         write_gaussians(path, run.backbone.explicit(camera), comments)
+
+
+def render_mode(raster: RasterSettings) -> str:
+    """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
+
+    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads (spec B6 of splat formats).
+    """
+    return "mip" if raster.compensate else "default"
 
 
 def unit_of(run: Run) -> float:

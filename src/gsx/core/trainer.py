@@ -53,15 +53,19 @@ def take_step(run: Run, plugins: Plugins) -> Step:
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:
     """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
-    reason = healed(run, step) or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
-    return next(filter(None, run.ranks.everyone(reason)), "")
+    removed = healed(run, step) if step.dropped else ""
+    reason = removed or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    reason = next(filter(None, run.ranks.everyone(reason)), "")
+    return reason if removed or not reason else "; ".join(filter(None, [reason, healed(run, step)]))
 
 
 def healed(run: Run, step: Step) -> str:
-    """Removes primitives that the render had to leave out; a reason to skip the step if there were any."""
-    removed = run.backbone.heal() if step.dropped else 0
+    """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
+    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken])
     if removed:
-        logger.warning("step %d: removed %d primitives with values that are not finite", step.number, removed)
+        logger.warning(
+            "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
+        )
     return f"removed {removed} primitives" if removed else ""
 
 
@@ -128,7 +132,8 @@ def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour
             named[term.name] += float(value.detach())
             loss = loss + value
     loss.backward()
-    seen.append(run.backbone.observe(rendering, number))
+    served = sum(weight for _, here in divided for _, weight in here)
+    seen.append(observation(run, rendering, number, own + served))
     return Step(
         number=number,
         view=view,
@@ -147,8 +152,11 @@ def without_graph(rendering: Rendering) -> Rendering:
 
 
 def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
-    """(the term without them, its parts that need no render of their own): the camera draws just what these see."""
-    if run.training.random_background or not term.shared:
+    """(the term without them, its parts that need no render of their own): the camera draws just what these see.
+
+    Terms that density control is not to learn from have none: it could not tell their gradients from the view's own.
+    """
+    if run.training.random_background or not (term.shared and term.observed):
         return term, ()
     here = [part for part in term.parts if part[0].camera.draws_as(camera)]
     return replace(term, parts=[part for part in term.parts if part not in here]), here
@@ -169,11 +177,26 @@ def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> floa
         loss.backward()
         total += float(loss.detach())
         if term.observed and math.isfinite(total) and finite_shift(rendering):
-            seen.append(run.backbone.observe(rendering, number))
+            seen.append(observation(run, rendering, number, weight))
     if not term.shared:
         for parameter in run.backbone.shared():
             parameter.grad = None
     return total
+
+
+def observation(run: Run, rendering: Rendering, number: int, weight: float) -> Observation:
+    """What density control learns from a render of that weight in the loss of its view; of weight 0 nothing.
+
+    The step's loss is the mean over the batch: the weight is divided by it, and the gradients of the screen means are,
+    as those of the parameters will be.
+    """
+    if not weight > 0:
+        return {}
+    views = run.training.batch
+    for moved in (rendering.screen.shift, rendering.screen.probe):
+        if views > 1 and moved is not None and moved.grad is not None:
+            moved.grad /= views
+    return run.backbone.observe(rendering, number, weight / views)
 
 
 def finite_shift(rendering: Rendering) -> bool:

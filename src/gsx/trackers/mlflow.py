@@ -1,6 +1,5 @@
 """MLflow: parameters, metrics and files of a run in a store beside the runs, or on a tracking server."""
 
-import fcntl
 import logging
 import math
 import os
@@ -14,6 +13,7 @@ from typing import Any
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import read_json, write_json
+from gsx.core.locks import lock
 from gsx.core.overview import flattened
 from gsx.core.plugins import hookimpl
 from gsx.core.run import Run
@@ -172,8 +172,8 @@ def client_of(uri: str) -> Any:
         return MlflowClient(uri)
     folder = Path(uri.removeprefix(SQLITE)).parent
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".mlflow.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with (folder / ".mlflow.lock").open("w") as stream:
+        lock(stream, wait=True)
         return MlflowClient(uri)
 
 

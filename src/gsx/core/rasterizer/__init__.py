@@ -2,7 +2,7 @@
 
 from gsx.core.rasterizer.batch import rasterize_batch
 from gsx.core.rasterizer.pieces import Mosaic, rasterize_pieces
-from gsx.core.rasterizer.projection import take_rows
+from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.visibility import screen_radii, touches
@@ -12,6 +12,7 @@ __all__ = [
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
+    "drawable",
     "rasterize",
     "rasterize_batch",
     "rasterize_pieces",

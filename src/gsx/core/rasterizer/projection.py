@@ -90,8 +90,7 @@ def refuse_unusable(camera: Camera, lens: Float[Tensor, "4"], margin: float) -> 
 
 def camera_points(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
     """Positions in the camera's frame, in float64: float32 is too coarse far from the origin or through a long lens."""
-    means = splats.means.double()
-    return means @ camera.rotation.T.to(means) + camera.translation.to(means)
+    return camera.to_camera(splats.means)
 
 
 @torch.no_grad()
@@ -113,6 +112,23 @@ def in_range(
     return fits & (x.maximum(y).maximum(z) <= largest)
 
 
+@torch.no_grad()
+def sound(
+    splats: Splats, points: Float[Tensor, "N 3"], lens: Float[Tensor, "4"], camera: Camera, margin: float
+) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
+    """(splats beyond the near plane, splats of which nothing is out of range). A depth that rounds to the near plane is
+    not beyond it."""
+    in_front = points[:, 2].to(splats.means) > camera.near
+    return in_front, usable(splats) & (in_range(splats, points, lens, camera.frame, margin) | ~in_front)
+
+
+@torch.no_grad()
+def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
+    """False for the splats that a render from this camera leaves out and counts as dropped."""
+    lens = on_frame(lens_of(camera, None), camera.frame).to(splats.means.device)
+    return sound(splats, camera_points(splats, camera), lens, camera, settings.jacobian_margin)[1]
+
+
 def project(
     splats: Splats, camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
 ) -> ScreenSplats:
@@ -127,9 +143,7 @@ def project(
     refuse_unusable(camera, lens, margin)
     lens = on_frame(lens, camera.frame).to(splats.means.device)
     points = camera_points(splats, camera)
-    # selecting comes before any division (spec 12); a depth that rounds to the near plane is not beyond it
-    in_front = points[:, 2].to(splats.means) > camera.near
-    good = usable(splats) & (in_range(splats, points, lens, camera.frame, margin) | ~in_front)
+    in_front, good = sound(splats, points, lens, camera, margin)  # selecting comes before any division (spec 12)
     ids = (good & in_front).nonzero()[:, 0]
     points, scales, quats, log_opacities, channels = (
         take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)

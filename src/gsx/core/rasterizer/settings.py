@@ -59,7 +59,7 @@ class RasterSettings:
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
     Blending more than 8 channels, sums in 16 bits and largest weights take the eager way regardless.
-    `auto`: a training run decides (`auto_steps`); everything else is eager."""
+    `auto`: a training run decides (`auto_steps`), and its evaluations follow it; everything else is eager."""
     auto_steps: int = 300
     """path=auto compiles for runs of at least this many steps, where a compiler works."""
     schedule: str = "auto"

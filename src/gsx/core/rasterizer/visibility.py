@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer.pairs import on_raster, published_radii, published_windows
-from gsx.core.rasterizer.projection import project
+from gsx.core.rasterizer.projection import drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float
 from gsx.core.splats import Splats
@@ -19,8 +19,23 @@ def touches(
     camera: Camera,
     settings: RasterSettings,
 ) -> Bool[Tensor, "N"]:
-    """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (spec 3.1)."""
-    return screen_radii(means, scales, quats, camera, settings) >= 0
+    """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (spec 3.1).
+
+    Those that have no such square, because something is out of range, are not held back either: the render counts them.
+    """
+    opaque = without_colours(means, scales, quats)
+    screen = project(opaque, camera, settings)
+    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
+    mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    mask.index_fill_(0, screen.ids[on_raster(first, last, camera)], True)
+    return mask | ~drawable(opaque, camera, settings) if screen.dropped else mask
+
+
+def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Splats:
+    """Opaque Gaussians of no colour."""
+    return Splats(
+        means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
+    )
 
 
 @torch.no_grad()
@@ -32,10 +47,7 @@ def screen_radii(
     settings: RasterSettings,
 ) -> Float[Tensor, "N"]:
     """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
-    opaque = Splats(
-        means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
-    )
-    screen = project(opaque, camera, settings)
+    screen = project(without_colours(means, scales, quats), camera, settings)
     first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
     on = on_raster(first, last, camera)
     xx, xy, yy = (screen.covariances[on] - settings.dilation * means.new_tensor([1, 0, 1])).unbind(1)
