@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsx.augmenters.consistency import blocks, consistent_share, exactly_consistent, repaired, unblocked
-from gsx.core.regenerator import box_average, projected
+from gsx.augmenters.consistency import BOX, blocks, consistent_pixels, exactly_consistent, repaired, unblocked
+from gsx.core.reduction import box_average, projected
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -29,14 +29,14 @@ def test_no_pixel_of_the_low_resolution_is_missed(factor: int, seed: int, spread
     low = (random(3, 5, 6, seed=seed) * 256).to(torch.uint8)
     guess = low.float().repeat_interleave(factor, 1).repeat_interleave(factor, 2) / 255
     image = guess + spread * (random(3, 5 * factor, 6 * factor, seed=seed + 1) - 0.5)
-    result = exactly_consistent(image, low, factor)
+    result = exactly_consistent(image, low, factor, BOX)
     assert torch.equal(rounded_average(result, factor), low)
-    assert consistent_share(result, low, factor) == 1
+    assert bool(consistent_pixels(result, low, factor, BOX).all())
 
 
 def test_black_and_white_are_kept() -> None:
     low = torch.tensor([0, 255, 254, 1], dtype=torch.uint8).view(1, 2, 2).repeat(3, 1, 1)
-    result = exactly_consistent(random(3, 4, 4), low, 2)
+    result = exactly_consistent(random(3, 4, 4), low, 2, BOX)
     assert torch.equal(rounded_average(result, 2), low)
     assert int(result[:, :2, :2].long().sum((1, 2)).max()) < 2  # 1 in four rounds to 0
     assert int(result[:, :2, 2:].long().sum((1, 2)).min()) >= 4 * 255 - 2
@@ -50,7 +50,7 @@ def test_consistent_pictures_stay_as_they_are() -> None:
 
 def test_the_projection_spreads_what_is_missing_evenly() -> None:
     image, low = 0.4 + 0.2 * random(3, 8, 8), 0.4 + 0.2 * random(3, 4, 4, seed=1)
-    result = projected(image, low, 2)
+    result = projected(image, low, 2, BOX)
     torch.testing.assert_close(box_average(result, 2), low)
     change = blocks(result - image, 2)
     torch.testing.assert_close(change, change.mean(1, keepdim=True).expand_as(change), rtol=0, atol=1e-6)
@@ -78,8 +78,10 @@ def test_blocks_are_put_back() -> None:
     assert blocks(image, 3)[0].tolist() == [0, 1, 2, 9, 10, 11, 18, 19, 20]
 
 
-def test_the_share_counts_pixels_with_all_channels_right() -> None:
+def test_pixels_with_all_channels_right_are_counted() -> None:
     image = (random(3, 8, 8) * 200).to(torch.uint8)
     low = rounded_average(image, 2)
     low[1, 0, 0] += 1
-    assert consistent_share(image, low, 2) == pytest.approx(15 / 16)
+    right = torch.ones(4, 4, dtype=torch.bool)
+    right[0, 0] = False
+    assert torch.equal(consistent_pixels(image, low, 2, BOX), right)

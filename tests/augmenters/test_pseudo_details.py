@@ -20,6 +20,7 @@ from gsx.core.losses import photometric
 from gsx.core.material import coverage, rendered
 from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.rasterizer import rasterize
+from gsx.core.reduction import Reduction
 from gsx.core.regenerator import Material
 from gsx.core.run import Run
 from gsx.core.session import execute, open_run, start
@@ -285,6 +286,33 @@ def test_exact_projection_gives_back_the_photograph(tmp_path: Path) -> None:
         assert torch.equal((2 * sums + 4) // 8, low)
 
 
+def test_everything_is_reduced_as_the_scene_says(tmp_path: Path) -> None:
+    """A scene reduced bicubically: projection, share, known pixels and gate go by that filter.
+
+    These thumbnails are too harsh for it: a few of their pixels no picture between black and white reduces to.
+    """
+    words = ("coarse_weight=0.5", "gate=1.0", "project=exact", "variants=0")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *(f"augmenter.upscale.{word}" for word in words))
+    bicubic = Reduction(filter="bicubic")
+    run.scene = replace(run.scene, reduction=bicubic)
+    augmenter = augmenter_of(run)
+    augmenter.term(run, 45, 0)
+    views = [view for views in augmenter.views.values() for view in views]
+    right: list[Tensor] = []
+    for view in views:
+        photo = run.scene.train[view.parent].image()[:, 13:22, 18:30]
+        shown = view.target.float() / 255
+        off = 255 * bicubic.inner(bicubic.reduce(shown, 2) - photo).abs()  # the rim takes from beyond the window
+        right.append((off <= 0.5).all(0))
+        assert view.reduction == bicubic
+        assert float(pseudo_loss(shown, view)) < 0.6 * float(pseudo_loss(shown, replace(view, reduction=Reduction())))
+    assert float(torch.stack(right).float().mean()) > 0.95
+    assert sum(view.provenance["consistent"] for view in views) > 0.95 * len(views)
+    assert all(view.trust is None or float((view.trust == 255).float().mean()) > 0.9 for view in views)
+    (path,) = (run.folder / "pseudo").glob("*.safetensors")
+    assert {view.reduction.filter for view in load_views(path)[0]} == {"bicubic"}
+
+
 def test_restored_views_show_what_the_model_shows(tmp_path: Path) -> None:
     """With the identity as regenerator targets are renders, to 8 bits: nothing to learn."""
     run = run_at(tmp_path / "run", 40, "augmenter=bootstrap")
@@ -455,7 +483,7 @@ class Spoiling:
 SPOILT = {
     "not finite": lambda image: image * torch.nan,
     "should be": lambda image: image[:, 1:],
-    "box-averaged": lambda image: image.flip(2),
+    "from its input": lambda image: image.flip(2),
 }
 
 
@@ -621,6 +649,7 @@ def test_files_hold_everything(tmp_path: Path) -> None:
         provenance={"seed": 22},
         coarse=torch.ones(3, 1, 1, dtype=torch.uint8),
         coarse_weight=0.25,
+        reduction=Reduction(filter="lanczos", light="linear"),
     )
     save_views(tmp_path / "views", [view, replace(view, trust=None)], {"event": 3})
     (first, second), facts = load_views(tmp_path / "views")
@@ -630,7 +659,7 @@ def test_files_hold_everything(tmp_path: Path) -> None:
     assert second.trust is None
     assert first.coarse is not None
     assert torch.equal(first.coarse, torch.ones(3, 1, 1, dtype=torch.uint8))
-    assert first.coarse_weight == 0.25
+    assert (first.coarse_weight, first.reduction) == (0.25, view.reduction)
     assert (first.parent, first.provenance) == (4, {"seed": 22})
     for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "cut_from"):
         assert getattr(first.camera, name) == getattr(camera, name)

@@ -16,6 +16,7 @@ from gsx.augmenters.trust import (
 )
 from gsx.core.camera import Camera, look_at
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.reduction import Reduction
 from gsx.core.splats import Splats
 
 
@@ -112,6 +113,6 @@ def test_blocks_that_contradict_the_photograph_do_not_count() -> None:
     result = given.repeat_interleave(2, 1).repeat_interleave(2, 2)
     result[1, 0, 0] += 4 * 5 / 255  # the block's average is five levels off in one channel
     result[:, 2:, 4:] += torch.tensor([[0.2, -0.2], [-0.2, 0.2]])  # detail that averages out
-    assert agreeing(result, given, 2, 4.0).tolist() == [[0, 0, 1, 1, 1, 1]] * 2 + [[1] * 6] * 2
-    assert bool((agreeing(result, given, 2, 6.0) == 1).all())
+    assert agreeing(result, given, 2, Reduction(), 4.0).tolist() == [[0, 0, 1, 1, 1, 1]] * 2 + [[1] * 6] * 2
+    assert bool((agreeing(result, given, 2, Reduction(), 6.0) == 1).all())
     assert in_bytes(torch.tensor([[0.0, 0.5, 1.0]])).tolist() == [[0, 128, 255]]

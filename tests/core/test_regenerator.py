@@ -7,9 +7,12 @@ import torch
 from regenerating import request, strict_checks
 from torch import Tensor
 
-from gsx.core.regenerator import Check, Request, box_average, colour_matched, displacement, strayed, unusable
+from gsx.core.images import resize, to_uint8
+from gsx.core.reduction import Reduction, box_average
+from gsx.core.regenerator import Check, Request, colour_matched, displacement, strayed, unusable
 
 STRICT = strict_checks()
+BICUBIC = Reduction(filter="bicubic")
 
 
 def complaint(asked: Request, result: Tensor) -> str:
@@ -51,6 +54,28 @@ def fine(shift: float = 0.0) -> Tensor:
 
 def test_sound_pictures_pass() -> None:
     assert complaint(request(texture()), fine()) == ""
+
+
+def test_pictures_are_reduced_as_the_scene_reduces_them() -> None:
+    """Bars as a photograph has them, beside their bicubic half: by box averages they would be 15 dB further apart."""
+    bars = (torch.sin(torch.arange(120.0)[:, None] / 2.3 + torch.arange(160.0) / 3.1) > 0).float()
+    photo = to_uint8(0.3 + 0.4 * bars.expand(3, -1, -1))
+    given = request(resize(photo, 80, 60).float() / 255)
+    strict = replace(STRICT, agreement=Check(limit=50.0, action="drop"))
+    assert strayed(replace(given, reduction=BICUBIC), photo.float() / 255, strict) == {}
+    assert "agreement" in strayed(given, photo.float() / 255, strict)
+
+
+def test_a_window_is_not_held_to_what_lay_beyond_it() -> None:
+    """Its rim was reduced together with pixels that nobody sees any more."""
+    bars = (torch.sin(torch.arange(120.0)[:, None] / 2.3 + torch.arange(160.0) / 3.1) > 0).float().expand(3, -1, -1)
+    low = BICUBIC.reduce(bars, 2)[:, 10:30, 20:44]
+    result = bars[:, 20:60, 40:88]
+    strict = replace(STRICT, agreement=Check(limit=90.0, action="drop"))
+    assert strayed(replace(request(low), reduction=BICUBIC), result, strict) == {}
+    off = low.clone()
+    off[:, 5, 5] += 0.01
+    assert "agreement" in strayed(replace(request(off), reduction=BICUBIC), result, strict)
 
 
 def test_half_a_pixel_of_the_finer_raster_is_the_limit() -> None:

@@ -1,5 +1,6 @@
 """Super-resolution learnt from a scene: better than a filter on unseen texture, true to its input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,13 @@ from torch import Tensor
 
 from gsx.core.errors import ConfigError
 from gsx.core.images import resize, to_uint8
-from gsx.core.regenerator import Material, Regenerator, box_average, strayed, unusable
+from gsx.core.reduction import Reduction, box_average
+from gsx.core.regenerator import Material, Regenerator, strayed, unusable
 from gsx.core.scene import View
-from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at
+from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 
 CPU = torch.device("cpu")
+BOX, BICUBIC = Reduction(), Reduction(filter="bicubic")
 
 
 def material(folder: Path, count: int = 6) -> Material:
@@ -84,6 +87,21 @@ def test_what_it_makes_reduces_to_what_it_was_given(learnt: SceneSR) -> None:
         assert strayed(given, result, strict_checks()) == {}
 
 
+def test_it_learns_and_enlarges_by_the_scenes_own_reduction(tmp_path: Path) -> None:
+    """Pairs are bicubic halves of what lies around them too; what it makes reduces bicubically."""
+    slope = (torch.arange(96.0)[:, None] + 2 * torch.arange(96.0)) / 400
+    low, truth = pairs([slope.expand(3, -1, -1)], BICUBIC, options(), torch.Generator().manual_seed(0))
+    assert (low.shape, truth.shape) == ((8, 3, 16, 16), (8, 3, 32, 32))
+    torch.testing.assert_close(low, box_average(truth, 2))  # of a slope every symmetric filter leaves the middle
+    regenerator = SceneSR(options(steps=30))
+    regenerator.prepare(replace(material(tmp_path), reduction=BICUBIC))
+    for scale in (2, 4):
+        given = replace(request(stripes(7, 12).float() / 255, scale), reduction=BICUBIC)
+        (result,) = regenerator.regenerate([given])
+        off = 255 * BICUBIC.inner(BICUBIC.reduce(result, scale) - given.image).abs()
+        assert float(off.mean()) < 0.5, scale
+
+
 def test_before_learning_it_is_the_bicubic_enlargement() -> None:
     network = Enlarger(8, 2, torch.Generator().manual_seed(0))
     image = torch.rand(1, 3, 9, 11, generator=torch.Generator().manual_seed(1))
@@ -104,7 +122,7 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
     first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
     first.prepare(material(tmp_path))
     photos = [view.image() for view in material(tmp_path).views]
-    kept_at(options(steps=5), photos, 0, CPU).write_bytes(b"no network")
+    kept_at(options(steps=5), photos, BOX, 0, CPU).write_bytes(b"no network")
     assert "loss" in again.prepare(material(tmp_path))
     assert "learnt again" in caplog.text
     given = request(stripes(3, 12).float() / 255)
@@ -113,16 +131,17 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
 
 def test_other_photographs_are_another_scene(tmp_path: Path) -> None:
     photos = [view.image() for view in material(tmp_path).views]
-    assert kept_at(options(), photos, 0, CPU) != kept_at(options(), photos[:-1], 0, CPU)
-    assert kept_at(options(), photos, 0, CPU) != kept_at(options(steps=7), photos, 0, CPU)
-    assert kept_at(options(), photos, 0, CPU) != kept_at(options(), photos, 1, CPU)
+    assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(), photos[:-1], BOX, 0, CPU)
+    assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(), photos, BICUBIC, 0, CPU)
+    assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(steps=7), photos, BOX, 0, CPU)
+    assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(), photos, BOX, 1, CPU)
 
 
 def test_the_time_is_limited_and_its_result_not_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     hurried = options(steps=100_000, seconds=0.2)
     SceneSR(hurried).prepare(material(tmp_path))
     assert "regenerator.upscale.seconds" in caplog.text
-    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], 0, CPU).exists()
+    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], BOX, 0, CPU).exists()
 
 
 def test_crops_are_of_every_orientation_and_place() -> None:

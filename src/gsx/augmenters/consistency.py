@@ -1,19 +1,41 @@
-"""Pictures whose box average is a given one, exactly (spec 5.3): the paper's interpolation flexibility, guaranteed."""
+"""Pictures that reduce to a given one in 8 bits (spec 5.3): the paper's interpolation flexibility, guaranteed for box
+averages."""
 
 import torch
 from torch import Tensor
 
 from gsx.core.images import to_uint8
-from gsx.core.regenerator import projected
-from gsx.core.shapes import Float, Int, UInt8
+from gsx.core.reduction import Reduction, projected
+from gsx.core.shapes import Bool, Float, Int, UInt8
+
+BOX = Reduction()
+
+
+REPAIRS = 50
+"""Rounds in which errors of rounding are spread back, where blocks overlap."""
 
 
 def exactly_consistent(
-    image: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int
+    image: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
 ) -> UInt8[Tensor, "3 H W"]:
-    """8-bit picture near `image` whose box average, rounded to 8 bits, is `low` in every pixel."""
-    near = projected(image.float(), low.float() / 255, factor)
-    return repaired(near, low, factor)
+    """8-bit picture near `image` that reduces, rounded to 8 bits, to `low`: by box averages in every pixel, by other
+    filters in nearly every one that a picture between black and white can give back."""
+    near = projected(image.float(), low.float() / 255, factor, reduction)
+    return repaired(near, low, factor) if reduction == BOX else settled(near, low, factor, reduction)
+
+
+def settled(
+    near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
+) -> UInt8[Tensor, "3 H W"]:
+    """Rounded; where that reduces to another level, what is missing is spread over the pixels that it came from."""
+    given = low.float() / 255
+    for _ in range(REPAIRS):
+        off = given - reduction.reduce(to_uint8(near).float() / 255, factor)
+        wrong = torch.where(off.abs() * 255 > 0.5, off, 0)
+        if not bool(wrong.any()):
+            break
+        near = near + factor**2 * reduction.adjoint(wrong, factor)
+    return to_uint8(near)
 
 
 def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> UInt8[Tensor, "3 H W"]:
@@ -55,8 +77,13 @@ def unblocked(values: Int[Tensor, "B a"], shape: torch.Size, factor: int) -> Int
     return parts.reshape(channels, height * factor, width * factor)
 
 
-def consistent_share(image: UInt8[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> float:
-    """Share of the pixels of `low` that the image's box average gives back in 8 bits, all channels."""
-    sums = blocks(image.long(), factor).sum(1).view(low.shape)
-    back = ((2 * sums + factor * factor) // (2 * factor * factor)).to(torch.uint8)
-    return float((back == low).all(0).float().mean())
+def consistent_pixels(
+    image: UInt8[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
+) -> Bool[Tensor, "h w"]:
+    """Pixels of `low` that the image gives back when it is reduced, in 8 bits, all channels."""
+    if reduction == BOX:
+        sums = blocks(image.long(), factor).sum(1).view(low.shape)
+        back = ((2 * sums + factor * factor) // (2 * factor * factor)).to(torch.uint8)
+    else:
+        back = to_uint8(reduction.reduce(image.float() / 255, factor))
+    return (back == low).all(0)

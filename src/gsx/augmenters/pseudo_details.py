@@ -27,7 +27,7 @@ from gsx.augmenters.cameras import (
     window_size,
     worst_window,
 )
-from gsx.augmenters.consistency import consistent_share, exactly_consistent
+from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.augmenters.trust import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
 from gsx.core.camera import Camera
@@ -37,14 +37,13 @@ from gsx.core.images import to_uint8, write_image
 from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
+from gsx.core.reduction import Reduction, projected
 from gsx.core.regenerator import (
     Checked,
     Checks,
     Request,
     as_blocks,
-    box_average,
     colour_matched,
-    projected,
     strayed,
     unusable,
 )
@@ -165,13 +164,14 @@ class PseudoOptions:
     """Windows at random places, or of cameras moved at random, are drawn again, ten times at most, while the model's
     mean alpha in them is lower: objects fill little of their pictures (spec 1.7). 0: the first is taken."""
     project: str
-    """exact: the nearest picture whose box average is its input, of photographs to the last of 8 bits (spec 5.3)."""
+    """exact: the nearest picture that reduces to its input as the scene's pictures do, of photographs in 8 bits: every
+    pixel where they are box averages, else nearly every one; the share is logged (spec 5.3)."""
     weight_map: str
     """none; splatsure: surfaces count that no photograph shows more finely than another (spec 6.1); finer, ours: those
     that no photograph shows as finely as the pseudo view does."""
     gate: float
-    """Pixels do not count whose block's average is further than this from the known photograph, in 8-bit levels; 0:
-    all count."""
+    """Blocks do not count that reduce to what is further than this from the known photograph, in 8-bit levels; 0: all
+    count."""
     coarse_weight: float
     """Of the mean difference between the reduced render and the known photograph, beside that of the pixels."""
     progressive: bool
@@ -179,7 +179,8 @@ class PseudoOptions:
     checks: Checks
     """Of redrawn pictures against what they were made from; those of the regenerator's role unless said otherwise."""
     coarser: list[int] = field(default_factory=list)
-    """Training cameras also count at these fractions of their size, with box averages for pictures (Mipmap-GS)."""
+    """Training cameras also count at these fractions of their size: photographs as the scene reduces them, renders by
+    box averages (Mipmap-GS)."""
 
     def __post_init__(self) -> None:
         where = f"augmenter.{self.name}"
@@ -610,7 +611,7 @@ class PseudoDetails:
         if not problem:
             result = colour_matched(request, result)
             if self.options.project == "exact" and request.scale > 1:
-                result = projected(result, request.image.cpu(), request.scale)
+                result = projected(result, request.image.cpu(), request.scale, request.reduction)
             found = strayed(request, result, self.options.checks)
             dropped = [told for check, told in found.items() if getattr(self.options.checks, check).action == "drop"]
             problem = "; ".join(dropped)
@@ -626,6 +627,7 @@ class PseudoDetails:
         return Request(
             image=image,
             scale=sketch.scale,
+            reduction=run.scene.reduction,
             camera=sketch.seen,
             view=view,
             number=sketch.parent,
@@ -650,19 +652,22 @@ class PseudoDetails:
         a, inside = sketch.scale, sketch.inside
         target = to_uint8(result.clamp(0, 1))
         if self.options.project == "exact" and a > 1 and request.photo:
-            target = exactly_consistent(result, to_uint8(request.image), a)
+            target = exactly_consistent(result, to_uint8(request.image), a, request.reduction)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
-        truth = inside.cut(to_uint8(request.image)) if request.photo and a > 1 else None
-        shares = {} if truth is None else {"consistent": consistent_share(kept, truth, a)}
+        shares = {}
+        if request.photo and a > 1:
+            same = consistent_pixels(target, to_uint8(request.image), a, request.reduction)
+            shares = {"consistent": float(inside.cut(same[None].float()).mean())}
         known = request.photo and a > 1 and self.options.coarse_weight > 0
         return PseudoView(
             camera=sketch.camera,
             target=kept,
             parent=sketch.parent,
-            trust=self.trust(run, sketch, request, window.cut(target.float() / 255)),
+            trust=self.trust(run, sketch, request, target.float() / 255, window),
             coarse=to_uint8(inside.cut(request.image)).contiguous() if known else None,
             coarse_weight=self.options.coarse_weight if known else 0.0,
+            reduction=request.reduction,
             provenance={
                 "event": event,
                 "view": request.view.name,
@@ -684,7 +689,8 @@ class PseudoDetails:
         _, camera, covered = reduced(whole, view.camera, factor)
         photo = self.options.base_source == "photo"
         picture = view.image() if photo else rendered(run, view.camera).cpu()
-        target = to_uint8(box_average(Window(0, 0, *covered.size).cut(picture), factor))
+        reduction = run.scene.reduction if photo else Reduction()  # Mipmap-GS: bilinear, which is the mean of four
+        target = to_uint8(reduction.reduce(Window(0, 0, *covered.size).cut(picture), factor))
         return PseudoView(
             camera=camera,
             target=target,
@@ -700,10 +706,10 @@ class PseudoDetails:
         )
 
     def trust(
-        self, run: Run, sketch: Sketch, request: Request, result: Float[Tensor, "3 h w"]
+        self, run: Run, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"], window: Window
     ) -> UInt8[Tensor, "h w"] | None:
-        """How much each pixel counts; None where all count whole."""
-        options, trust = self.options, torch.ones(result.shape[1:])
+        """How much each pixel of a window of the result counts; None where all count whole."""
+        options, trust = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
             run.backbone.begin(max(1, run.step))
@@ -712,7 +718,8 @@ class PseudoDetails:
             photographs = [view.camera for view in run.scene.train]
             trust = trust * weights(splats, sketch.camera, photographs, run.raster).cpu()
         if options.gate > 0 and request.photo and sketch.scale > 1:
-            trust = trust * agreeing(result, sketch.inside.cut(request.image), sketch.scale, options.gate)
+            agreed = agreeing(result, request.image, sketch.scale, request.reduction, options.gate)
+            trust = trust * window.cut(agreed[None])[0]
         return None if bool((trust == 1).all()) else in_bytes(trust)
 
     def show(self, folder: Path, sketch: Sketch, request: Request, view: PseudoView) -> None:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer import RasterSettings, rasterize, screen_radii
-from gsx.core.regenerator import as_blocks, box_average
+from gsx.core.reduction import Reduction
+from gsx.core.regenerator import as_blocks
 from gsx.core.shapes import Float, UInt8
 from gsx.core.splats import Splats
 
@@ -81,10 +82,11 @@ def sampled_better(
 
 
 def agreeing(
-    result: Float[Tensor, "3 H W"], given: Float[Tensor, "3 h w"], scale: int, levels: float
+    result: Float[Tensor, "3 H W"], given: Float[Tensor, "3 h w"], scale: int, reduction: Reduction, levels: float
 ) -> Float[Tensor, "H W"]:
-    """1 where the result, box-averaged, is within `levels` of 255 of what it was made from in all channels, else 0."""
-    off = (box_average(result.clamp(0, 1), scale) - given).abs().amax(0) * 255
+    """1 in blocks where the result, reduced, is within `levels` of 255 of what it was made from in all channels, else
+    0."""
+    off = (reduction.reduce(result.clamp(0, 1), scale) - given).abs().amax(0) * 255
     return as_blocks((off <= levels).float(), scale)
 
 

@@ -117,7 +117,8 @@ def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*sha
 def display_from_linear(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Display values of light, clamped to [0, 1] (IEC 61966-2-1, sRGB)."""
     light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
 def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:

@@ -30,6 +30,7 @@ def material_of(run: Run, seed: int) -> Material:
     """Everything but held-out views."""
     return Material(
         views=run.scene.train,
+        reduction=run.scene.reduction,
         render=lambda camera: rendered(run, camera),
         held_out=lambda share: held_out_renders(run, share, seed),
         step=run.step,

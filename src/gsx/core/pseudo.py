@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsx.core.camera import Camera, Frame
 from gsx.core.files import replace_file
-from gsx.core.regenerator import Regenerator, box_average
+from gsx.core.reduction import Reduction
+from gsx.core.regenerator import Regenerator
 from gsx.core.scene import Scene
 from gsx.core.shapes import Float, UInt8
 
@@ -30,9 +31,11 @@ class PseudoView:
     trust: UInt8[Tensor, "h w"] | None = None
     """Weight of each pixel in the loss, 255 counts whole; None: all count whole."""
     coarse: UInt8[Tensor, "3 l m"] | None = None
-    """What is known of it at a lower resolution: its box average over whole blocks."""
+    """What is known of it at a lower resolution: what it reduces to."""
     coarse_weight: float = 0.0
     """Of the mean difference at that resolution, beside that of the pixels."""
+    reduction: Reduction = Reduction()
+    """By which it becomes `coarse`, but for the rim: that takes from beyond the window."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where it comes from: kind, event, regenerator, seed, hash. JSON-serialisable."""
 
@@ -115,9 +118,9 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool =
         difference = difference * (view.trust.to(image.device).float() / 255)
     if view.coarse is None:
         return difference.mean()
-    reduced = box_average(image, view.camera.width // view.coarse.shape[2])
-    known = view.coarse.to(image.device).float() / 255
-    return difference.mean() + view.coarse_weight * size(reduced - known).mean()
+    reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])
+    off = view.reduction.inner(reduced - view.coarse.to(image.device).float() / 255)
+    return difference.mean() + view.coarse_weight * size(off).mean()
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -136,7 +139,7 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
             f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
         }
         entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
-        listed.append(entry | {"camera": intrinsics(view.camera)})
+        listed.append(entry | {"camera": intrinsics(view.camera), "reduction": asdict(view.reduction)})
     text = json.dumps({"facts": facts, "views": listed})
     replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
 
@@ -183,5 +186,6 @@ def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> P
         trust=tensors.get(f"{number}.trust"),
         coarse=tensors.get(f"{number}.coarse"),
         coarse_weight=entry["coarse_weight"],
+        reduction=Reduction(**entry.get("reduction", {})),
         provenance=entry["provenance"],
     )

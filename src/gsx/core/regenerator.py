@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.metrics import psnr
+from gsx.core.reduction import Reduction
 from gsx.core.scene import View
 from gsx.core.shapes import Float
 
@@ -18,8 +19,6 @@ LARGEST_DRIFT = 2 / 255
 """Mean colours that differ by more are put right (spec 6.4)."""
 LEAST_SLOPE = 1e-3
 """Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
-PROJECTIONS = 5
-"""Rounds of projection and clamping; each halves what clamping undid (spec 5.3)."""
 ACTIONS = ("drop", "warn", "off")
 
 
@@ -63,6 +62,8 @@ class Request:
     """Display values in [0, 1]."""
     scale: int
     """The result is this many times as wide and high."""
+    reduction: Reduction = Reduction()
+    """By which a result becomes `image`: the scene's. The default: box averages of display values."""
     camera: Camera
     """That sees `image`."""
     view: View
@@ -91,6 +92,8 @@ class Material:
     """What a regenerator may learn from before its first call: training views only."""
 
     views: Sequence[View]
+    reduction: Reduction = Reduction()
+    """How the scene's pictures come from finer ones."""
     render: Callable[[Camera], Float[Tensor, "3 h w"]]
     """The model as it is now."""
     held_out: Callable[[float], list[Float[Tensor, "3 h w"]]]
@@ -126,21 +129,9 @@ class Checked(Protocol):
         ...
 
 
-def box_average(image: Float[Tensor, "C H W"], factor: int) -> Float[Tensor, "C h w"]:
-    """Means over blocks of factor x factor pixels."""
-    return torch.nn.functional.avg_pool2d(image[None], factor)[0] if factor > 1 else image
-
-
 def as_blocks(image: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
     """Every pixel as a block of factor x factor."""
     return image.repeat_interleave(factor, -2).repeat_interleave(factor, -1)
-
-
-def projected(image: Float[Tensor, "3 H W"], low: Float[Tensor, "3 h w"], factor: int) -> Float[Tensor, "3 H W"]:
-    """The nearest picture with that box average, clamped to [0, 1]: D D^T = I / a^2, so errors are spread evenly."""
-    for _ in range(PROJECTIONS):
-        image = (image + as_blocks(low - box_average(image, factor), factor)).clamp(0, 1)
-    return image
 
 
 def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3"]:
@@ -165,14 +156,19 @@ def unusable(request: Request, result: Tensor) -> str:
 
 
 def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
-    """How a result differs from its input by more than a check allows, in words by the check's name (spec 6.4)."""
-    low, given = box_average(result.cpu().float().clamp(0, 1), request.scale), request.image.cpu()
+    """How a result differs from its input by more than a check allows, in words by the check's name (spec 6.4).
+
+    Looked at without the rim of the window, which was reduced from pixels beyond it.
+    """
+    reduction = request.reduction
+    low = reduction.inner(reduction.reduce(result.cpu().float().clamp(0, 1), request.scale))
+    given = reduction.inner(request.image.cpu())
     drift = 255 * float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
     agreement = psnr(low, given) if request.scale > 1 else math.inf
     shift = displacement(low, given) if checks.displacement.active else 0.0
     words = {
         "colour": (drift > checks.colour.limit, f"its mean colour is {drift:.1f} levels off"),
-        "agreement": (agreement < checks.agreement.limit, f"box-averaged it is {agreement:.1f} dB from its input"),
+        "agreement": (agreement < checks.agreement.limit, f"reduced it is {agreement:.1f} dB from its input"),
         "displacement": (shift > checks.displacement.limit, f"it is displaced by {shift:.2f} px"),
     }
     return {name: told for name, (beyond, told) in words.items() if beyond and getattr(checks, name).active}

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.camera import Camera
+from gsx.core.reduction import Reduction
 from gsx.core.shapes import Float, UInt8
 
 
@@ -70,6 +71,8 @@ class Scene:
     """Display colour behind the scene, in [0, 1]."""
     extent: float
     """1.1 x the largest distance of a training camera from their mean (3D-GS, spec 2.4)."""
+    reduction: Reduction = Reduction()
+    """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
     notes: Sequence[str] = ()
     """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
     provenance: dict[str, Any] = field(default_factory=dict)

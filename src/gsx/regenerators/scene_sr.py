@@ -1,7 +1,8 @@
 """Super-resolution learnt from the scene's own photographs (spec 5.3; the idea: ZSSR, Shocher et al. 2018).
 
-Photographs reduced by two, and themselves, are pairs of input and truth; textures that recur at several distances are
-what it learns. Every picture it gives back reduces to its input (`core.regenerator.projected`), x4 and x8 by recursion.
+Photographs reduced by two as the scene reduces them, and themselves, are pairs of input and truth; textures that recur
+at several distances are what it learns. Every picture it gives back reduces to its input (`core.reduction`), x4 and x8
+by recursion.
 """
 
 import hashlib
@@ -15,15 +16,17 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import interpolate
 
 from gsx.core.cache import cache_folder, content_key
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
-from gsx.core.regenerator import Material, Request, projected
+from gsx.core.reduction import Reduction, projected
+from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.core.window import Window
 
 logger = logging.getLogger(__name__)
 
@@ -106,12 +109,12 @@ class SceneSR:
         self.network = Enlarger(
             self.options.channels, self.options.layers, torch.Generator().manual_seed(material.seed)
         ).to(material.device)
-        path = kept_at(self.options, photos, material.seed, material.device)
+        path = kept_at(self.options, photos, material.reduction, material.seed, material.device)
         if path.is_file() and (found := read_network(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
-        loss, whole = train(self.network, photos, self.options, material.seed)
+        loss, whole = train(self.network, photos, material.reduction, self.options, material.seed)
         seconds = time.perf_counter() - begun
         logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
         if whole:
@@ -126,10 +129,12 @@ class SceneSR:
 
 
 def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
-    """One picture, doubled until it is large enough."""
-    image = request.image.to(next(network.parameters()).device)
+    """One picture, doubled until it is large enough; it reduces to what it was made from."""
+    image = given = request.image.to(next(network.parameters()).device)
     for _ in range(round(math.log2(request.scale))):
-        image = projected(network(image[None])[0], image, STEP)
+        image = projected(network(image[None])[0], image, STEP, request.reduction)
+    if request.scale > STEP and request.reduction.filter != "area":  # two reductions are not one by twice the factor
+        image = projected(image, given, request.scale, request.reduction)
     return image
 
 
@@ -137,7 +142,11 @@ def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
 
 
 def train(
-    network: Enlarger, photos: Sequence[Float[Tensor, "3 H W"]], options: SceneSROptions, seed: int
+    network: Enlarger,
+    photos: Sequence[Float[Tensor, "3 H W"]],
+    reduction: Reduction,
+    options: SceneSROptions,
+    seed: int,
 ) -> tuple[float, bool]:
     """(mean loss of the last tenth, whether all steps were taken)."""
     generator = torch.Generator().manual_seed(seed)
@@ -152,11 +161,11 @@ def train(
                 "scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps
             )
             break
-        truth = torch.stack([crop(photos, options.crop, generator) for _ in range(options.batch)]).to(device)
-        low = avg_pool2d(truth, STEP)
+        low, truth = (part.to(device) for part in pairs(photos, reduction, options, generator))
         noise = torch.randn(low.shape, generator=generator).to(device) * options.noise / 255
         out = network(low + noise)
-        loss = (out - truth).abs().mean() + (avg_pool2d(out, STEP) - low).abs().mean()
+        off = reduction.inner(reduction.reduce(out, STEP) - low)
+        loss = (out - truth).abs().mean() + off.abs().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -164,6 +173,17 @@ def train(
         losses.append(float(loss.detach()))
     tail = losses[-max(1, len(losses) // 10) :]
     return sum(tail) / max(1, len(tail)), len(losses) == options.steps
+
+
+def pairs(
+    photos: Sequence[Float[Tensor, "3 H W"]], reduction: Reduction, options: SceneSROptions, generator: torch.Generator
+) -> tuple[Float[Tensor, "B 3 h w"], Float[Tensor, "B 3 H W"]]:
+    """(reduced crops of photographs, the crops): larger ones are reduced, then both lose their borders."""
+    larger = [crop(photos, options.crop + 2 * reduction.rim, generator) for _ in range(options.batch)]
+    low = torch.stack([reduction.inner(reduction.reduce(part, STEP)) for part in larger])
+    left = (larger[0].shape[1] - STEP * low.shape[2]) // 2
+    window = Window(left=left, top=left, width=STEP * low.shape[3], height=STEP * low.shape[2])
+    return low, torch.stack([window.cut(part) for part in larger])
 
 
 def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.Generator) -> Float[Tensor, "3 h w"]:
@@ -180,13 +200,16 @@ def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.G
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def kept_at(options: SceneSROptions, photos: Sequence[Tensor], seed: int, device: torch.device) -> Path:
-    """Where what is learnt from these photographs, with these options and seed, by this code and machine, is kept."""
+def kept_at(
+    options: SceneSROptions, photos: Sequence[Tensor], reduction: Reduction, seed: int, device: torch.device
+) -> Path:
+    """Where what is learnt from these photographs, reduced so, with these options and seed, by this code and machine,
+    is kept."""
     digest = hashlib.sha256(Path(__file__).read_bytes())
     for photo in photos:
         digest.update(repr(tuple(photo.shape)).encode())
         digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
-    key = content_key(asdict(options), digest.hexdigest(), seed, machine_stamp(device))
+    key = content_key(asdict(options), asdict(reduction), digest.hexdigest(), seed, machine_stamp(device))
     return cache_folder("scene_sr", key) / "network.safetensors"
 
 

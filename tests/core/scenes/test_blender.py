@@ -275,6 +275,7 @@ def test_views_from_afar_and_views_of_smaller_images_have_truths_of_their_own(fo
 def test_a_scale_given_twice_is_trained_on_twice_and_moves_no_camera(folder: Path) -> None:
     scene, plain = load(options(folder, scales=[1, 1, 2])), load(options(folder))
     assert [view.camera.width for view in scene.train] == [40, 40, 40, 40, 20, 20]
+    assert (scene.reduction.filter, plain.reduction.filter) == ("area", "bicubic")
     assert scene.extent == pytest.approx(plain.extent)
     assert len(scene.test) == 1
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import read_image, write_image
+from gsx.core.reduction import Reduction
 from gsx.core.scene import Scene, View
 from gsx.core.scenes.colmap import load
 from gsx.core.scenes.colmap_model import check_binary, count_images
@@ -118,6 +119,13 @@ def test_scene_is_named_after_its_folder_and_black(tmp_path: Path) -> None:
     scene = load(colmap_options(tmp_path / "garden"))
     assert scene.name == "garden"
     assert scene.background.tolist() == [0, 0, 0]
+
+
+def test_pictures_come_from_finer_ones_by_the_resize_rule(tmp_path: Path) -> None:
+    write_scene(synthesize(frames=3), tmp_path)
+    assert load(colmap_options(tmp_path)).reduction == Reduction(filter="bicubic")
+    changed = colmap_options(tmp_path, resize_filter="lanczos", resize_light="linear")
+    assert load(changed).reduction == Reduction(filter="lanczos", light="linear")
 
 
 def test_extent_is_over_training_cameras_only(tmp_path: Path) -> None:

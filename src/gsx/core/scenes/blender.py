@@ -11,6 +11,7 @@ from torch import Tensor
 from gsx.core.camera import Camera
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import PhotoSource, image_size
+from gsx.core.reduction import Reduction
 from gsx.core.scene import PointCloud, Scene, View, extent_of
 from gsx.core.scenes.options import SceneOptions
 from gsx.core.scenes.points import random_points, read_points
@@ -21,6 +22,7 @@ from gsx.core.scenes.posed import (
     present_frames,
     provenance,
     read_frames,
+    reduction_of,
     refuse_too_few,
     views_of,
 )
@@ -80,6 +82,7 @@ def load(options: BlenderOptions) -> Scene:
         test=test,
         points=points,
         background=torch.tensor(list(options.background), dtype=torch.float32),
+        reduction=Reduction() if list(options.scales) != [1] else reduction_of(options),
         extent=extent_of([view.camera for view in train]),
         notes=[*train_notes, *test_notes, *_test_note(test_file), points_note],
         provenance=provenance(

@@ -30,6 +30,7 @@ from gsx.core.scenes.posed import (
     pose_from_opengl,
     provenance,
     read_json,
+    reduction_of,
     refuse_too_few,
     views_of,
 )
@@ -137,6 +138,7 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
         test=[],
         points=points,
         background=torch.tensor(list(options.background), dtype=torch.float32),
+        reduction=reduction_of(options),
         extent=extent_of([view.camera for view in views]),
         notes=[f"Cameras come from {POSES_FILE}.", note],
         provenance=provenance(options, len(views), points=options.points),

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsx.core.camera import Camera, centred
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.images import ImageCache, PhotoSource, ResizeRule, Size, checked_size, training_size
+from gsx.core.reduction import Reduction
 from gsx.core.scene import View
 from gsx.core.scenes.options import SceneOptions
 from gsx.core.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
@@ -163,6 +164,11 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
     rule = ResizeRule(filter=options.resize_filter, light=options.resize_light, background=(red, green, blue))
     cache = ImageCache(int(options.cache_gb * 1e9))
     return [_view(shot, options, rule, cache) for shot in shots]
+
+
+def reduction_of(options: SceneOptions) -> Reduction:
+    """How training pictures come from finer ones: by the resize rule."""
+    return Reduction(filter=options.resize_filter, light=options.resize_light)
 
 
 def rgb(background: Sequence[float]) -> tuple[float, float, float]:
