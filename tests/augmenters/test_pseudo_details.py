@@ -384,7 +384,7 @@ def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path
     for scale in (1, 2):
         words = (
             "augmenter=upscale_paper",
-            "augmenter.upscale.weight_map=splatsure",
+            "augmenter.upscale.weight_map=finer",
             f"augmenter.upscale.scales=[{scale}]",
         )
         run = run_at(tmp_path / f"run{scale}", 44, "augmenter=upscale_paper", *words)

@@ -1,6 +1,7 @@
 """Diffusion models as regenerators, on tiny pipelines that are saved and opened as real ones are."""
 
 import json
+import math
 import shutil
 import socket
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from gsx.regenerators.diffusion.options import DiffusionOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
 from gsx.regenerators.diffusion.sizes import grown
+from gsx.regenerators.diffusion.tuning import closest
 
 pytest.importorskip("diffusers", reason="needs gsx[diffusion]")
 pytest.importorskip("peft", reason="needs gsx[diffusion]")
@@ -105,7 +107,7 @@ class Shown:
 
 
 def material(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> Material:
-    """Training views that show pairs' photographs, and a model that shows their renders."""
+    """Training views that show pairs' photographs, and models that show their renders."""
     scene = small_scene(spread(4), views=len(pairs or [1, 2]))
     views = scene.train
     renders: dict[int, Tensor] = {}
@@ -120,6 +122,7 @@ def material(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> 
     return Material(
         views=views,
         render=lambda camera: renders[id(camera)],
+        held_out=lambda share: [render for render, _ in pairs or []],
         step=1,
         seed=0,
         device=torch.device("cpu"),
@@ -618,10 +621,60 @@ def test_an_adapter_that_does_harm_is_not_used(
     figures = tuned.prepare(material(tmp_path, pairs))
     assert not figures["error_tuned"] <= figures["error_raw"]
     assert all(isinstance(value, float) for value in figures.values())
-    assert "tuning does not help" in caplog.text
+    assert "the model stays as it is" in caplog.text
     raw = ready("sdxl_turbo_raw", tmp_path / "raw", model=models["useful"])
     asked = [request(pairs[0][0], 1)]
     assert torch.equal(tuned.regenerate(asked)[0], raw.regenerate(asked)[0])
+
+
+def test_an_adapter_that_beats_the_model_but_not_the_renders_is_not_used(
+    models: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Renders a little too dark: tuning brings them back, and what the autoencoder loses is more than that."""
+    photos = tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1))
+    pairs = [((photo - 0.04).clamp(0, 1), photo) for photo in photos]
+    tuned = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *TUNING, model=models["useful"]))
+    figures = tuned.prepare(material(tmp_path, pairs))
+    assert figures["error_of_renders"] < figures["error_tuned"] < figures["error_raw"]
+    facts = json.loads((tmp_path / "sdxl_turbo" / "adapter.json").read_text())
+    assert (facts["used"], facts["best"]) == (False, "renders")
+    assert "regenerator/restore=identity" in caplog.text
+    raw = ready("sdxl_turbo_raw", tmp_path / "raw", model=models["useful"])
+    asked = [request(pairs[0][0], 1)]
+    assert torch.equal(tuned.regenerate(asked)[0], raw.regenerate(asked)[0])
+
+
+def test_what_is_closest_to_the_photographs() -> None:
+    """Of equals what changes least; what is no number is far off."""
+    for errors, best in (
+        ((3.0, 2.0, 1.0), "tuned"),
+        ((3.0, 1.0, 2.0), "raw"),
+        ((1.0, 3.0, 2.0), "renders"),
+        ((1.0, 1.0, 1.0), "renders"),
+        ((3.0, 1.0, 1.0), "raw"),
+        ((3.0, math.nan, math.nan), "renders"),
+    ):
+        names = ("error_of_renders", "error_raw", "error_tuned")
+        assert closest(dict(zip(names, errors, strict=True))) == best
+
+
+def test_tuning_learns_and_measures_on_held_out_renders(models: dict[str, Path], tmp_path: Path) -> None:
+    """A run whose own renders are the photographs is not measured on these."""
+    pairs = worn(tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1)))
+    few = [*TUNING, "regenerator.restore.tuning.steps=2", "regenerator.restore.tuning.halves=0.4"]
+    given, asked = material(tmp_path, pairs), list[float]()
+    photos = {id(view.camera): view.image() for view in given.views}
+
+    def held_out(share: float) -> list[Tensor]:
+        asked.append(share)
+        return given.held_out(share)
+
+    fitted = replace(given, render=lambda camera: photos[id(camera)], held_out=held_out)
+    figures = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *few, model=models["useful"])).prepare(fitted)
+    assert asked == [0.4]
+    measured = [pairs[n] for n in (2, 6)]  # a quarter of eight, their middles
+    expected = sum(float((a - b)[:, :, 4:36].square().mean()) for a, b in measured) / 2
+    assert figures["error_of_renders"] == pytest.approx(expected, rel=0.02)
 
 
 def test_a_damaged_adapter_is_named(

@@ -12,11 +12,13 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.images import to_uint8
 from gsx.core.regenerator import Material, Regenerator
 from gsx.core.scene import View
+from gsx.regenerators.pairs import held_out_pairs, with_own
 from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer
 
 
 def options(**changes: float) -> RestorerOptions:
     values = {"channels": 8, "steps": 120, "later_steps": 10, "again": 1.0, "batch": 4, "crop": 32, "rate": 3e-3}
+    values["halves"] = 0.35
     return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
 
 
@@ -32,7 +34,13 @@ def material(folder: Path, spoil=blurred, count: int = 8) -> Material:
     views = [View(f"photo{i}", camera(), Photo(stripes(i))) for i in range(count)]
     renders = {view.camera: spoil(view.image()) for view in views}
     return Material(
-        views=views, render=lambda seen: renders[seen], step=40, seed=0, device=torch.device("cpu"), folder=folder
+        views=views,
+        render=lambda seen: renders[seen],
+        held_out=lambda share: list(renders.values()),
+        step=40,
+        seed=0,
+        device=torch.device("cpu"),
+        folder=folder,
     )
 
 
@@ -116,6 +124,46 @@ def test_it_learns_again_when_the_run_has_become_much_longer(tmp_path: Path) -> 
     image = blurred(stripes(0).float() / 255)
     assert not torch.equal(restored(resumed, image), image)
     assert resumed.useful == [True, True]
+
+
+def test_it_learns_from_renders_by_models_that_were_not_fitted_to_the_photographs(tmp_path: Path) -> None:
+    """The run's own renders of its training views show nothing to mend; those of half-models do."""
+    given, asked = material(tmp_path), list[float]()
+    photos = {view.camera: view.image() for view in given.views}
+
+    def held_out(share: float) -> list[Tensor]:
+        asked.append(share)
+        return [blurred(photo) for photo in photos.values()]
+
+    restorer = SceneRestorer(options(halves=0.4))
+    figures = restorer.prepare(replace(given, render=lambda seen: photos[seen], held_out=held_out))
+    assert asked == [0.4]
+    expected = sum(float((blurred(photo) - photo).square().mean()) for photo in list(photos.values())[1::2]) / 4
+    assert figures["error_of_renders_0"] == pytest.approx(expected)
+    assert figures["error_restored_0"] < 0.9 * figures["error_of_renders_0"]
+    assert restorer.useful == [True, True]
+
+
+def test_one_in_seven_renders_is_the_runs_own(tmp_path: Path) -> None:
+    """And of the views that the network learns from alone."""
+    given = material(tmp_path, count=14)
+    numbers = {view.camera: number for number, view in enumerate(given.views)}
+    own = replace(given, render=lambda seen: torch.full((3, 48, 48), float(numbers[seen])))
+    pairs = held_out_pairs(own, 0.3)
+    learnt = with_own(pairs, own, range(1, 14, 2))
+    assert [float(render.max()) for render, _ in learnt[7:]] == [1.0, 13.0]
+    for n, (_, photo) in zip([*range(1, 14, 2), 1, 13], learnt, strict=True):
+        assert torch.equal(photo, given.views[n].image())
+
+
+def test_seeds_share_no_network(tmp_path: Path) -> None:
+    """Nor do the two halves: four beginnings of two seeds differ."""
+    begun = []
+    for seed in (0, 1):
+        restorer = SceneRestorer(options())
+        networks, _ = restorer.recalled(replace(material(tmp_path), seed=seed), [])
+        begun += [network.down[0][0].weight.detach() for network in networks]  # type: ignore[index]
+    assert not any(torch.equal(a, b) for n, a in enumerate(begun) for b in begun[:n])
 
 
 def test_networks_of_another_size_are_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ def material(folder: Path, count: int = 6) -> Material:
     return Material(
         views=views,
         render=lambda seen: torch.zeros(3, seen.height, seen.width),
+        held_out=lambda share: [],
         step=1,
         seed=0,
         device=torch.device("cpu"),

@@ -29,7 +29,7 @@ from gsx.augmenters.cameras import (
 )
 from gsx.augmenters.consistency import consistent_share, exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
-from gsx.augmenters.trust import agreeing, in_bytes, sampled_better
+from gsx.augmenters.trust import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
 from gsx.core.camera import Camera
 from gsx.core.checkpoint import sidecars, step_of
 from gsx.core.errors import ConfigError, InputError, TrainingError
@@ -74,7 +74,7 @@ REDUCTIONS = ("all", "per_scale")
 FROZEN = ("none", "half", "active")
 SEEDS = ("fixed", "per_view")
 PROJECTIONS = ("none", "exact")
-WEIGHT_MAPS = ("none", "splatsure")
+WEIGHT_MAPS: dict[str, WeightMap | None] = {"none": None, "splatsure": seen_alike, "finer": sampled_better}
 CHOICES = {
     "window": WINDOWS,
     "noise": NOISES,
@@ -167,7 +167,8 @@ class PseudoOptions:
     project: str
     """exact: the nearest picture whose box average is its input, of photographs to the last of 8 bits (spec 5.3)."""
     weight_map: str
-    """none, or splatsure: only pixels count whose surface no photograph shows as finely (spec 6.1)."""
+    """none; splatsure: surfaces count that no photograph shows more finely than another (spec 6.1); finer, ours: those
+    that no photograph shows as finely as the pseudo view does."""
     gate: float
     """Pixels do not count whose block's average is further than this from the known photograph, in 8-bit levels; 0:
     all count."""
@@ -703,12 +704,13 @@ class PseudoDetails:
     ) -> UInt8[Tensor, "h w"] | None:
         """How much each pixel counts; None where all count whole."""
         options, trust = self.options, torch.ones(result.shape[1:])
-        if options.weight_map == "splatsure":
+        weights = WEIGHT_MAPS[options.weight_map]
+        if weights is not None:
             run.backbone.begin(max(1, run.step))
             with torch.no_grad():
                 splats = run.backbone.splats(sketch.camera)
             photographs = [view.camera for view in run.scene.train]
-            trust = trust * sampled_better(splats, sketch.camera, photographs, run.raster).cpu()
+            trust = trust * weights(splats, sketch.camera, photographs, run.raster).cpu()
         if options.gate > 0 and request.photo and sketch.scale > 1:
             trust = trust * agreeing(result, sketch.inside.cut(request.image), sketch.scale, options.gate)
         return None if bool((trust == 1).all()) else in_bytes(trust)

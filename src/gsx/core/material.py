@@ -5,13 +5,11 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.evaluate import render_tiled
+from gsx.core.halves import TILE_PIXELS, held_out_renders
 from gsx.core.rasterizer import rasterize
 from gsx.core.regenerator import Material
 from gsx.core.run import Run
 from gsx.core.shapes import Float
-
-TILE_PIXELS = 1 << 20
-"""Pictures are rendered in pieces of this many pixels."""
 
 
 @torch.no_grad()
@@ -33,6 +31,7 @@ def material_of(run: Run, seed: int) -> Material:
     return Material(
         views=run.scene.train,
         render=lambda camera: rendered(run, camera),
+        held_out=lambda share: held_out_renders(run, share, seed),
         step=run.step,
         seed=seed,
         device=run.device,

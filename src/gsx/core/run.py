@@ -1,6 +1,6 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,9 @@ class Run:
     device: torch.device
     generator: torch.Generator
     sampler: Sampler
+    anew: Callable[[Scene, int, torch.Generator], Backbone] | None = None
+    """A backbone of the same options at step 0, for a scene, so many steps and a generator; None: the run is only
+    looked at."""
     augmenters: Sequence[Augmenter] = ()
     ranks: Ranks = Ranks()
     """The processes that train it together."""

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsx import __version__
 from gsx.core import checkpoint, trunk
-from gsx.core.backbone import Beginning
+from gsx.core.backbone import Backbone, Beginning
 from gsx.core.cache import cache_root, source_revision
 from gsx.core.camera import Camera, offsets_from
 from gsx.core.config import Settings, read_config, write_config
@@ -127,8 +127,12 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
-    beginning = Beginning(scene=scene, iterations=general.iterations, device=device, raster=raster, generator=generator)
-    backbone = settings.backbone.component.factory(settings.backbone.options, beginning)
+
+    def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
+        beginning = Beginning(scene=scene, iterations=iterations, device=device, raster=raster, generator=generator)
+        return settings.backbone.component.factory(settings.backbone.options, beginning)
+
+    backbone = anew(scene, general.iterations, generator)
     return Run(
         config=settings.resolved,
         folder=folder,
@@ -140,6 +144,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         device=device,
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
+        anew=anew,
         augmenters=build_augmenters(settings, scene) if training else [],
         ranks=ranks,
     )

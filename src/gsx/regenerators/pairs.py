@@ -5,10 +5,28 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
+from gsx.core.regenerator import Material
 from gsx.core.window import Window
 
 Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, h, w] each, display values."""
+
+
+OWN_EVERY = 6
+"""Of so many pairs to learn from one more shows the run's own render, which is to be left alone more (spec 5.1: 10 to
+20 %)."""
+
+
+def held_out_pairs(material: Material, share: float) -> list[Pair]:
+    """Every training view as a model shows it that was not fitted to it (`Material.held_out`)."""
+    renders = material.held_out(share)
+    return [(render, view.image()) for render, view in zip(renders, material.views, strict=True)]
+
+
+def with_own(pairs: Sequence[Pair], material: Material, numbers: Sequence[int]) -> list[Pair]:
+    """The pairs of training views of these numbers, and beside some of them the run's own renders."""
+    own = [(material.render(material.views[n].camera).cpu(), pairs[n][1]) for n in numbers[::OWN_EVERY]]
+    return [*(pairs[number] for number in numbers), *own]
 
 
 def random_part(pairs: Sequence[Pair], size: tuple[int, int], generator: torch.Generator) -> Pair:

@@ -1,7 +1,7 @@
-"""A restorer learnt from this run: what photographs have that renders of the same views lack (spec 5.2).
+"""A restorer learnt from this scene: what photographs have that renders lack of places nobody photographed (spec 5.2).
 
-Two networks learn from half of the training views each. A picture made beside a training view is restored by the one
-that has not seen that view, so that neither can answer from memory.
+Two networks learn from half of the training views each, rendered by a model that was not fitted to them. A picture made
+beside a training view is restored by the one that has not seen that view, so that neither can answer from memory.
 """
 
 import logging
@@ -17,9 +17,10 @@ from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.regenerator import Material, Request
 from gsx.core.scene import View
+from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.regenerators.classical import refuse_enlarging
-from gsx.regenerators.pairs import Pair, mean_square, random_part
+from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 from gsx.regenerators.scene_sr import begin, read_network
 
 logger = logging.getLogger(__name__)
@@ -41,6 +42,9 @@ class RestorerOptions:
     """At each later one at which it learns; it goes on from there."""
     again: float
     """It learns again at the first event by which the run has become so many times as long as at the last time."""
+    halves: float = 0.35
+    """The models that render what it learns from are trained for this share of the steps that the run has taken. The
+    default: runs older than this option."""
     batch: int
     crop: int
     """Edge of a training crop, px."""
@@ -51,8 +55,8 @@ class RestorerOptions:
             raise ValueError(
                 "regenerator.restore: channels, steps, later_steps, batch must be at least 1, crop at least 16"
             )
-        if not self.rate > 0 or not self.again >= 1:
-            raise ValueError("regenerator.restore: rate must be above 0, again at least 1")
+        if not self.rate > 0 or not self.again >= 1 or not self.halves > 0:
+            raise ValueError("regenerator.restore: rate and halves must be above 0, again at least 1")
 
 
 class Residual(nn.Module):
@@ -107,7 +111,7 @@ class SceneRestorer:
             )
 
     def prepare(self, material: Material) -> dict[str, float]:
-        """Train each network on renders of half of the views, and measure it on the other half.
+        """Train each network on held-out renders of half of the views, and measure it on those of the other half.
 
         One that has become worse there goes back to what it was. One that brings renders of views it has not seen no
         closer to their photographs is not used.
@@ -121,14 +125,14 @@ class SceneRestorer:
         if earlier and material.step < self.options.again * event_of(earlier[-1]):
             return {}
         steps = self.options.later_steps if earlier else self.options.steps
-        pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
+        pairs = held_out_pairs(material, self.options.halves)
         figures: dict[str, float] = {}
         for fold, network in enumerate(self.networks):
-            own = [pair for number, pair in enumerate(pairs) if number % FOLDS == fold]
+            own = with_own(pairs, material, range(fold, len(pairs), FOLDS))
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
             renders, before = mean_square(others), mean_error(network, others)
             former = {name: value.clone() for name, value in network.state_dict().items()}
-            learn(network, own, self.options, steps, material.seed * 1_000_003 + material.step * FOLDS + fold)
+            learn(network, own, self.options, steps, derived_seed("crops", material.seed, material.step, fold))
             after = mean_error(network, others)
             if after > before:
                 network.load_state_dict(former)
@@ -177,8 +181,8 @@ class SceneRestorer:
             InputError: they were of another size.
         """
         networks = [
-            Residual(self.options.channels, torch.Generator().manual_seed(material.seed + fold)).to(material.device)
-            for fold in range(FOLDS)
+            Residual(self.options.channels, generator).to(material.device)
+            for generator in (torch.Generator().manual_seed(derived_seed(material.seed, fold)) for fold in range(FOLDS))
         ]
         found = read_network(earlier[-1]) if earlier else None
         for fold, network in enumerate(networks if found else ()):

@@ -5,7 +5,7 @@ from gsx.core.rasterizer.pieces import Mosaic, rasterize_pieces
 from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
-from gsx.core.rasterizer.visibility import touches
+from gsx.core.rasterizer.visibility import screen_radii, touches
 
 __all__ = [
     "Mosaic",
@@ -16,6 +16,7 @@ __all__ = [
     "rasterize",
     "rasterize_batch",
     "rasterize_pieces",
+    "screen_radii",
     "take_rows",
     "touches",
 ]

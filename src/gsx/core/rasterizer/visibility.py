@@ -1,4 +1,4 @@
-"""Which Gaussians touch the picture at all, without drawing it."""
+"""Which Gaussians touch the picture at all, and how large they are there, without drawing it."""
 
 import torch
 from torch import Tensor
@@ -23,11 +23,33 @@ def touches(
 
     Those that have no such square, because something is out of range, are not held back either: the render counts them.
     """
-    opaque = Splats(
-        means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
-    )
+    opaque = without_colours(means, scales, quats)
     screen = project(opaque, camera, settings)
     first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
     mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     mask.index_fill_(0, screen.ids[on_raster(first, last, camera)], True)
     return mask | ~drawable(opaque, camera, settings) if screen.dropped else mask
+
+
+def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Splats:
+    """Opaque Gaussians of no colour."""
+    return Splats(
+        means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
+    )
+
+
+@torch.no_grad()
+def screen_radii(
+    means: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    camera: Camera,
+    settings: RasterSettings,
+) -> Float[Tensor, "N"]:
+    """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
+    screen = project(without_colours(means, scales, quats), camera, settings)
+    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
+    on = on_raster(first, last, camera)
+    xx, xy, yy = (screen.covariances[on] - settings.dilation * means.new_tensor([1, 0, 1])).unbind(1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], largest.clamp_min(0).sqrt())

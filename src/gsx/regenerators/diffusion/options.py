@@ -115,6 +115,9 @@ class TuningOptions:
     """Crops that are encoded once and learnt from."""
     held_out: float
     """Share of the training views that is only measured on."""
+    halves: float = 0.35
+    """The models that render what it learns from are trained for this share of the steps that the run has taken. The
+    default: runs older than this option."""
     strengths: list[float]
     """Least and greatest of those that the model will be called with."""
     prompt: str
@@ -127,8 +130,8 @@ class TuningOptions:
         where = "regenerator.restore.tuning"
         if self.steps < 0 or self.warm_up < 0 or min(self.rank, self.batch, self.crops, self.crop) < 1:
             raise ValueError(f"{where}: rank, batch, crop and crops must be at least 1, steps and warm_up at least 0")
-        if not self.rate > 0 or not 0 < self.held_out < 1 or self.seconds < 0:
-            raise ValueError(f"{where}: rate must be above 0, held_out between 0 and 1, seconds at least 0")
+        if not (self.rate > 0 and self.halves > 0) or not 0 < self.held_out < 1 or self.seconds < 0:
+            raise ValueError(f"{where}: rate and halves must be above 0, held_out between 0 and 1, seconds at least 0")
         if len(self.strengths) != 2 or not 0 < self.strengths[0] <= self.strengths[1] <= 1:
             raise ValueError(f"{where}.strengths is {list(self.strengths)}; give the least and the greatest, up to 1")
 

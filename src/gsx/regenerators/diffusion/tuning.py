@@ -1,4 +1,4 @@
-"""A LoRA for one scene: the model learns to take renders of this run to their photographs (spec 5.1).
+"""A LoRA for one scene: the model learns to take renders of unseen views to their photographs (spec 5.1).
 
 It is trained as it will be called: the render's latent, noised as little as the strengths of the run allow, is to
 become the photograph's in the one step that image-to-image executes.
@@ -32,13 +32,18 @@ from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
 from gsx.regenerators.diffusion.pace import Pace
 from gsx.regenerators.diffusion.recipes import Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.sizes import grown
-from gsx.regenerators.pairs import Pair, mean_square, random_part
+from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 
 logger = logging.getLogger(__name__)
 
 ADAPTERS = "lora"
 """Kind of the adapters in the cache."""
 WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
+REASONS = {
+    "raw": "tuning does not help on held-out renders",
+    "renders": "held-out renders are closest to their photographs as they are (regenerator/restore=identity)",
+}
+"""Why an adapter is not merged, by what is closest to the photographs."""
 WEIGHT_DECAY = 1e-2
 LARGEST_NORM = 1.0
 """To which gradients are clipped (spec 5.1)."""
@@ -53,17 +58,27 @@ class Tuned:
     figures: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pairs:
+    """Renders and photographs of training views."""
+
+    own: Sequence[Pair]
+    """To learn from."""
+    others: Sequence[Pair]
+    """To measure on: the middles of views that are not learnt from."""
+
+
 def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, material: Material, files: str) -> Tuned:
     """Merge the adapter of this scene into a model: the run's own, one from the cache, or a new one.
 
-    An adapter that brings held-out renders no closer to their photographs than the model as it was is not used.
+    It must bring held-out renders closer to their photographs than the model as it was does, and than they are.
 
     Raises:
         TrainingError: it cannot be learnt or read; the run keeps its checkpoint.
     """
     own = material.folder / options.name
     if not (own / FACTS).is_file():
-        pairs = [(material.render(view.camera).cpu(), view.image()) for view in material.views]
+        pairs = divided(material, options.tuning)
         shared = cache_folder(ADAPTERS, key_of(pairs, options, material, files))
         if not adopted(shared, own):
             new_adapter(pipe.to(material.device), options, recipe, material, pairs, files, own)
@@ -86,10 +101,10 @@ def refuse_another(facts: dict[str, Any], folder: Path, options: RestorerOptions
         )
 
 
-def key_of(pairs: Sequence[Pair], options: RestorerOptions, material: Material, files: str) -> str:
+def key_of(pairs: Pairs, options: RestorerOptions, material: Material, files: str) -> str:
     """Of everything that decides what is learnt."""
     digest = hashlib.sha256()
-    for part in (image for pair in pairs for image in pair):
+    for part in (image for pair in (*pairs.own, *pairs.others) for image in pair):
         digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
     machine = (code_stamp(), version("peft"), *machine_stamp(material.device))
     telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
@@ -101,16 +116,16 @@ def new_adapter(
     options: RestorerOptions,
     recipe: Recipe,
     material: Material,
-    pairs: Sequence[Pair],
+    pairs: Pairs,
     files: str,
     folder: Path,
 ) -> None:
     """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder."""
-    own, others = divided(pairs, options.tuning)
+    others = pairs.others
     figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, recipe, others)}
     begun = time.perf_counter()
     try:
-        whole = learn(pipe, options, recipe, own, material.seed)
+        whole = learn(pipe, options, recipe, pairs.own, material.seed)
     except (RuntimeError, ValueError) as error:
         raise TrainingError(
             f"regenerator {options.name} cannot be tuned ({type(error).__name__}: {error}): lower "
@@ -120,17 +135,16 @@ def new_adapter(
     figures["error_tuned"] = error_of(pipe, options, recipe, others)
     weights = adapter_bytes(pipe)
     pipe.unet.delete_adapters("default")
-    used = figures["error_tuned"] < figures["error_raw"]
-    if not used:
-        logger.warning("%s: tuning does not help on held-out views, the model stays as it is", options.name)
-    if figures["error_tuned"] >= figures["error_of_renders"]:
-        logger.warning("%s takes held-out renders further from their photographs", options.name)
+    best = closest(figures)
+    if best != "tuned":
+        logger.warning("%s: %s, the model stays as it is", options.name, REASONS[best])
     folder.mkdir(parents=True, exist_ok=True)
     replace_file(folder / WEIGHTS, weights)
     write_json(
         folder / FACTS,
         {
-            "used": used,
+            "used": best == "tuned",
+            "best": best,
             "whole": whole,
             "figures": figures,
             "sha256": hashlib.sha256(weights).hexdigest(),
@@ -144,16 +158,24 @@ def new_adapter(
     )
 
 
+def closest(figures: dict[str, float]) -> str:
+    """What is closest to the photographs of held-out renders: tuned, raw, or the renders; the last of equals."""
+    errors = {"renders": figures["error_of_renders"], "raw": figures["error_raw"], "tuned": figures["error_tuned"]}
+    return min(errors, key=lambda name: errors[name] if math.isfinite(errors[name]) else math.inf)
+
+
 # -- pairs -------------------------------------------------------------------------------------------------------------
 
 
-def divided(pairs: Sequence[Pair], options: TuningOptions) -> tuple[list[Pair], list[Pair]]:
-    """(pairs to learn from, the middles of pairs to measure on), the latter spread evenly over the views."""
+def divided(material: Material, options: TuningOptions) -> Pairs:
+    """Held-out renders of most training views, and of others, spread evenly over the views, to measure on."""
+    pairs = held_out_pairs(material, options.halves)
     every = max(2, round(1 / options.held_out))
-    first = min(every, len(pairs)) // 2
-    held = set(range(first, len(pairs), every))
-    own = [pair for number, pair in enumerate(pairs) if number not in held]
-    return own, [middle(pairs[number], options.crop) for number in sorted(held)]
+    measured = range(min(every, len(pairs)) // 2, len(pairs), every)
+    learnt = [number for number in range(len(pairs)) if number not in measured]
+    return Pairs(
+        own=with_own(pairs, material, learnt), others=[middle(pairs[number], options.crop) for number in measured]
+    )
 
 
 def middle(pair: Pair, crop: int) -> Pair:
