@@ -213,10 +213,10 @@ def test_what_too_few_cameras_would_draw_is_not_made() -> None:
 def test_a_child_without_a_place_is_not_made(place: float) -> None:
     backbone = small_octree()
     raw = raw_of(backbone)
-    kept = chosen_places(raw, torch.ones(len(raw["means"])), levels_of(backbone), 10**6)
+    seen = kept(levels_of(backbone), raw["means"], raw["level"])
     raw["means"][5, 1] = place
-    kept[5] = False
-    assert torch.equal(chosen_places(raw, torch.ones(len(kept)), levels_of(backbone), 10**6), kept)
+    seen[5] = False
+    assert torch.equal(kept(levels_of(backbone), raw["means"], raw["level"]), seen)
 
 
 def test_room_goes_to_the_largest_gradients_of_those_that_are_seen() -> None:
