@@ -6,9 +6,10 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -144,6 +145,8 @@ class AnchorOptions:
     levels: LevelOptions | None
     decay_until: int = 0
     """Published step at which learning rates have come down; 0: at the end of the run."""
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
@@ -160,7 +163,7 @@ class AnchorOptions:
         Raises:
             ValueError: a value is unknown.
         """
-        return resolved(self.quirks, self.fidelity)
+        return resolved(self.quirks, self.fidelity, self.reference)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,10 +191,7 @@ class ExplicitOptions(AnchorOptions):
     sh_every: int
     """Published steps between SH degrees."""
     initial_opacity: float
-
-    def switches(self) -> Quirks:
-        """As above; the reference, Octree-AnyGS, restricts bias to the level at hand."""
-        return resolved(self.quirks, self.fidelity, {"bias": "level"})
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})
 
 
 def neural_anchors(options: NeuralOptions, beginning: Beginning) -> "Anchors":

@@ -387,8 +387,8 @@ def refuse_unknown_roles(config: Any) -> None:
         role = node.get("role") if isinstance(node, dict) and "checks" in node else None
         if known and role is not None and role not in known:
             raise ConfigError(
-                f"augmenter.{name}.role: no regenerator is chosen for '{role}', there are {', '.join(known)}: take one of "
-                f"these, or add regenerator/{role}=NAME and +checks/strict@checks.{role}.{nearest(role, known)}"
+                f"augmenter.{name}.role: no regenerator is chosen for '{role}', there are {', '.join(known)}: take one "
+                f"of them, or add regenerator/{role}=NAME and +checks/strict@checks.{role}.{nearest(role, known)}"
             )
 
 
