@@ -507,6 +507,29 @@ def test_the_gate_opens_when_all_levels_train(quirk: str, step: int, opens: bool
     assert bool(backbone.table["bias"].any()) == opens
 
 
+@pytest.mark.parametrize(("name", "bias", "half_cell"), [
+    ("octree_scaffold", "all", True), ("octree_gs3d", "level", False),
+])  # fmt: skip
+def test_fidelity_reaches_the_switches_of_levels_and_of_each_reference(name: str, bias: str, half_cell: bool) -> None:
+    """Octree-AnyGS keeps bias at the level at hand and has no half cell; sane is the same for both."""
+    for word, wanted in (
+        ("fidelity=reference", (bias, half_cell)),
+        ("fidelity=sane", ("own", False)),
+        ("quirks.bias=all", ("all", half_cell)),
+    ):
+        backbone = small_anchors(name, word)
+        assert backbone.levels is not None
+        assert (backbone.quirks.bias, backbone.levels.half_cell) == wanted
+    points = torch.tensor([[3.0, 3, 3], [4.0, 4, 4], [3.5, 3.2, 3.9]]).repeat(10, 1) + spread(30) / 8
+    origins = {
+        word: small_anchors(name, word, scene=small_scene(points)).levels.origin
+        for word in ("fidelity=reference", "fidelity=sane", "levels.extend_rule=sane")
+    }
+    low, high = float(points.min()), float(points.max())
+    assert origins["fidelity=reference"] == pytest.approx(1.1 * low)
+    assert origins["fidelity=sane"] == origins["levels.extend_rule=sane"] == pytest.approx(low - 0.05 * (high - low))
+
+
 def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
     backbone = small_anchors("octree_scaffold")
     with torch.no_grad():

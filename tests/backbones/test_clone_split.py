@@ -37,9 +37,7 @@ from gsx.core.scene import Scene
 from gsx.core.session import execute, open_run
 
 WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
-CONTROL = LevelDensityOptions(
-    update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, gate=False, volume_weight=0.01
-)
+CONTROL = LevelDensityOptions(update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, volume_weight=0.01)
 
 
 @cache
@@ -215,10 +213,10 @@ def test_what_too_few_cameras_would_draw_is_not_made() -> None:
 def test_a_child_without_a_place_is_not_made(place: float) -> None:
     backbone = small_octree()
     raw = raw_of(backbone)
-    kept = chosen_places(raw, torch.ones(len(raw["means"])), levels_of(backbone), 10**6)
+    seen = kept(levels_of(backbone), raw["means"], raw["level"])
     raw["means"][5, 1] = place
-    kept[5] = False
-    assert torch.equal(chosen_places(raw, torch.ones(len(kept)), levels_of(backbone), 10**6), kept)
+    seen[5] = False
+    assert torch.equal(kept(levels_of(backbone), raw["means"], raw["level"]), seen)
 
 
 def test_room_goes_to_the_largest_gradients_of_those_that_are_seen() -> None:
@@ -281,11 +279,13 @@ def test_events_come_every_hundred_steps_of_their_window(step: int, happens: boo
     assert bool(due(step=step).adapt(step)) == happens
 
 
-@pytest.mark.parametrize(("gate", "step", "split"), [
-    (False, 1600, 2), (True, 1600, 0), (True, 10000, 0), (True, 10100, 2),
+@pytest.mark.parametrize(("word", "step", "split"), [
+    ("fidelity=reference", 1600, 2), ("quirks.gate=open", 1600, 2),
+    ("quirks.gate=closed", 1600, 0), ("quirks.gate=closed", 10000, 0), ("quirks.gate=closed", 10100, 2),
+    ("fidelity=sane", 1600, 0), ("fidelity=sane", 10100, 2),
 ])  # fmt: skip
-def test_the_gate_keeps_splits_until_all_levels_train(gate: bool, step: int, split: int) -> None:
-    backbone = due(f"clone_split.level_density.gate={gate}", step=step)
+def test_the_gate_keeps_splits_until_all_levels_train(word: str, step: int, split: int) -> None:
+    backbone = due(word, step=step)
     done = backbone.adapt(step)
     assert (done["cloned"], done["split"]) == (2, split)
     assert bool(backbone.table["bias"][3] > 0) == (split > 0)
@@ -293,7 +293,7 @@ def test_the_gate_keeps_splits_until_all_levels_train(gate: bool, step: int, spl
 
 def test_splits_that_wait_take_no_room() -> None:
     count = len(small_octree().table)
-    done = due("clone_split.level_density.gate=true", f"max_primitives={count + 1}").adapt(1600)
+    done = due("quirks.gate=closed", f"max_primitives={count + 1}").adapt(1600)
     assert (done["cloned"], done["split"]) == (1, 0)
 
 
@@ -304,6 +304,31 @@ def test_the_cap_is_never_passed() -> None:
     assert "withheld" not in free
     more = free["cloned"] + free["split"] - 1
     assert done == {"cloned": 0, "split": 1, "pruned": 0, "withheld": more}  # the largest gradient comes first
+
+
+@pytest.mark.parametrize(("word", "bias"), [
+    ("fidelity=reference", 1.005), ("fidelity=sane", 1.0), ("quirks.bias=own", 1.0), ("quirks.bias=level", 1.005),
+])  # fmt: skip
+def test_bias_has_a_limit_where_the_reference_has_none(word: str, bias: float) -> None:
+    backbone = due(word, "quirks.gate=open")
+    backbone.table["bias"][3] = 0.995
+    backbone.adapt(1600)
+    assert float(backbone.table["bias"][3]) == pytest.approx(bias)
+
+
+def test_fidelity_reaches_every_switch_of_the_second_form() -> None:
+    """Those of the reference, and what levels leave open; what means nothing here is refused."""
+    found = {}
+    for fidelity in ("reference", "sane"):
+        given = free_gaussians(options_of(f"fidelity={fidelity}", "levels.half_cell=null"))
+        assert given.quirks is not None
+        assert given.levels is not None
+        found[fidelity] = (given.quirks.gate, given.quirks.bias, given.levels.extend_rule, given.levels.half_cell)
+    assert found == {"reference": ("open", "level", "reference", True), "sane": ("closed", "own", "sane", False)}
+    with pytest.raises(
+        ConfigError, match=r"quirks\.promoted is 'max', which means nothing to densification=clone_split"
+    ):
+        options_of("quirks.promoted=max")
 
 
 @pytest.mark.parametrize(("step", "pruned"), [(3000, 1), (3100, 3)])

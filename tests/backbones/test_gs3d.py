@@ -43,7 +43,7 @@ def hand_made(
         table["quats"].normal_(generator=torch.Generator().manual_seed(2))
         table["log_scales"].copy_(torch.tensor(scales).log()[:, None] + torch.tensor([0.0, -0.5, -1.0]))
         table["opacity_logits"].copy_(torch.tensor([logit(o) for o in opacities or [0.5] * count]))
-    seen = torch.full((count,), 2, dtype=torch.int32)
+    seen = torch.full((count,), 2.0)
     backbone.statistics = Statistics(2 * torch.tensor(gradients), seen)
     return backbone
 

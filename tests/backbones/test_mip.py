@@ -78,7 +78,7 @@ def row_values(
         table["sh_constant"].copy_(torch.arange(count)[:, None, None].expand(-1, 1, 3))
         table["log_scales"].copy_(torch.tensor(scales).log()[:, None] + torch.tensor([0.0, -0.5, -1.0]))
         table["opacity_logits"].copy_((opacity / (1 - opacity)).log())
-    seen = torch.full((count,), 2, dtype=torch.int32)
+    seen = torch.full((count,), 2.0)
     sums = 2 * torch.tensor(list(gradients) or [0.0] * count)
     backbone.statistics = Statistics(sums, seen, 2 * torch.tensor(absolute) if absolute else None)
     return backbone

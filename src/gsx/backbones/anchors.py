@@ -6,9 +6,10 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -39,6 +40,7 @@ from gsx.backbones.levels import (
     derive,
     drawn,
     facts_of,
+    faithful,
     initial_nodes,
     note_of,
     warnings_of,
@@ -143,15 +145,25 @@ class AnchorOptions:
     levels: LevelOptions | None
     decay_until: int = 0
     """Published step at which learning rates have come down; 0: at the end of the run."""
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
 
     def __post_init__(self) -> None:
         checked_filter(self.filter)
         checked_end(self.levels, self.published_iterations)
-        resolved(self.quirks, self.fidelity)
+        self.switches()
         if self.max_primitives < 0:
             raise ValueError(f"backbone.max_primitives is {self.max_primitives}; give a number, or 0 for no cap")
         if self.voxel < 0:
             raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
+
+    def switches(self) -> Quirks:
+        """All quirks decided, by themselves or by the fidelity.
+
+        Raises:
+            ValueError: a value is unknown.
+        """
+        return resolved(self.quirks, self.fidelity, self.reference)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +191,7 @@ class ExplicitOptions(AnchorOptions):
     sh_every: int
     """Published steps between SH degrees."""
     initial_opacity: float
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})
 
 
 def neural_anchors(options: NeuralOptions, beginning: Beginning) -> "Anchors":
@@ -232,7 +245,7 @@ class Anchors:
             head_rates,
             sh,
         )
-        self.quirks = resolved(options.quirks, options.fidelity)
+        self.quirks = options.switches()
         self.extent, self.generator, self.device = scene.extent, beginning.generator, beginning.device
         self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
         self.cameras = [view.camera for view in scene.train]
@@ -264,12 +277,12 @@ class Anchors:
         self, points: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "N 3"], dict[str, Tensor], Int[Tensor, "Q"], Int[Tensor, "Q"]]:
         """(positions, columns of levels, anchor and point of each point-anchor pair)."""
-        if self.options.levels is None:
+        options = faithful(self.options.levels, self.options.fidelity)
+        if options is None:
             self.voxel = self.options.voxel or automatic_voxel(points, self.quirks.voxel == "squared")
             positions, owner = voxel_nodes(points, self.voxel)
             return positions, {}, owner, torch.arange(len(points))
-        until = all_levels_from(self.options.levels, self.schedule)
-        self.levels = derive(points, self.cameras, self.options.levels, until)
+        self.levels = derive(points, self.cameras, options, all_levels_from(options, self.schedule))
         positions, of, group = initial_nodes(points, self.levels)
         for warning in warnings_of(self.levels, len(of)):
             logger.warning("%s", warning)

@@ -30,8 +30,6 @@ class LevelDensityOptions:
     """By how much, in levels."""
     shrink: float
     """A child's scale is its parent's times this."""
-    gate: bool
-    """Split only once all levels take part in training, as the reference means to but does not."""
     volume_weight: float
     """Of the mean volume of the Gaussians drawn, in the loss."""
 
@@ -125,6 +123,7 @@ def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def bias_levels(table: Table, biased: Bool[Tensor, "N"], step: float) -> None:
-    """Let Gaussians with fair gradients be drawn from a little farther."""
+def bias_levels(table: Table, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
+    """Let Gaussians with fair gradients be drawn from a little farther, by at most so many levels."""
     table["bias"][: len(biased)] += step * biased
+    table["bias"].clamp_max_(most)

@@ -5,8 +5,9 @@ gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -71,10 +72,11 @@ class Quirks:
     voxel: str
     """squared: the automatic voxel is the median mean SQUARED neighbour distance (Scaffold-GS); distance: its root."""
     gate: str
-    """open: promotion and bias from the first growth (a bug of Octree-GS); closed: once all levels are in training."""
+    """open: promotion and bias from the first growth (a bug of Octree-GS); closed: once all levels are in training.
+    Of free Gaussians: splits and their bias."""
     bias: str
     """all: bias also anchors of other levels, without limit (Octree-GS); level: of the level at hand, without limit
-    (Octree-AnyGS); own: of the level at hand, at most 1."""
+    (Octree-AnyGS, GSOctree); own: of the level at hand, at most 1."""
     finest: str
     """bounded: the strongest gradients of the finest level grow nothing (Octree-GS); open: they do."""
     promoted: str
@@ -98,15 +100,16 @@ SANE = {name: values[1] for name, values in CHOICES.items()} | {"duplicates": "n
 FIDELITIES = {"reference": {name: values[0] for name, values in CHOICES.items()}, "sane": SANE}
 
 
-def resolved(quirks: Quirks, fidelity: str) -> Quirks:
-    """Every switch that is '' as the fidelity has it.
+def resolved(quirks: Quirks, fidelity: str, published: Mapping[str, str] = MappingProxyType({})) -> Quirks:
+    """Every switch that is '' as the fidelity has it; `published`: where the reference at hand differs from `CHOICES`.
 
     Raises:
         ValueError: a value is unknown; it and the known ones are named.
     """
     if fidelity not in FIDELITIES:
         raise ValueError(f"backbone.fidelity is '{fidelity}'; choose {' or '.join(FIDELITIES)}")
-    values = {name: value or FIDELITIES[fidelity][name] for name, value in vars(quirks).items()}
+    asked = {**FIDELITIES[fidelity], **(published if fidelity == "reference" else {})}
+    values = {name: value or asked[name] for name, value in vars(quirks).items()}
     for name, value in values.items():
         if value not in CHOICES[name]:
             raise ValueError(f"backbone.quirks.{name} is '{value}'; choose {' or '.join(CHOICES[name])}")

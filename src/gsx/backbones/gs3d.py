@@ -20,6 +20,7 @@ from gsx.backbones.clone_split import (
     stacked,
     starting_points,
 )
+from gsx.backbones.growth import Quirks
 from gsx.backbones.levels import (
     LevelOptions,
     Levels,
@@ -130,6 +131,8 @@ class GS3DOptions:
     levels: LevelOptions | None = None
     """Levels of detail (Octree-GS), with density control across them; None: every camera draws everything."""
     level_density: LevelDensityOptions | None = None
+    quirks: Quirks | None = None
+    """With levels: the switches of their reference, of which `gate` and `bias` concern free Gaussians."""
     decay_until: int = 0
     """Published step at which the rate of the means has come down; 0: at the end of the run."""
 
@@ -144,9 +147,9 @@ class GS3DOptions:
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
         checked_end(self.levels, self.published_iterations)
-        if (self.levels is None) != (self.level_density is None):
+        if len({part is None for part in (self.levels, self.level_density, self.quirks)}) > 1:
             raise ValueError(
-                "backbone.levels and backbone.level_density belong together: give both, or take backbone=gs3d for none"
+                "backbone.levels, level_density and quirks belong together: give all, or take backbone=gs3d for none"
             )
 
 
@@ -404,8 +407,9 @@ class GS3D:
 
     def densify_levels(self, step: int, levels: Levels) -> dict[str, int]:
         """Copies of small Gaussians on their level, children of large ones a level finer, then prune (spec 4B)."""
-        density, control = self.options.density, self.options.level_density
+        density, control, quirks = self.options.density, self.options.level_density, self.options.quirks
         assert control is not None
+        assert quirks is not None
         gradient, level = self.statistics.mean_gradient(), self.table["level"]
         raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
         verdict = judged(
@@ -416,14 +420,14 @@ class GS3D:
             control,
             threshold=density.gradient,
             large=density.split_extent * self.extent,
-            splitting=not control.gate or self.highest() == levels.count - 1,
+            splitting=quirks.gate == "open" or self.highest() == levels.count - 1,
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
         children_made = small_children(raw, split, levels, control.shrink, self.generator)
         new = stacked([clones(raw, cloned), children_made])
         seen = kept(levels, new["means"], new["level"])
         keep = within_room(seen, gradient[torch.cat([cloned, split])], self.room())
-        bias_levels(self.table, verdict.biased, control.bias_step)
+        bias_levels(self.table, verdict.biased, control.bias_step, 1.0 if quirks.bias == "own" else math.inf)
         append_rows(self.table, {name: value[keep] for name, value in new.items()})
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)

@@ -54,14 +54,15 @@ class LevelOptions:
     """The box is the points' range of coordinates times this (spec 3.2)."""
     extend_rule: str
     """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
-    box grows on both sides wherever it lies, to the same length (spec 3.2)."""
+    box grows on both sides wherever it lies, to the same length (spec 3.2); '': as backbone.fidelity says."""
     visible_threshold: float
     """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
     fraction (spec 3.4)."""
     mode: str
     """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (spec 3.7)."""
-    half_cell: bool
-    """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5)."""
+    half_cell: bool | None
+    """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5); None: as
+    backbone.fidelity says."""
     zoom: str
     """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
     reference does, trained there or not; training: none that the finest training camera would not draw."""
@@ -71,9 +72,9 @@ class LevelOptions:
     """Each interval between two levels is this much shorter than the one before (spec 3.6)."""
 
     def __post_init__(self) -> None:
-        threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES)
+        threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES) + ", or '' for backbone.fidelity's"
         self.demand("mode", self.mode in MODES, f"choose {', '.join(MODES)}")
-        self.demand("extend_rule", self.extend_rule in EXTEND_RULES, f"choose {rules}")
+        self.demand("extend_rule", self.extend_rule in ("", *EXTEND_RULES), f"choose {rules}")
         self.demand("zoom", self.zoom in ZOOM_RULES, f"choose {', '.join(ZOOM_RULES)}")
         self.demand("fork", self.fork >= 2, "give at least 2")
         self.demand("count", self.count == -1 or self.count >= 1, "give at least 1, or -1 to take it from the scene")
@@ -89,6 +90,14 @@ class LevelOptions:
         """Refuse a value that does not meet a condition."""
         if not met:
             raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
+
+
+def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None:
+    """The options, with the switches of the reference's quirks that they leave open as the fidelity has them."""
+    if options is None:
+        return None
+    half_cell = fidelity == "reference" if options.half_cell is None else options.half_cell
+    return replace(options, extend_rule=options.extend_rule or fidelity, half_cell=half_cell)
 
 
 def checked_end(options: LevelOptions | None, published: int) -> None:
@@ -222,7 +231,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         switches=switch_points(count, first, until, options.coarse_factor),
         threshold=options.visible_threshold,
         mode=options.mode,
-        half_cell=options.half_cell,
+        half_cell=bool(options.half_cell),
         zoom=options.zoom,
         views=views,
     )

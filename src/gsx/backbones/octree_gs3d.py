@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
 from gsx.backbones.clone_split import LevelDensityOptions
 from gsx.backbones.gs3d import GS3D, Density, GS3DOptions, Rates
+from gsx.backbones.levels import faithful
 from gsx.core.backbone import Beginning
 
 FORMS = ("anchors", "clone_split")
+QUIRKS = ("gate", "bias")
+"""Quirks of the reference that the second form has, too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +48,18 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
     """The options of the second form.
 
     Raises:
-        ValueError: something that it needs is missing.
+        ValueError: something that it needs is missing, or a switch is set that it does not have.
     """
     own = options.clone_split
     if own is None or options.levels is None:
         missing = "levels" if options.levels is None else "clone_split"
         raise ValueError(f"backbone.{missing} is null, and densification is clone_split; without levels: backbone=gs3d")
+    idle = [name for name, value in vars(options.quirks).items() if value and name not in QUIRKS]
+    if idle:
+        raise ValueError(
+            f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which means nothing to "
+            f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
+        )
     return GS3DOptions(
         name=options.name,
         filter=options.filter,
@@ -62,8 +71,9 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
         rates=own.rates,
         density=own.density,
         mip=options.mip,
-        levels=options.levels,
+        levels=faithful(options.levels, options.fidelity),
         level_density=own.level_density,
+        quirks=options.switches(),
         decay_until=options.decay_until,
     )
 

@@ -345,6 +345,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     """
     config = OmegaConf.create(config)
     refuse_unknown_scene(config)
+    refuse_unknown_roles(config)
     try:
         raw = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
@@ -375,6 +376,20 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
         resolved={key: value for key, value in raw.items() if key not in ("experiment", "checks")},  # type: ignore[misc]
     )
+
+
+def refuse_unknown_roles(config: Any) -> None:
+    """Raise ConfigError if an augmenter that checks pictures takes the role of no regenerator."""
+    raw = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(raw, dict)
+    known = list(raw.get("checks") or {})
+    for name, node in named_nodes(raw.get("augmenter"), "augmenter").items():
+        role = node.get("role") if isinstance(node, dict) and "checks" in node else None
+        if known and role is not None and role not in known:
+            raise ConfigError(
+                f"augmenter.{name}.role: no regenerator is chosen for '{role}', there are {', '.join(known)}: take one "
+                f"of them, or add regenerator/{role}=NAME and +checks/strict@checks.{role}.{nearest(role, known)}"
+            )
 
 
 def refuse_unknown_scene(config: Any) -> None:
