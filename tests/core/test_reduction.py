@@ -7,7 +7,7 @@ from torch import Tensor
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.core.images import display_from_linear, resize, to_uint8
 from gsx.core.metrics import psnr
-from gsx.core.reduction import Reduction, projected
+from gsx.core.reduction import ENOUGH, Reduction, projected
 
 FILTERS = ["area", "bicubic", "lanczos"]
 
@@ -73,7 +73,7 @@ def test_the_projection_is_the_nearest_picture_that_reduces_to_the_given_one(nam
     missing = low.flatten() - dense @ fine.flatten()
     nearest = fine.flatten() + dense.T @ torch.linalg.solve(dense @ dense.T, missing)
     torch.testing.assert_close(found.flatten(), nearest, rtol=0, atol=2e-4)
-    torch.testing.assert_close(reduction.reduce(found, factor), low, rtol=0, atol=1e-4)
+    torch.testing.assert_close(reduction.reduce(found, factor), low, rtol=0, atol=ENOUGH)
 
 
 @pytest.mark.parametrize("light", ["display", "linear"])

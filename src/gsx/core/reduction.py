@@ -13,9 +13,12 @@ from torch.nn.functional import avg_pool2d, conv2d, conv_transpose2d
 from gsx.core.images import FILTERS, KERNELS, LIGHTS, REACH, display_from_linear, linear_from_display
 from gsx.core.shapes import Float
 
-BOX_ROUNDS, ROUNDS = 5, 30
-"""Rounds of projection and clamping: box averages need none but for clamping, each halves what that undid (spec 5.3);
-other filters take the error of the finest detail of the coarse picture down by a quarter in each, others by more."""
+ROUNDS = 15
+"""Rounds of projection and clamping, at most."""
+ENOUGH = 0.02 / 255
+"""A picture that reduces to values as close as this to the given ones is projected."""
+PACE, MEMORY = 1.73, 0.139
+"""Heavy ball (Polyak 1964) for a^2 D D^T with eigenvalues from 0.227 to 1.09: those of both filters at any factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +69,8 @@ class Reduction:
 
     def adjoint(self, low: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
         """D^T: <D x, y> = <x, D^T y>."""
+        if self.filter == "area":
+            return low.repeat_interleave(factor, -2).repeat_interleave(factor, -1) / factor**2
         planes = low.reshape(-1, 1, *low.shape[-2:])
         weights, margin = self.weights(factor, low)
         rows, columns = (self.sums(side, factor, low) for side in low.shape[-2:])
@@ -77,8 +82,6 @@ class Reduction:
 
     def weights(self, factor: int, like: Tensor) -> tuple[Float[Tensor, "L"], int]:
         """(what a coarse pixel takes of fine ones in a row, how many of these lie beyond its block on each side)."""
-        if self.filter == "area":
-            return torch.full((factor,), 1 / factor, dtype=like.dtype, device=like.device), 0
         reach = REACH[self.filter]
         margin = reach * factor - factor // 2
         distance = (torch.arange(factor + 2 * margin, dtype=torch.float64) + 0.5 - margin) / factor - 0.5
@@ -102,13 +105,19 @@ def projected(
 ) -> Float[Tensor, "*C H W"]:
     """The nearest picture that reduces to the given one, clamped to [0, 1]; nearest in light where light is reduced.
 
-    Errors are spread by the adjoint, round after round: of box averages one would do, since D D^T = I / a^2.
+    Errors are spread by the adjoint, round after round; of box averages the first does it, since D D^T = I / a^2, and
+    later ones halve what clamping undid.
     """
     if reduction.light == "linear":
         in_light = Reduction(filter=reduction.filter)
         fine, given = linear_from_display(image.clamp(0, 1)), linear_from_display(low.clamp(0, 1))
         return display_from_linear(projected(fine, given, factor, in_light))
-    for _ in range(BOX_ROUNDS if reduction.filter == "area" else ROUNDS):
+    pace, memory = (1.0, 0.0) if reduction.filter == "area" else (PACE, MEMORY)
+    before = image
+    for _ in range(ROUNDS):
         off = low - reduction.reduce(image, factor)
-        image = (image + factor**2 * reduction.adjoint(off, factor)).clamp(0, 1)
-    return image
+        if float(off.abs().max()) < ENOUGH:
+            break
+        onward = image + pace * factor**2 * reduction.adjoint(off, factor) + memory * (image - before)
+        before, image = image, onward.clamp(0, 1)
+    return image.clamp(0, 1)
