@@ -339,4 +339,4 @@ def test_figures_by_scale_are_in_the_evaluation(folder: Path, tmp_path: Path) ->
     assert evaluation["psnr"] == pytest.approx(sum(by_scale) / 2)
     assert "<td>x1/2</td>" in (tmp_path / "run" / "report.html").read_text()
     again, judging = open_run(tmp_path / "run", plugins(), ["scene.cache_gb=0"])  # nothing is shared
-    assert Evaluator(again, judging.evaluation).zoom(0.5) == evaluation["zoom"]["0.5"]
+    assert Evaluator(again, judging.evaluation).evaluate()["zoom"]["0.5"] == evaluation["zoom"]["0.5"]
