@@ -11,7 +11,8 @@ from gsx.core.errors import ConfigError
 from gsx.core.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant"})  # those: test_variants.py
+GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks"})
+"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py."""
 NEEDS = {
     ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
     ("preset", "octree"): ("backbone=octree_scaffold",),

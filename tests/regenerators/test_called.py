@@ -46,7 +46,8 @@ def test_projection_saves_pictures_of_an_upscaler_that_strays(tmp_path: Path) ->
     """Of photographs and of renders; without it the run ends, and says what to set."""
     words = ["augmenter=upscale_paper", "iterations=12", "regenerator/upscale=callable"]
     words += ["regenerator.upscale.function=test_called:stray"]
-    with pytest.raises(TrainingError, match=r"differs from its input.*augmenter.upscale.project=exact"):
+    words += [f"augmenter.upscale.checks.agreement.{word}" for word in ("action=drop", "limit=30")]
+    with pytest.raises(TrainingError, match=r"dB from its input.*augmenter.upscale.project=exact"):
         tiny_run(tmp_path / "strays", words)
     tiny_run(tmp_path / "projected", [*words, "augmenter.upscale.project=exact"])
     made = json.loads((tmp_path / "projected" / "pseudo" / "index.json").read_text())["views"]
