@@ -12,8 +12,8 @@ from gsx.core.camera import Camera, look_at
 from gsx.core.config import typed
 from gsx.core.images import to_uint8
 from gsx.core.pseudo import Setting
-from gsx.core.reduction import box_average
-from gsx.core.regenerator import Checks, Material, Request, as_blocks
+from gsx.core.reduction import as_blocks, box_average
+from gsx.core.regenerator import Checks, Material, Request
 from gsx.core.run import Run
 from gsx.core.scene import View
 

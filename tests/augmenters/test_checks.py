@@ -16,7 +16,8 @@ from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, TrainingError
-from gsx.core.regenerator import Request, as_blocks
+from gsx.core.reduction import as_blocks
+from gsx.core.regenerator import Request
 from gsx.core.run import Run
 from gsx.core.session import start
 

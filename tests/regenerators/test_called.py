@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsx.cli import main
 from gsx.core.errors import ConfigError, TrainingError
-from gsx.core.regenerator import as_blocks
+from gsx.core.reduction import as_blocks
 from gsx.regenerators.called import Called, CalledOptions
 
 PROMPTS: list[str] = []

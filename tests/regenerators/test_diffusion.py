@@ -21,7 +21,8 @@ from gsx.cli import main, plugins
 from gsx.core.camera import Camera
 from gsx.core.config import compose
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.regenerator import Material, Request, as_blocks, displacement
+from gsx.core.reduction import as_blocks
+from gsx.core.regenerator import Material, Request, displacement
 from gsx.core.session import open_run
 from gsx.regenerators.diffusion.ladder import Ladder
 from gsx.regenerators.diffusion.options import DiffusionOptions

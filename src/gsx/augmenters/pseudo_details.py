@@ -37,12 +37,11 @@ from gsx.core.images import to_uint8, write_image
 from gsx.core.material import coverage, material_of, rendered
 from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
 from gsx.core.pseudo_pictures import picture_name
-from gsx.core.reduction import Reduction, projected
+from gsx.core.reduction import Reduction, as_blocks, projected
 from gsx.core.regenerator import (
     Checked,
     Checks,
     Request,
-    as_blocks,
     colour_matched,
     strayed,
     unusable,

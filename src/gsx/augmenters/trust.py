@@ -9,8 +9,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer import RasterSettings, rasterize, screen_radii
-from gsx.core.reduction import Reduction
-from gsx.core.regenerator import as_blocks
+from gsx.core.reduction import Reduction, as_blocks
 from gsx.core.shapes import Float, UInt8
 from gsx.core.splats import Splats
 

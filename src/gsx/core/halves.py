@@ -13,9 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
 from gsx.core.errors import InputError
-from gsx.core.evaluate import render_tiled
+from gsx.core.evaluate import render_view
 from gsx.core.files import replace_file
 from gsx.core.guard import Guard
 from gsx.core.images import to_uint8
@@ -60,7 +59,8 @@ def made(run: Run, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
         model = trained(without(run, half, steps, seed))
-        shown |= {number: picture(model, views[number].camera) for number in range(half, len(views), HALVES)}
+        numbers = range(half, len(views), HALVES)
+        shown |= {n: to_uint8(render_view(model, views[n], TILE_PIXELS).image.cpu()) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 
@@ -94,14 +94,6 @@ def trained(run: Run) -> Run:
         while not run.complete:
             take_step(run, plugins)
     return run
-
-
-@torch.no_grad()
-def picture(run: Run, camera: Camera) -> UInt8[Tensor, "3 h w"]:
-    """What the run's model shows, in 8 bits."""
-    run.backbone.begin(run.step)
-    image = render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, TILE_PIXELS).image
-    return to_uint8(image.cpu())
 
 
 # -- files -------------------------------------------------------------------------------------------------------------

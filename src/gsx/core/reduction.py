@@ -70,7 +70,7 @@ class Reduction:
     def adjoint(self, low: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
         """D^T: <D x, y> = <x, D^T y>."""
         if self.filter == "area":
-            return low.repeat_interleave(factor, -2).repeat_interleave(factor, -1) / factor**2
+            return as_blocks(low, factor) / factor**2
         planes = low.reshape(-1, 1, *low.shape[-2:])
         weights, margin = self.weights(factor, low)
         rows, columns = (self.sums(side, factor, low) for side in low.shape[-2:])
@@ -98,6 +98,11 @@ class Reduction:
 def box_average(image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
     """Means over blocks of factor x factor pixels."""
     return avg_pool2d(image, factor)
+
+
+def as_blocks(image: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
+    """Every pixel as a block of factor x factor."""
+    return image.repeat_interleave(factor, -2).repeat_interleave(factor, -1)
 
 
 def projected(

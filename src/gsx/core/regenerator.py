@@ -129,11 +129,6 @@ class Checked(Protocol):
         ...
 
 
-def as_blocks(image: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
-    """Every pixel as a block of factor x factor."""
-    return image.repeat_interleave(factor, -2).repeat_interleave(factor, -1)
-
-
 def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3"]:
     """By how much the mean colour of a result differs from that of its input."""
     return result.cpu().float().mean((1, 2)) - request.image.cpu().mean((1, 2))

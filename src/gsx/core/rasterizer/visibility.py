@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsx.core.camera import Camera
 from gsx.core.rasterizer.pairs import on_raster, published_radii, published_windows
-from gsx.core.rasterizer.projection import drawable, project
+from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float
 from gsx.core.splats import Splats
@@ -24,10 +24,9 @@ def touches(
     Those that have no such square, because something is out of range, are not held back either: the render counts them.
     """
     opaque = without_colours(means, scales, quats)
-    screen = project(opaque, camera, settings)
-    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
+    screen, on = on_screen(opaque, camera, settings)
     mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    mask.index_fill_(0, screen.ids[on_raster(first, last, camera)], True)
+    mask.index_fill_(0, screen.ids[on], True)
     return mask | ~drawable(opaque, camera, settings) if screen.dropped else mask
 
 
@@ -36,6 +35,13 @@ def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], q
     return Splats(
         means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
     )
+
+
+def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple[ScreenSplats, Bool[Tensor, "M"]]:
+    """(splats beyond the near plane, those of them whose published square's tiles touch the raster)."""
+    screen = project(splats, camera, settings)
+    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
+    return screen, on_raster(first, last, camera)
 
 
 @torch.no_grad()
@@ -47,9 +53,7 @@ def screen_radii(
     settings: RasterSettings,
 ) -> Float[Tensor, "N"]:
     """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
-    screen = project(without_colours(means, scales, quats), camera, settings)
-    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
-    on = on_raster(first, last, camera)
+    screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
     xx, xy, yy = (screen.covariances[on] - settings.dilation * means.new_tensor([1, 0, 1])).unbind(1)
     largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
     return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], largest.clamp_min(0).sqrt())
