@@ -3,8 +3,8 @@
     python benchmarks/same_results.py FOLDER before.json      # on the old source: run the compositions, keep digests
     python benchmarks/same_results.py FOLDER after.json --against before.json
 
-Digests are those of tensors, pixels and figures, without clocks and paths. They hold for one machine and one torch; nothing is
-committed. A few minutes on two cores.
+Digests are those of tensors, pixels and figures, without clocks and paths. They hold for one machine and one torch and
+are not committed. A quarter of an hour on two cores.
 """
 
 import argparse

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from gsx.core.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.splats import Splats
 
 
 def random_splats(count: int = 150, seed: int = 0, channels: int = 3, size: float = 0.08) -> Splats:

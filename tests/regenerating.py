@@ -8,14 +8,14 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
-from gsx.core.camera import Camera, look_at
-from gsx.core.config import typed
-from gsx.core.images import to_uint8
-from gsx.core.pseudo import Setting
-from gsx.core.reduction import as_blocks, box_average
-from gsx.core.regenerator import Checks, Material, Request
-from gsx.core.run import Run
-from gsx.core.scene import View
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.images import to_uint8
+from gsx.core.data.reduction import as_blocks, box_average
+from gsx.core.data.scene import View
+from gsx.core.training.pseudo_views import Setting
+from gsx.core.training.regenerator import Checks, Material, Request
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import typed
 
 EDGE = 48
 

@@ -10,10 +10,10 @@ from tiny import tiny_settings
 from torch import Tensor
 
 from gsx.cli import plugins
-from gsx.core import session
-from gsx.core.camera import Camera
-from gsx.core.run import Run
-from gsx.core.scene import ImageSource, Scene, View
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import ImageSource, Scene, View
+from gsx.core.training.run import Run
+from gsx.experiments.runs import session
 
 
 @dataclass(frozen=True)

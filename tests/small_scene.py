@@ -8,11 +8,11 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D, GS3DOptions
-from gsx.core.backbone import Beginning
-from gsx.core.camera import Camera, look_at
-from gsx.core.config import typed
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.scene import PointCloud, Scene, View
+from gsx.core.training.backbone import Beginning
+from gsx.experiments.runs.config import typed
 
 
 class Grey:

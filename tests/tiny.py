@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.cli import plugins
-from gsx.core.config import Settings, compose
 from gsx.core.plugins import hookimpl
-from gsx.core.run import Run
-from gsx.core.session import execute, start
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import Settings, compose
+from gsx.experiments.runs.session import execute, start
 
 OVERRIDES = (
     "scene.width=48",

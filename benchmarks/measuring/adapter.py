@@ -4,8 +4,7 @@ import torch
 from torch import Tensor
 
 from gsx.cli import plugins
-from gsx.core.camera import Camera
-from gsx.core.config import compose
+from gsx.core.data.camera import Camera
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.compiled import composite_compiled
 from gsx.core.rasterizer.composite import composite, make_blocks
@@ -13,6 +12,7 @@ from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import Pairs, pair
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
+from gsx.experiments.runs.config import compose
 
 
 def settings_of(path: str, *overrides: str) -> RasterSettings:

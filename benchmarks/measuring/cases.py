@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.shapes import Float
-from gsx.core.splats import Splats
 from measuring import naive, rival
 from measuring.adapter import blend_pairs, count_pairs, learnable, leaves_of, pair_screen
 from measuring.watches import Job, Watch

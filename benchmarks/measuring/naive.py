@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float, Int

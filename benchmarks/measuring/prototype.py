@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.projection import ScreenSplats

@@ -8,9 +8,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from gsx.core.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis, Plot, Series, axis_of, curve
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, replace_file, write_json
+from gsx.experiments.reports.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis, Plot, Series, axis_of, curve
 from measuring.machine import commit
 
 Section = dict[str, Any]

@@ -5,10 +5,10 @@ from importlib.util import find_spec
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
-from gsx.core.splats import Splats
 
 
 def missing(device: torch.device) -> str:

@@ -5,12 +5,12 @@ from itertools import cycle
 from pathlib import Path
 
 from gsx.cli import plugins
-from gsx.core.config import compose
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.run import Run
-from gsx.core.session import build, load_scene, open_run
-from gsx.core.trainer import take_step
+from gsx.core.training.run import Run
+from gsx.core.training.trainer import take_step
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import build, load_scene, open_run
 from measuring.adapter import settings_of
 from measuring.bench import Bench, Row, section
 from measuring.results import Section

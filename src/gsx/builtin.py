@@ -12,7 +12,6 @@ def gsx_register(registry: Registry) -> None:
     from gsx.backbones.anchors import NeuralOptions, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
-    from gsx.core.scenes import blender, bungee, colmap, demo, photos, transforms
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
     from gsx.regenerators.diffusion.ladder import Ladder, LadderOptions
@@ -22,6 +21,7 @@ def gsx_register(registry: Registry) -> None:
     from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
+    from gsx.scenes import blender, bungee, colmap, demo, photos, transforms
     from gsx.trackers.mlflow import MLflow, MLflowOptions
     from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
 

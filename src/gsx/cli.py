@@ -16,9 +16,9 @@ from gsx import __version__
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 
 if TYPE_CHECKING:
-    from gsx.core.config import Settings
     from gsx.core.plugins import Plugins
-    from gsx.core.run import Run
+    from gsx.core.training.run import Run
+    from gsx.experiments.runs.config import Settings
 
 logger = logging.getLogger("gsx.cli")
 
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if processes() > 1:
-        from gsx.core.distributed import as_one
+        from gsx.core.training.distributed import as_one
 
         return as_one(lambda: dispatch_together(words), explained)
     try:
@@ -132,7 +132,7 @@ def dispatch_together(words: list[str]) -> int:
     if any(word.startswith("-") for word in words) or (words[:1] and words[0] in VERBS and words[0] != "resume"):
         asked = " ".join(words[:2])
         raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
-    from gsx.experiments.sweep import is_table
+    from gsx.experiments.tables.sweep import is_table
 
     if is_table(words):
         raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
@@ -247,18 +247,18 @@ def verb_train(words: list[str]) -> int:
             raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
     if flags:
         return hand_to_hydra(words)
-    from gsx.experiments.sweep import is_table
+    from gsx.experiments.tables.sweep import is_table
 
     if is_table(words):
         return fill_table(words)
-    from gsx.core.config import compose
+    from gsx.experiments.runs.config import compose
 
     return train(compose(words, loaded := plugins()), loaded)
 
 
 def fill_table(words: list[str]) -> int:
     """gsx +experiment=TABLE ..."""
-    from gsx.experiments.sweep import run_table
+    from gsx.experiments.tables.sweep import run_table
 
     text, code = run_table(words, plugins(), sweep_job)
     sys.stdout.write(text)
@@ -267,8 +267,8 @@ def fill_table(words: list[str]) -> int:
 
 def hand_to_hydra(words: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
-    from gsx.core.config import check_overrides, hydra_main, quoted
-    from gsx.experiments.sweep import is_table
+    from gsx.experiments.runs.config import check_overrides, hydra_main, quoted
+    from gsx.experiments.tables.sweep import is_table
 
     if is_table(words) and {"-m", "--multirun"} & set(words):
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
@@ -299,7 +299,7 @@ def new_sweep(output: Path) -> Path:
 def close_sweep(sweep: Path) -> int:
     """Report on the runs that a multirun has made; returns the worst exit code of its jobs."""
     from gsx.core.files import read_json
-    from gsx.core.overview import write_overview
+    from gsx.experiments.reports.overview import write_overview
 
     records = [read_json(path) for path in sorted((sweep / "jobs").glob("*.json"))]
     folders = [folder for record in records if record["folder"] and (folder := Path(record["folder"])).is_dir()]
@@ -313,8 +313,8 @@ def sweep_job(config: Any) -> int:
 
     An error is shown and does not end the others; Ctrl-C does.
     """
-    from gsx.core.config import job_place, settings_from
     from gsx.core.files import write_json
+    from gsx.experiments.runs.config import job_place, settings_from
 
     set_up_logging()
     folders: list[Path] = []
@@ -339,7 +339,7 @@ def sweep_job(config: Any) -> int:
 
 def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
     """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which."""
-    from gsx.core.session import start
+    from gsx.experiments.runs.session import start
 
     if settings.general.reuse:
         return reused(settings, loaded, [] if folders is None else folders)
@@ -351,8 +351,8 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.core.identity import claimed, place_of, scene_stamp
-    from gsx.core.session import pursue
+    from gsx.core.run_folder.run_key import claimed, place_of, scene_stamp
+    from gsx.experiments.runs.session import pursue
 
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
@@ -371,7 +371,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     """Train to the end or to Ctrl-C, and say where things are."""
-    from gsx.core.session import execute
+    from gsx.experiments.runs.session import execute
 
     try:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
@@ -406,8 +406,8 @@ def verb_resume(words: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...]"""
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
     folder, overrides = run_words("resume", words, told)
-    from gsx.core.config import write_config
-    from gsx.core.session import open_run
+    from gsx.experiments.runs.config import write_config
+    from gsx.experiments.runs.session import open_run
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides, training=True)
@@ -424,8 +424,8 @@ def verb_eval(words: list[str]) -> int:
     told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
     folder, overrides = run_words("eval", words, told)
     from gsx.core.rasterizer.prepare import warm
-    from gsx.core.report import write_report
-    from gsx.core.session import as_trained, evaluate, finish, open_run
+    from gsx.experiments.reports.report import write_report
+    from gsx.experiments.runs.session import as_trained, evaluate, finish, open_run
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
@@ -452,7 +452,7 @@ def verb_render(words: list[str]) -> int:
     given = parser.parse_args(words)
     if given.zoom <= 0 or given.frames < 1:
         raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
-    from gsx.core.session import open_run, render_orbit, render_test_views
+    from gsx.experiments.runs.session import open_run, render_orbit, render_test_views
 
     run, settings = open_run(given.run, plugins())
     if given.orbit:
@@ -472,8 +472,8 @@ def verb_export(words: list[str]) -> int:
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     given = parser.parse_args(words)
-    from gsx.core.export import refuse_suffix
-    from gsx.core.session import export, open_run, reimport_psnr, view_named
+    from gsx.core.gaussians.splat_files import refuse_suffix
+    from gsx.experiments.runs.session import export, open_run, reimport_psnr, view_named
 
     if given.file:
         refuse_suffix(given.file)
@@ -494,7 +494,7 @@ def verb_report(words: list[str]) -> int:
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
     given = parser.parse_args(words)
-    from gsx.core.report import report_on
+    from gsx.experiments.reports.report import report_on
 
     sys.stdout.write(f"{report_on(given.folders, new_folder(given.to) if given.to else None)}\n")
     return 0
@@ -505,7 +505,7 @@ def verb_scenes(words: list[str]) -> int:
     parser = Parser(prog="gsx scenes", description="What a folder is: format, cameras, images, points, problems.")
     parser.add_argument("path", type=Path, metavar="PATH", help="folder of a scene")
     given = parser.parse_args(words)
-    from gsx.core.scenes.inspect import describe
+    from gsx.experiments.runs.inspect import describe
 
     lines = describe(given.path)
     sys.stdout.write("\n".join(lines) + "\n")
@@ -521,8 +521,8 @@ def verb_datasets(words: list[str]) -> int:
     )
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
     words = parser.parse_args(words).words
-    from gsx.core.config import Compositions
-    from gsx.experiments.datasets import described
+    from gsx.experiments.runs.config import Compositions
+    from gsx.experiments.tables.datasets import described
 
     overrides = [word for word in words if "=" in word]
     with Compositions(plugins()) as compositions:
@@ -624,10 +624,10 @@ def verb_trade(words: list[str]) -> int:
         remedy = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...]"
         raise ConfigError(f"'{words[0]}' is nothing gsx can trade.{nearest(words[0], ['rasterizer'])} Type {remedy}")
     given = trade_arguments(words[1:])
-    from gsx.core.trade import advice_lines, check_knobs, table
-    from gsx.core.trade_measure import sweep, usable_paths
-    from gsx.core.trade_page import write_trade
-    from gsx.core.trade_subject import open_subject
+    from gsx.experiments.trade.knobs import advice_lines, check_knobs, table
+    from gsx.experiments.trade.measure import sweep, usable_paths
+    from gsx.experiments.trade.page import write_trade
+    from gsx.experiments.trade.subject import open_subject
 
     knobs, loaded = check_knobs(given.knobs), plugins()
     views, combinations = (2, 4) if given.target else (1, 1)

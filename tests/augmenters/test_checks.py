@@ -14,12 +14,12 @@ from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
-from gsx.core.config import compose
+from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
-from gsx.core.reduction import as_blocks
-from gsx.core.regenerator import Request
-from gsx.core.run import Run
-from gsx.core.session import start
+from gsx.core.training.regenerator import Request
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import start
 
 LATENT = ("regenerator/upscale=sd_x2_latent", "regenerator/restore=sdxl_turbo")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsx.augmenters.consistency import BOX, blocks, consistent_pixels, exactly_consistent, repaired, unblocked
-from gsx.core.reduction import box_average, projected
+from gsx.core.data.reduction import box_average, projected
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

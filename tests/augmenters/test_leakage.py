@@ -6,7 +6,7 @@ import pytest
 from sealed import trained_sealed
 from torch import Tensor
 
-from gsx.core.reduction import as_blocks
+from gsx.core.data.reduction import as_blocks
 
 
 def blocks(image: Tensor, *, scale: int, **more: object) -> Tensor:

@@ -11,13 +11,13 @@ from torch import Tensor
 import gsx.augmenters.pseudo_details as pseudo_details
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import main, plugins
-from gsx.core.config import compose
-from gsx.core.material import rendered
-from gsx.core.metrics import psnr
-from gsx.core.regenerator import Material, Request, displacement
-from gsx.core.run import Run
-from gsx.core.session import start
-from gsx.core.trainer import train
+from gsx.core.quality.metrics import psnr
+from gsx.core.training.material import rendered
+from gsx.core.training.regenerator import Material, Request, displacement
+from gsx.core.training.run import Run
+from gsx.core.training.trainer import train
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import start
 
 CONTROL = (
     "scene.width=64",

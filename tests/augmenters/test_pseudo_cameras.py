@@ -17,10 +17,10 @@ from gsx.augmenters.cameras import (
     window_size,
     worst_window,
 )
-from gsx.core.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.window import Window
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.splats import Splats
-from gsx.core.window import Window
 
 
 def camera(width: int = 1200, height: int = 800, focal: float = 1000.0) -> Camera:

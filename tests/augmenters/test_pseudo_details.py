@@ -13,18 +13,18 @@ from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
-from gsx.core.config import compose
+from gsx.core.data.images import read_image
+from gsx.core.data.reduction import Reduction
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.images import read_image
-from gsx.core.losses import photometric
-from gsx.core.material import coverage, rendered
-from gsx.core.pseudo import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
+from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
-from gsx.core.reduction import Reduction
-from gsx.core.regenerator import Material
-from gsx.core.run import Run
-from gsx.core.session import execute, open_run, start
-from gsx.core.trainer import backward
+from gsx.core.training.material import coverage, rendered
+from gsx.core.training.pseudo_views import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
+from gsx.core.training.regenerator import Material
+from gsx.core.training.run import Run
+from gsx.core.training.trainer import backward
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import execute, open_run, start
 
 PLAIN = ("regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager")
 
@@ -178,7 +178,7 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     run = run_at(tmp_path / "run", 60, *words)
     run.sampler.order = [2]
     renders = []
-    monkeypatch.setattr("gsx.core.trainer.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
+    monkeypatch.setattr("gsx.core.training.trainer.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
     step = backward(run)
     assert len(renders) == (3 if background == "true" else 2)
     found = gradients(run)
@@ -211,7 +211,7 @@ def test_what_is_known_at_a_lower_resolution_counts_by_squares_too(tmp_path: Pat
 
 
 def compose_camera() -> Any:
-    from gsx.core.camera import look_at
+    from gsx.core.data.camera import look_at
 
     return look_at([0.0, -4.0, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=2, height=2)
 
@@ -730,7 +730,7 @@ def test_what_cannot_work_is_refused_before_training(tmp_path: Path) -> None:
 
 
 def test_oracle_knows_photographs_only_where_they_were_taken() -> None:
-    from gsx.core.scene import View
+    from gsx.core.data.scene import View
     from gsx.regenerators.classical import Oracle, PlainOptions
 
     class Photo:

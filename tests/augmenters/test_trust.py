@@ -14,10 +14,10 @@ from gsx.augmenters.trust import (
     sampling_ratios,
     seen_alike,
 )
-from gsx.core.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.reduction import Reduction
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.reduction import Reduction
-from gsx.core.splats import Splats
 
 
 def at(distance: float, width: int = 40, target: float = 0.0) -> Camera:

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from gsx.backbones.anchors import Anchors, Decay, automatic_voxel, voxel_nodes
 from gsx.cli import plugins
-from gsx.core.backbone import Backbone, Beginning
-from gsx.core.camera import Camera, look_at
-from gsx.core.config import Settings, compose
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
-from gsx.core.losses import photometric
+from gsx.core.gaussians.splats import Splats
+from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, touches
-from gsx.core.scene import Scene
-from gsx.core.session import execute, open_run
-from gsx.core.splats import Splats
+from gsx.core.training.backbone import Backbone, Beginning
+from gsx.experiments.runs.config import Settings, compose
+from gsx.experiments.runs.session import execute, open_run
 
 NAMES = ("scaffold", "octree_scaffold", "octree_gs3d")
 NEURAL = ("scaffold", "octree_scaffold")

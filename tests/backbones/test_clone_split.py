@@ -25,16 +25,16 @@ from gsx.backbones.gs3d import GS3D
 from gsx.backbones.levels import Levels, initial_nodes, kept
 from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians
 from gsx.cli import plugins
-from gsx.core.backbone import Backbone, Beginning
-from gsx.core.camera import Camera, look_at
-from gsx.core.config import compose, read_config, write_config
-from gsx.core.density import within_room
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
-from gsx.core.export import splats_of, write_columns
-from gsx.core.ply import read_ply
+from gsx.core.gaussians.ply import read_ply
+from gsx.core.gaussians.splat_files import splats_of, write_columns
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.scene import Scene
-from gsx.core.session import execute, open_run
+from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.density import within_room
+from gsx.experiments.runs.config import compose, read_config, write_config
+from gsx.experiments.runs.session import execute, open_run
 
 WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
 CONTROL = LevelDensityOptions(update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, volume_weight=0.01)

@@ -11,10 +11,10 @@ from torch.nn import Parameter
 
 from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, baked
 from gsx.backbones.heads import Heads
-from gsx.core.camera import Camera, look_at
-from gsx.core.density import Table
-from gsx.core.sh import colours_of
-from gsx.core.splats import Splats
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.gaussians.sh import colours_of
+from gsx.core.gaussians.splats import Splats
+from gsx.core.training.density import Table
 
 CAMERA = look_at([0.3, -4, 1], [0, 0, 0], fov_x=0.9, width=24, height=16)
 FIELDS = ("means", "scales", "quats", "log_opacities", "colours")

@@ -8,13 +8,13 @@ from small_scene import small_scene, spread
 from torch import Tensor
 
 from gsx.cli import plugins
-from gsx.core.backbone import Backbone, Beginning
-from gsx.core.camera import look_at
-from gsx.core.config import compose
-from gsx.core.losses import photometric
+from gsx.core.data.camera import look_at
+from gsx.core.data.scene import Scene, View
+from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
-from gsx.core.scene import Scene, View
-from gsx.core.session import in_units, measured, warned_of_units
+from gsx.core.training.backbone import Backbone, Beginning
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import in_units, measured, warned_of_units
 
 BACKBONES = {
     "gs3d": (),

@@ -15,11 +15,11 @@ from gsx.backbones.anchors import Anchors
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.levels import distance_range, drawn, seen_fraction, viewpoints_of
 from gsx.backbones.mip import filter_sizes
-from gsx.core.camera import Camera, offsets_from
+from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.scene import Scene
+from gsx.core.gaussians.sh import colours_of
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import rasterize
-from gsx.core.scene import Scene
-from gsx.core.sh import colours_of
-from gsx.core.splats import Splats
 
 FAR = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
 BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d", "octree_gs3d, clone_split")

@@ -30,7 +30,7 @@ from gsx.backbones.growth import (
     resolved,
 )
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
-from gsx.core.density import Table
+from gsx.core.training.density import Table
 
 PUBLISHED = GrowthOptions(
     observe_from=500, start=1500, stop=15000, every=100, success=0.8, gradient=2e-4, prune_opacity=0.005,

@@ -9,12 +9,12 @@ from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D, children
-from gsx.core.backbone import Backbone
-from gsx.core.camera import Camera
-from gsx.core.density import Statistics
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
-from gsx.core.losses import photometric
+from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, ScreenStatistics, rasterize
+from gsx.core.training.backbone import Backbone
+from gsx.core.training.density import Statistics
 
 NAMES = ("means", "sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats")
 

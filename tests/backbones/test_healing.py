@@ -13,14 +13,14 @@ from torch import Tensor
 
 from gsx.backbones.anchors import Anchors
 from gsx.backbones.gs3d import GS3D
-from gsx.core.camera import look_at
+from gsx.core.data.camera import look_at
 from gsx.core.errors import TrainingError
-from gsx.core.guard import Guard
+from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import RasterSettings, rasterize, touches
-from gsx.core.run import Run, Sampler, TrainingOptions
-from gsx.core.splats import Splats
-from gsx.core.trainer import backward, take_step
+from gsx.core.training.guard import Guard
+from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.trainer import backward, take_step
 
 NEURAL = ("scaffold", "octree_scaffold")
 WITH_QUATS = ("gs3d", "mip_splatting", "octree_gs3d", "octree_gs3d, clone_split")
@@ -70,7 +70,7 @@ def assert_removed(run: Run, plugins: Plugins, caplog: pytest.LogCaptureFixture,
     """One primitive goes, with a word, and the run goes on as if it had never been there."""
     before = run.backbone.size()[0]
     caplog.clear()
-    with caplog.at_level(logging.WARNING, "gsx.core.trainer"):
+    with caplog.at_level(logging.WARNING, "gsx.core.training.trainer"):
         step = take_step(run, plugins)
     assert "removed 1 primitives" in step.skipped, what
     assert f"step {step.number}: removed 1 primitives with values that are not finite" in caplog.text, what

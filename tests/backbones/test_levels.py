@@ -33,8 +33,8 @@ from gsx.backbones.levels import (
     warnings_of,
     whole_level,
 )
-from gsx.core.camera import Camera, look_at
-from gsx.core.schedule import Schedule
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.training.schedule import Schedule
 
 PUBLISHED = LevelOptions(
     fork=2,

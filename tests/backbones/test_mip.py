@@ -21,20 +21,20 @@ from gsx.backbones.gs3d import GS3D
 from gsx.backbones.levels import quantile
 from gsx.backbones.mip import MipOptions, filter_sizes, logit_of_log, smoothed
 from gsx.cli import plugins
-from gsx.core.camera import Camera, look_at
-from gsx.core.config import compose
-from gsx.core.density import Statistics
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.evaluate import render_tiled
-from gsx.core.export import read_gaussians, splats_of
-from gsx.core.losses import photometric
-from gsx.core.metrics import psnr
-from gsx.core.ply import read_ply
+from gsx.core.evaluation.evaluator import render_tiled
+from gsx.core.gaussians.ply import read_ply
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of
+from gsx.core.gaussians.splats import Splats
+from gsx.core.quality.losses import photometric
+from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize
-from gsx.core.run import Run
-from gsx.core.scene import Scene
-from gsx.core.session import build, execute, export, load_scene, open_run, render_camera
-from gsx.core.splats import Splats
+from gsx.core.training.density import Statistics
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import build, execute, export, load_scene, open_run, render_camera
 
 OPTIONS = MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=29900)
 UNIT = math.sqrt(0.2)

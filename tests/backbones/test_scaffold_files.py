@@ -8,9 +8,9 @@ from small_scene import small_scene, spread
 from test_anchors import NAMES, NEURAL, small_anchors, stir
 
 from gsx.core.errors import InputError
-from gsx.core.export import read_gaussians, splats_of, write_columns, write_gaussians
-from gsx.core.metrics import psnr
-from gsx.core.ply import read_ply
+from gsx.core.gaussians.ply import read_ply
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import rasterize
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
-from gsx.core.camera import Camera, look_at
-from gsx.core.splats import Splats
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.gaussians.splats import Splats
 
 IMAGE, GRADIENT = 1e-4, 1e-4
 """The usual bounds of float32: on the image, and on the relative error of a field's gradient."""

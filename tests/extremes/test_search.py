@@ -11,11 +11,11 @@ from torch import Tensor
 
 from extremes.cases import ball, scaled, view
 from extremes.comparison import gradients_of, leaves, paths, undecided
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.splats import Splats
 
 LARGEST = float(torch.finfo(torch.float32).max)
 EDGES = [0.0, -0.0, 1e-45, -1e-39, 1e-20, 1e-12, 1e-6, 1e4, 1e6, 1e12, -1e15, -1e19, 1e20, 1e30, -1e38, LARGEST]

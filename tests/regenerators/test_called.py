@@ -11,8 +11,8 @@ from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.cli import main
+from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
-from gsx.core.reduction import as_blocks
 from gsx.regenerators.called import Called, CalledOptions
 
 PROMPTS: list[str] = []

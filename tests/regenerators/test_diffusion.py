@@ -18,12 +18,12 @@ from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 
 from gsx.cli import main, plugins
-from gsx.core.camera import Camera
-from gsx.core.config import compose
+from gsx.core.data.camera import Camera
+from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.reduction import as_blocks
-from gsx.core.regenerator import Material, Request, displacement
-from gsx.core.session import open_run
+from gsx.core.training.regenerator import Material, Request, displacement
+from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.session import open_run
 from gsx.regenerators.diffusion.ladder import Ladder
 from gsx.regenerators.diffusion.options import DiffusionOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, Recipe, steps_for

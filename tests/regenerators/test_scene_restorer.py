@@ -8,10 +8,10 @@ import torch
 from regenerating import Photo, camera, request, stripes
 from torch import Tensor
 
+from gsx.core.data.images import to_uint8
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.images import to_uint8
-from gsx.core.regenerator import Material, Regenerator
-from gsx.core.scene import View
+from gsx.core.training.regenerator import Material, Regenerator
 from gsx.regenerators.pairs import held_out_pairs, with_own
 from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer
 

@@ -8,11 +8,11 @@ import torch
 from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
+from gsx.core.data.images import resize, to_uint8
+from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.images import resize, to_uint8
-from gsx.core.reduction import Reduction, box_average
-from gsx.core.regenerator import Material, Regenerator, strayed, unusable
-from gsx.core.scene import View
+from gsx.core.training.regenerator import Material, Regenerator, strayed, unusable
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 
 CPU = torch.device("cpu")

@@ -11,10 +11,10 @@ from tiny import tiny_run, tiny_settings
 
 from gsx.cli import plugins
 from gsx.core.errors import ConfigError, TrainingError
-from gsx.core.overview import flattened
 from gsx.core.plugins import hookimpl
-from gsx.core.run import Run
-from gsx.core.session import execute, open_run, start
+from gsx.core.training.run import Run
+from gsx.experiments.reports.overview import flattened
+from gsx.experiments.runs.session import execute, open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, parameters, portions
 

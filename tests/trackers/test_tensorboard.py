@@ -12,8 +12,8 @@ from tiny import StopAfter, tiny_run, tiny_settings
 from gsx.cli import plugins
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import hookimpl
-from gsx.core.run import Run
-from gsx.core.session import execute, open_run, start
+from gsx.core.training.run import Run
+from gsx.experiments.runs.session import execute, open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.tensorboard import events_folder
 

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from gsx.core.images import to_uint8
-from gsx.core.material import material_of
-from gsx.core.pseudo import PseudoView, Setting, Term
-from gsx.core.regenerator import Request
-from gsx.core.run import Run
+from gsx.core.data.images import to_uint8
+from gsx.core.training.material import material_of
+from gsx.core.training.pseudo_views import PseudoView, Setting, Term
+from gsx.core.training.regenerator import Request
+from gsx.core.training.run import Run
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from gsx.core.regenerator import Material, Request
+from gsx.core.training.regenerator import Material, Request
 
 
 @dataclass(frozen=True, kw_only=True)

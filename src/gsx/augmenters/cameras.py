@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.data.window import Window
 from gsx.core.shapes import Float
-from gsx.core.window import Window
 
 WINDOWS = ("center", "random", "grid", "error")
 NOISES = ("uniform", "normal")

@@ -30,15 +30,17 @@ from gsx.augmenters.cameras import (
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.augmenters.trust import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
-from gsx.core.camera import Camera
-from gsx.core.checkpoint import sidecars, step_of
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import to_uint8, write_image
+from gsx.core.data.reduction import Reduction, as_blocks, projected
+from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.images import to_uint8, write_image
-from gsx.core.material import coverage, material_of, rendered
-from gsx.core.pseudo import PseudoView, Setting, Term, load_views, save_views
-from gsx.core.pseudo_pictures import picture_name
-from gsx.core.reduction import Reduction, as_blocks, projected
-from gsx.core.regenerator import (
+from gsx.core.run_folder.checkpoint import sidecars, step_of
+from gsx.core.seeds import derived_seed
+from gsx.core.shapes import Float, UInt8
+from gsx.core.training.material import coverage, material_of, rendered
+from gsx.core.training.pseudo_views import PseudoView, Setting, Term, load_views, save_views
+from gsx.core.training.regenerator import (
     Checked,
     Checks,
     Request,
@@ -46,11 +48,9 @@ from gsx.core.regenerator import (
     strayed,
     unusable,
 )
-from gsx.core.run import Run
-from gsx.core.schedule import Schedule
-from gsx.core.seeds import derived_seed
-from gsx.core.shapes import Float, UInt8
-from gsx.core.window import Window
+from gsx.core.training.run import Run
+from gsx.core.training.schedule import Schedule
+from gsx.experiments.runs.pseudo_pictures import picture_name
 
 logger = logging.getLogger(__name__)
 

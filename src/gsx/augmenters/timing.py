@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gsx.core.schedule import Schedule
+from gsx.core.training.schedule import Schedule
 
 SPLITS = ("window", "run", "linear")
 

@@ -7,11 +7,11 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.data.reduction import Reduction, as_blocks
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, screen_radii
-from gsx.core.reduction import Reduction, as_blocks
 from gsx.core.shapes import Float, UInt8
-from gsx.core.splats import Splats
 
 WeightMap: TypeAlias = Callable[[Splats, Camera, Sequence[Camera], RasterSettings], Tensor]
 """(splats, camera of the pseudo view, cameras of the photographs, rules to draw by) -> weights of pixels, [h, w]."""

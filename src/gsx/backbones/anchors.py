@@ -46,9 +46,16 @@ from gsx.backbones.levels import (
     warnings_of,
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
-from gsx.core.backbone import Beginning, Gaussians, Observation
-from gsx.core.camera import Camera
-from gsx.core.density import (
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import PointCloud
+from gsx.core.errors import InputError
+from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.core.gaussians.quaternions import make_identity_where_zero
+from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer import Rendering, drawable, touches
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.backbone import Beginning, Gaussians, Observation
+from gsx.core.training.density import (
     ADAM_EPSILON,
     Table,
     adam_tensors,
@@ -59,14 +66,7 @@ from gsx.core.density import (
     sightings,
     table_tensors,
 )
-from gsx.core.errors import InputError
-from gsx.core.neighbours import mean_square_distance
-from gsx.core.quaternions import make_identity_where_zero
-from gsx.core.rasterizer import Rendering, drawable, touches
-from gsx.core.scene import PointCloud
-from gsx.core.schedule import log_linear
-from gsx.core.shapes import Bool, Float, Int
-from gsx.core.splats import Splats
+from gsx.core.training.schedule import log_linear
 
 logger = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.levels import Levels, initial_nodes, thresholds
 from gsx.backbones.sampling import sampled_means
-from gsx.core.density import Table
-from gsx.core.scene import PointCloud
+from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.density import Table
 
 
 @dataclass(frozen=True, kw_only=True)

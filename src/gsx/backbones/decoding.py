@@ -11,13 +11,13 @@ from torch.nn.functional import logsigmoid, normalize
 from gsx.backbones.heads import Heads
 from gsx.backbones.levels import Levels
 from gsx.backbones.mip import logit_of_log, smoothed
-from gsx.core.backbone import Gaussians
-from gsx.core.camera import Camera, offsets_from
-from gsx.core.density import Table
+from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import take_rows
-from gsx.core.sh import colours_of, constant_from_colour
 from gsx.core.shapes import Float, Int
-from gsx.core.splats import Splats
+from gsx.core.training.backbone import Gaussians
+from gsx.core.training.density import Table
 
 LARGEST_LOG_SCALE = 30.0
 """Lengths are held below e^30 world units, so that their squares stay finite in float32."""

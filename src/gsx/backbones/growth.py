@@ -15,8 +15,8 @@ from torch import Tensor
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
-from gsx.core.density import Table, append_rows, keep_rows, mean_of, room_under, within_room
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.density import Table, append_rows, keep_rows, mean_of, room_under, within_room
 
 LARGEST_CELL = 2.0**53
 """Integers up to this are exact in float64."""

@@ -36,9 +36,18 @@ from gsx.backbones.levels import (
 )
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
-from gsx.core.backbone import Beginning, Gaussians, Observation
-from gsx.core.camera import Camera, offsets_from
-from gsx.core.density import (
+from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.scene import PointCloud
+from gsx.core.errors import InputError
+from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.core.gaussians.quaternions import make_identity_where_zero
+from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.splat_files import columns_of
+from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer import Rendering, drawable, take_rows
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.backbone import Beginning, Gaussians, Observation
+from gsx.core.training.density import (
     Statistics,
     Table,
     append_rows,
@@ -52,16 +61,7 @@ from gsx.core.density import (
     withheld,
     within_room,
 )
-from gsx.core.errors import InputError
-from gsx.core.export import columns_of
-from gsx.core.neighbours import mean_square_distance
-from gsx.core.quaternions import make_identity_where_zero
-from gsx.core.rasterizer import Rendering, drawable, take_rows
-from gsx.core.scene import PointCloud
-from gsx.core.schedule import log_linear
-from gsx.core.sh import colours_of, constant_from_colour
-from gsx.core.shapes import Bool, Float, Int
-from gsx.core.splats import Splats
+from gsx.core.training.schedule import log_linear
 
 logger = logging.getLogger(__name__)
 

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import new_cells
-from gsx.core.camera import Camera, offsets_from
-from gsx.core.schedule import Schedule
+from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.schedule import Schedule
 
 MODES = ("round", "floor", "ceil", "progressive")
 EXTEND_RULES = ("reference", "sane")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float

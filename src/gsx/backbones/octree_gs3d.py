@@ -6,7 +6,7 @@ from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
 from gsx.backbones.clone_split import LevelDensityOptions
 from gsx.backbones.gs3d import GS3D, Density, GS3DOptions, Rates
 from gsx.backbones.levels import faithful
-from gsx.core.backbone import Beginning
+from gsx.core.training.backbone import Beginning
 
 FORMS = ("anchors", "clone_split")
 QUIRKS = ("gate", "bias")

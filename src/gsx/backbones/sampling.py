@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gsx.core.quaternions import rotation_matrices
+from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.shapes import Float
 
 

@@ -17,7 +17,7 @@ import pluggy
 from gsx.core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
-    from gsx.core.run import Run, Step
+    from gsx.core.training.run import Run, Step
 
 GROUP = "gsx"
 """Entry-point group and pluggy project name."""

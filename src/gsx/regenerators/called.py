@@ -10,10 +10,10 @@ from typing import Any
 
 from torch import Tensor
 
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.core.training.regenerator import Material, Request
 
 
 @contextmanager

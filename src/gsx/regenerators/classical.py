@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from gsx.core.data.images import resize, to_uint8
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.images import resize, to_uint8
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.core.training.regenerator import Material, Request
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from gsx.core.regenerator import Material
-from gsx.core.window import Window
+from gsx.core.data.window import Window
+from gsx.core.training.regenerator import Material
 
 Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, h, w] each, display values."""

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
+from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
+from gsx.core.training.regenerator import Material, Request
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 from gsx.regenerators.scene_sr import begin, read_network

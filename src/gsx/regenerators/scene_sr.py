@@ -19,14 +19,14 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from gsx.core.cache import cache_folder, content_key
+from gsx.core.data.reduction import Reduction, projected
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
-from gsx.core.reduction import Reduction, projected
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.shapes import Float
-from gsx.core.window import Window
+from gsx.core.training.regenerator import Material, Request
 
 logger = logging.getLogger(__name__)
 

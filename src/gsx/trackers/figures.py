@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gsx.core.run_files import part
+from gsx.core.run_folder.files import part
 
 
 def numbers(content: dict[str, Any], prefix: str = "") -> dict[str, float]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from raster_scenes import SMOOTH, changed, front_camera, gradients, leaves, random_splats, soft_splats
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_batch
 from gsx.core.rasterizer.reference import render_reference

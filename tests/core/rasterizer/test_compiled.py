@@ -9,11 +9,11 @@ import pytest
 import torch
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.compiled import available, takes
 from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial
 from gsx.core.rasterizer.scan import parts
-from gsx.core.splats import Splats
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
 
@@ -144,7 +144,7 @@ BROKEN = """
 import torch
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.prepare import decide, warm_splats
-from gsx.core.camera import look_at
+from gsx.core.data.camera import look_at
 import logging
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=32, height=32)

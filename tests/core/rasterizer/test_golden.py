@@ -9,12 +9,12 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.gaussians.sh import colours_of
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.sh import colours_of
-from gsx.core.splats import Splats
 
 FILE = Path(__file__).parents[2] / "golden" / "gsplat.safetensors"
 with safe_open(FILE, "pt") as opened:

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import logsigmoid
 
-from gsx.core.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import InputError
-from gsx.core.quaternions import rotation_matrices
+from gsx.core.gaussians.quaternions import rotation_matrices
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.splats import Splats
 
 
 def scene(count: int = 200, seed: int = 0, channels: int = 3) -> Splats:

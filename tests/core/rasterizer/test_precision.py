@@ -19,13 +19,13 @@ from raster_scenes import (
     truth_of,
 )
 
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.composite import composite, make_blocks, make_tables
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import pair
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import project
-from gsx.core.splats import Splats
 
 SEEDS = range(3)
 FORMS = ("squares", "direct", "expanded")

@@ -6,12 +6,12 @@ import pytest
 import torch
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
-from gsx.core.camera import look_at
+from gsx.core.data.camera import look_at
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.pairs import pair
 from gsx.core.rasterizer.projection import project
-from gsx.core.splats import Splats
 
 
 @functools.cache

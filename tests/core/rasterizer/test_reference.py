@@ -7,10 +7,10 @@ import torch
 from extremes.comparison import undecided
 from torch.nn.functional import logsigmoid
 
-from gsx.core.camera import look_at
+from gsx.core.data.camera import look_at
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.splats import Splats
 
 FIELDS = ("means", "scales", "quats", "log_opacities", "colours")
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 from raster_scenes import changed, front_camera, leaves, random_splats, run_script
 
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.reference import alpha_maps, frame_pixels
-from gsx.core.splats import Splats
 
 
 def brute_force(

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.render import Rendering, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float
-from gsx.core.splats import Splats
 
 
 def rasterize_batch(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera, Frame
+from gsx.core.data.camera import Camera, Frame
 from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.projection import ScreenSplats

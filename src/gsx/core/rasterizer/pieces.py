@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError, TooManyPairs
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.render import Rendering, rasterize
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float
-from gsx.core.splats import Splats
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from gsx.core.camera import look_at
+from gsx.core.data.camera import look_at
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.available import available, compiles
 from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.render import rasterize
 from gsx.core.rasterizer.settings import RasterSettings
-from gsx.core.splats import Splats
 
 logger = logging.getLogger(__name__)
 

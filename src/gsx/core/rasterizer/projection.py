@@ -9,13 +9,13 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera, Frame
+from gsx.core.data.camera import Camera, Frame
 from gsx.core.errors import InputError
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.available import compile_rows, compiles
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.splats import Splats
 
 OPACITY_SLACK = 1e-3
 """ln of an opacity may exceed 0 by this, for rounding."""

@@ -8,11 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
-from gsx.core.quaternions import rotation_matrices
+from gsx.core.data.camera import Camera
+from gsx.core.gaussians.quaternions import rotation_matrices
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float
-from gsx.core.splats import Splats
 
 
 def whole(camera: Camera) -> Camera:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.camera import Camera
+from gsx.core.data.camera import Camera
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import Blocks, composite, make_blocks
@@ -14,7 +15,6 @@ from gsx.core.rasterizer.pairs import Pairs, pair
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.splats import Splats
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.shapes import Float
+from gsx.core.training.regenerator import Material, Request
 from gsx.regenerators.diffusion.options import UpscalerOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4
 from gsx.regenerators.diffusion.redraw import Diffusion

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, make_folder, make_room
+from gsx.core.data.images import read_image, resize, to_uint8, write_image
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.images import read_image, resize, to_uint8, write_image
-from gsx.core.regenerator import Material, Request
-from gsx.core.scene import View
 from gsx.core.shapes import Float
-from gsx.core.window import Window
+from gsx.core.training.regenerator import Material, Request
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.diffusion.models import (
     PACKAGES,

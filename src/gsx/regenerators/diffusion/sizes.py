@@ -6,8 +6,8 @@ A pipeline that is handed another size resizes without a word (spec 4), which mo
 import torch
 from torch import Tensor
 
+from gsx.core.data.window import Window
 from gsx.core.shapes import Float, Int
-from gsx.core.window import Window
 
 
 def fitting(side: int, multiple: int, least: int) -> int:

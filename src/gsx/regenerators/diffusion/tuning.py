@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, make_folder, make_room
+from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file, write_json
-from gsx.core.regenerator import Material
 from gsx.core.shapes import Float, Int
-from gsx.core.window import Window
+from gsx.core.training.regenerator import Material
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
 from gsx.regenerators.diffusion.pace import Pace

@@ -1,0 +1,1 @@
+"""Cameras, windows, views, scenes and their pictures."""

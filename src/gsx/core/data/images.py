@@ -1,0 +1,403 @@
+"""Images in and out through OpenImageIO, prefiltered resizing, 8-bit rounding, and photographs as truth of views.
+
+Images are uint8 display values [C, H, W], red first, alpha (if any) straight and last.
+"""
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.files import replacing
+from gsx.core.shapes import Float, UInt8
+
+FILTERS = ("bicubic", "area", "lanczos")
+LIGHTS = ("display", "linear")
+ZOOM_SLACK = 1.01  # sizes are rounded to whole pixels, so four times a quarter can be a little more than all
+JPEG_QUALITY = 95
+ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
+    1: (False, ()),
+    2: (False, (-1,)),
+    3: (False, (-2, -1)),
+    4: (False, (-2,)),
+    5: (True, ()),
+    6: (True, (-1,)),
+    7: (True, (-2, -1)),
+    8: (True, (-2,)),
+}  # EXIF 2.3 tag 0x0112: exchange rows and columns?, then which axes to flip
+
+Size = tuple[int, int]
+"""(width, height) in pixels."""
+
+
+def read_image(path: str | Path, *, upright: bool = False) -> UInt8[Tensor, "C H W"]:
+    """Decodes an image to 3 or, with alpha, 4 channels.
+
+    Grey becomes RGB, 16 bits are rounded to 8, floating-point files are taken as scene-linear light and get the
+    sRGB curve, premultiplied colours are divided by their alpha. With `upright` the EXIF orientation is applied;
+    by default the raster is as stored, which is what COLMAP, nerfstudio and 3D-GS state their cameras for.
+
+    Raises:
+        InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
+    """
+    pixels, spec = _decode(Path(path))
+    image = _display_bytes(_rgb_or_rgba(pixels, spec, path), _is_straight(spec), path)
+    image = image.permute(2, 0, 1).contiguous()
+    return _orient(image, _orientation(spec)) if upright else image
+
+
+def image_size(path: str | Path, *, upright: bool = False) -> Size:
+    """(width, height) as `read_image` with the same `upright` gives it, from the header alone.
+
+    Raises:
+        InputError: the file is missing or is no image.
+    """
+    reader = _open(Path(path))
+    spec = reader.spec()
+    reader.close()
+    swapped = upright and ORIENTATIONS[_orientation(spec)][0]
+    return (spec.height, spec.width) if swapped else (spec.width, spec.height)
+
+
+def checked_size(path: str | Path, expected: Size) -> Size:
+    """`image_size`, provided that the image is what the camera model was made for, or a uniform reduction of it.
+
+    Raises:
+        InputError: the size differs by more than the rounding to whole pixels.
+    """
+    size = image_size(path)
+    _refuse_other_size(path, size, expected)
+    return size
+
+
+def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
+    """Writes RGB as PNG or JPEG, by suffix, or straight RGBA as PNG; floats are rounded by `to_uint8`.
+
+    The file appears whole or not at all.
+
+    Raises:
+        InputError: the suffix does not suit, or the file cannot be written.
+    """
+    import OpenImageIO as oiio
+
+    path = Path(path)
+    suffixes = (".png", ".jpg", ".jpeg") if image.shape[0] == 3 else (".png",)
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"Image '{path}' has {image.shape[0]} channels, write it as {' or '.join(suffixes)}.")
+    rounded = image if image.dtype == torch.uint8 else to_uint8(image)
+    buffer = oiio.ImageBuf(np.ascontiguousarray(rounded.detach().cpu().permute(1, 2, 0).numpy()))
+    buffer.specmod().attribute("Compression", f"jpeg:{JPEG_QUALITY}")
+    buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
+    try:
+        with replacing(path) as partial:
+            if not buffer.write(str(partial)):
+                raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder's space.")
+    except OSError as problem:
+        raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), remove what is in its way.") from None
+
+
+def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    """Display values in [0, 1] rounded to 8 bits: x 255 + 0.5, clamped (spec 8.2)."""
+    return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Light of display values in [0, 1] (IEC 61966-2-1, sRGB)."""
+    return torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+def display_from_linear(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Display values of light, clamped to [0, 1] (IEC 61966-2-1, sRGB)."""
+    light = light.clamp(0, 1)
+    bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
+
+
+def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:
+    """Size to train at (spec 8.1): divided by `downscale` and rounded; else limited to `max_width` (0: no limit).
+
+    Raises:
+        ConfigError: downscale is below 1 or max_width below 0.
+    """
+    if downscale < 1 or max_width < 0:
+        raise ConfigError(
+            f"scene.downscale is {downscale} and scene.max_width {max_width}, they must be at least 1 and 0."
+        )
+    if downscale > 1:
+        return max(1, round(width / downscale)), max(1, round(height / downscale))
+    if max_width and width > max_width:
+        scale = width / max_width
+        return int(width / scale), max(1, int(height / scale))
+    return width, height
+
+
+def resize(
+    image: UInt8[Tensor, "C H W"], width: int, height: int, filter: str = "bicubic", light: str = "display"
+) -> UInt8[Tensor, "C height width"]:
+    """The image on another raster, each channel on its own: composite alpha first.
+
+    All filters widen with the reduction, so nothing aliases: Keys' cubic with a = -0.5, which on display values is
+    the published filter; the coverage of pixels by pixels (area); Lanczos with 3 lobes.
+
+    Raises:
+        ConfigError: an unknown filter or light.
+    """
+    _refuse_unknown("scene.resize_filter", filter, FILTERS)
+    _refuse_unknown("scene.resize_light", light, LIGHTS)
+    if image.shape[1:] == (height, width):
+        return image
+    across, down = _weights(image.shape[2], width, filter), _weights(image.shape[1], height, filter)
+    if light == "linear":
+        values = _down(_across(linear_from_display(image.float() / 255), across), down)
+        return to_uint8(display_from_linear(values))
+    values = _across(image.float(), across)
+    if filter == "bicubic":  # Pillow, whose result is the published one, keeps 8 bits between its two passes
+        values = _rounded(values).float()
+    return _rounded(_down(values, down))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResizeRule:
+    """How photographs become training images."""
+
+    filter: str
+    light: str
+    background: tuple[float, float, float]
+    """Display RGB in [0, 1] behind images with alpha."""
+
+    def __post_init__(self) -> None:
+        _refuse_unknown("scene.resize_filter", self.filter, FILTERS)
+        _refuse_unknown("scene.resize_light", self.light, LIGHTS)
+        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
+            raise ConfigError(f"scene.background is {list(self.background)}, give red, green and blue in [0, 1].")
+
+
+class ImageCache:
+    """Keeps the most recently used images that fit into `budget_bytes`."""
+
+    def __init__(self, budget_bytes: int) -> None:
+        self._budget = budget_bytes
+        self._used = 0
+        self._images: OrderedDict[Hashable, Tensor] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], UInt8[Tensor, "C H W"]]) -> UInt8[Tensor, "C H W"]:
+        """The image stored under `key`, or else what `make` returns, which is then stored."""
+        if key in self._images:
+            self._images.move_to_end(key)
+            return self._images[key]
+        image = make()
+        if image.numel() <= self._budget:
+            self._images[key] = image
+            self._used += image.numel()
+        while self._used > self._budget:
+            self._used -= self._images.popitem(last=False)[1].numel()
+        return image
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhotoSource:
+    """A photograph as the truth of one view (implements `gsx.core.data.scene.ImageSource`)."""
+
+    path: Path
+    rule: ResizeRule
+    cache: ImageCache
+    whole: Camera
+    """The camera of the whole photograph, after `remap`, at its own resolution: the finest truth there is."""
+    expected_size: Size | None = None
+    """(width, height) that the camera model states for the stored file; None: any."""
+    remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C height width"]] | None = None
+    """Undistortion or a reduction, applied to the decoded file; those that do the same compare equal."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """The photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
+
+        Raises:
+            InputError: the file cannot be read or has another size than the camera model states.
+            ValueError: `camera` reaches past the photograph.
+        """
+        across, down = camera.fx / self.whole.fx, camera.fy / self.whole.fy
+        width, height = round(self.whole.width * across), round(self.whole.height * down)
+        left = round(self.whole.cx * across - camera.cx)
+        top = round(self.whole.cy * down - camera.cy)
+        if left < 0 or top < 0 or left + camera.width > width or top + camera.height > height:
+            raise ValueError(f"a {camera.size} window at {left, top} reaches past '{self.path}' at {width, height}")
+        made_by = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
+        image = self.cache.get(made_by, lambda: self._resized(width, height))
+        return image[:, top : top + camera.height, left : left + camera.width]
+
+    def max_zoom(self, camera: Camera) -> float:
+        """How many times finer the photograph is than `camera`, with 1% for rounded sizes."""
+        return ZOOM_SLACK * self.whole.fx / camera.fx
+
+    def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
+        image = read_image(self.path)
+        if self.expected_size is not None:
+            _refuse_other_size(self.path, (image.shape[2], image.shape[1]), self.expected_size)
+        if self.remap is not None:
+            image = self.remap(image)
+        if image.shape[0] == 4:
+            image = composite(image, self.rule.background)
+        return resize(image, width, height, self.rule.filter, self.rule.light)
+
+
+def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, float]) -> UInt8[Tensor, "3 H W"]:
+    """Straight-alpha RGBA over a background, in double precision, then truncated to 8 bits (spec 2.2)."""
+    values = image.double() / 255
+    colour, alpha = values[:3], values[3:]
+    behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
+    return ((colour * alpha + behind * (1 - alpha)) * 255).to(torch.uint8)
+
+
+def _open(path: Path) -> Any:
+    """An OpenImageIO reader that leaves straight alpha alone."""
+    import OpenImageIO as oiio
+
+    if not path.is_file():
+        raise InputError(f"Image '{path}' does not exist, check the folder and the name.")
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)
+    reader = oiio.ImageInput.open(str(path), hints)
+    if reader is None:
+        raise InputError(f"Image '{path}' cannot be read ({oiio.geterror()}), convert it to PNG or JPEG.")
+    return reader
+
+
+def _decode(path: Path) -> tuple[np.ndarray, Any]:
+    """Pixels [H, W, C] in the file's own number type, and OpenImageIO's description of the file."""
+    reader = _open(path)
+    spec = reader.spec()
+    pixels = None if _is_cmyk(spec) else reader.read_image(spec.format)
+    error = reader.geterror()
+    reader.close()
+    if _is_cmyk(spec):
+        raise InputError(f"Image '{path}' is CMYK, whose colours need a printing profile: convert it to sRGB.")
+    if pixels is None or error:
+        raise InputError(f"Image '{path}' is damaged ({error}), copy or export it anew.")
+    if (spec.width, spec.height) != (spec.full_width, spec.full_height):
+        raise InputError(
+            f"Image '{path}' stores only a {spec.width} x {spec.height} window of its {spec.full_width} x"
+            f" {spec.full_height} pixels, write it whole."
+        )
+    return pixels, spec
+
+
+def _is_cmyk(spec: Any) -> bool:
+    names = ("jpeg:ColorSpace", "tiff:ColorSpace", "oiio:ColorSpace")
+    return any(spec.get_string_attribute(name).lower() in ("cmyk", "ycbcrk", "color separated") for name in names)
+
+
+def _rgb_or_rgba(pixels: np.ndarray, spec: Any, path: str | Path) -> np.ndarray:
+    """Grey repeated to three channels; anything but grey or RGB, with or without alpha, is refused."""
+    channels = pixels.shape[2]
+    if channels not in (1, 2, 3, 4) or (channels % 2 == 0 and spec.alpha_channel != channels - 1):
+        raise InputError(
+            f"Image '{path}' has channels {', '.join(spec.channelnames)}, keep only grey or RGB, with or without alpha."
+        )
+    return pixels[..., (0, 0, 0, 1)[: channels + 2]] if channels < 3 else pixels
+
+
+def _is_straight(spec: Any) -> bool:
+    return spec.alpha_channel < 0 or spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
+
+
+def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt8[Tensor, "H W C"]:
+    """Straight 8-bit display values of pixels of any number type."""
+    if pixels.dtype == np.uint8 and straight:
+        return torch.from_numpy(pixels)
+    is_light = np.issubdtype(pixels.dtype, np.floating)
+    full = 1.0 if is_light else float(np.iinfo(pixels.dtype).max)
+    values = torch.from_numpy(pixels.astype(np.float32) / full)
+    if values.isnan().any():
+        raise InputError(f"Image '{path}' holds values that are not numbers (NaN), render or export it anew.")
+    colour, alpha = values[..., :3], values[..., 3:]
+    if not straight:
+        colour = torch.where(alpha > 0, colour / alpha.clamp(min=torch.finfo(torch.float32).tiny), 0)
+    return to_uint8(torch.cat([display_from_linear(colour) if is_light else colour, alpha], dim=-1))
+
+
+def _orientation(spec: Any) -> int:
+    """EXIF orientation, 1 (as stored) where it is missing or undefined."""
+    value = spec.get_int_attribute("Orientation", 1)
+    return value if value in ORIENTATIONS else 1
+
+
+def _orient(image: UInt8[Tensor, "C H W"], orientation: int) -> UInt8[Tensor, "C height width"]:
+    exchange, flips = ORIENTATIONS[orientation]
+    return (image.transpose(1, 2) if exchange else image).flip(flips).contiguous()
+
+
+def _refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
+    """One factor of at least 1 must bring both expected sides to within a pixel of the file's."""
+    (width, height), (model_width, model_height) = size, expected
+    least = max(model_width / (width + 1), model_height / (height + 1))
+    most = min(model_width / max(width - 1, 1e-9), model_height / max(height - 1, 1e-9))
+    if not max(least, 1) <= most:
+        raise InputError(
+            f"Image '{path}' is {width} x {height} and the camera model says {model_width} x {model_height}: use the"
+            " images the cameras were computed from, as stored (a rotation kept in EXIF is not applied)."
+        )
+
+
+def _refuse_unknown(key: str, value: str, options: tuple[str, ...]) -> None:
+    if value not in options:
+        raise ConfigError(f"{key} is '{value}', use one of {', '.join(options)}.{nearest(value, options)}")
+
+
+def _across(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new W"]) -> Float[Tensor, "C H new"]:
+    return _down(values.transpose(1, 2), weights).transpose(1, 2)
+
+
+def _down(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new H"]) -> Float[Tensor, "C new W"]:
+    return torch.stack([weights @ channel.contiguous() for channel in values])
+
+
+def _rounded(levels: Float[Tensor, "C H W"]) -> UInt8[Tensor, "C H W"]:
+    """Values already in 0..255 to 8 bits; ties, which are exact on this scale, go up."""
+    return (levels + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size size"]:
+    """The filter as a sparse matrix whose rows add up to 1: what each new pixel takes from the old ones."""
+    ratio = size / new_size
+    stretch = max(ratio, 1.0)
+    reach = (1 + ratio) / 2 if filter == "area" else REACH[filter] * stretch
+    centre = ((torch.arange(new_size, dtype=torch.float64) + 0.5) * ratio)[:, None]
+    old = (centre - reach - 0.5).ceil().long() + torch.arange(math.floor(2 * reach) + 1)
+    distance = old + 0.5 - centre
+    weights = _overlap(distance, ratio) if filter == "area" else KERNELS[filter](distance / stretch)
+    weights = torch.where((distance.abs() <= reach) & (old >= 0) & (old < size), weights, 0)
+    weights /= weights.sum(1, keepdim=True)
+    new = torch.arange(new_size)[:, None].expand_as(old)
+    places = torch.stack([new.flatten(), old.clamp(0, size - 1).flatten()])
+    return torch.sparse_coo_tensor(
+        places, weights.flatten().float(), (new_size, size), check_invariants=False
+    ).coalesce()
+
+
+def _overlap(distance: Tensor, ratio: float) -> Tensor:
+    """Length shared by an old pixel (length 1) and a new one (length `ratio`), centres `distance` apart."""
+    return ((1 + ratio) / 2 - distance.abs()).clamp(0, min(1, ratio))
+
+
+def _keys(x: Tensor) -> Tensor:
+    """Keys (1981) with a = -0.5, for |x| <= 2."""
+    x = x.abs()
+    inner = (1.5 * x - 2.5) * x * x + 1
+    return torch.where(x < 1, inner, ((-0.5 * x + 2.5) * x - 4) * x + 2)
+
+
+def _lanczos(x: Tensor) -> Tensor:
+    """sinc windowed by its own central lobe, three times as wide, for |x| <= 3."""
+    return torch.sinc(x) * torch.sinc(x / 3)
+
+
+KERNELS = {"bicubic": _keys, "lanczos": _lanczos}
+REACH = {"bicubic": 2, "lanczos": 3}

@@ -1,0 +1,85 @@
+"""What every loader returns: views with truth at any resolution the data allow, points, extent, background."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.reduction import Reduction
+from gsx.core.shapes import Float, UInt8
+
+
+@runtime_checkable
+class ImageSource(Protocol):
+    """Where the truth of one view comes from: a photograph, or an analytic scene."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """The truth as `camera` sees it; `camera` is the view's own camera at any zoom, or a crop of that."""
+        ...
+
+    def max_zoom(self, camera: Camera) -> float:
+        """The largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and the image it took. Images are decoded when asked for and kept as uint8."""
+
+    name: str
+    camera: Camera
+    source: ImageSource
+    group: str = ""
+    """Name of the group the view is reported under, for example a BungeeNeRF scale; empty: none."""
+
+    def image(self) -> Float[Tensor, "3 H W"]:
+        """The truth at the camera's resolution, display values in [0, 1]."""
+        return self.source.image(self.camera).float() / 255.0
+
+    def zoom(self, factor: float) -> "View | None":
+        """The view sampled `factor` times as finely, or None where the data hold no such truth."""
+        if factor > self.source.max_zoom(self.camera):
+            return None
+        return replace(self, camera=self.camera.zoom(factor))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points that initialise a backbone."""
+
+    positions: Float[Tensor, "P 3"]
+    """World coordinates, float32."""
+    colours: UInt8[Tensor, "P 3"]
+    """Display RGB."""
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """A scene ready for training."""
+
+    name: str
+    train: Sequence[View]
+    test: Sequence[View]
+    points: PointCloud
+    background: Float[Tensor, "3"]
+    """Display colour behind the scene, in [0, 1]."""
+    extent: float
+    """1.1 x the largest distance of a training camera from their mean (3D-GS, spec 2.4)."""
+    reduction: Reduction = Reduction()
+    """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
+    notes: Sequence[str] = ()
+    """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
+
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera centre from the mean centre, in scene units (spec 2.4)."""
+    centres = torch.stack([camera.centre.double() for camera in cameras])
+    return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())

@@ -1,0 +1,306 @@
+"""Evaluation on held-out views: image quality, zoomed views against true finer pixels, size and speed.
+
+Beside each zoomed figure stands the naive competitor, the x1 render resized by bicubic interpolation: a zoomed render
+that loses to it adds artefacts, not detail.
+"""
+
+import hashlib
+import json
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import to_uint8
+from gsx.core.data.scene import View
+from gsx.core.gaussians.splats import Splats
+from gsx.core.quality.lpips import LpipsOptions, load_lpips
+from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
+from gsx.core.rasterizer import RasterSettings, rasterize_pieces
+from gsx.core.rasterizer.prepare import path_of
+from gsx.core.shapes import Float
+from gsx.core.training.remarks import gathered
+from gsx.core.training.run import Run
+
+LEAST_TILE_PIXELS = 16 * 16
+"""One tile of the published rasterizer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions:
+    """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
+
+    zoom: list[float]
+    quantise: bool
+    ssim: str
+    tile_pixels: int
+    lpips: LpipsOptions
+    remedy: str = ""
+    """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
+
+    def __post_init__(self) -> None:
+        if self.ssim not in SSIM_VARIANTS:
+            raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
+        if not self.zoom or not all(0 < factor < math.inf for factor in self.zoom):
+            raise ValueError(f"eval.zoom is {list(self.zoom)}; give positive factors, for example [1,2,4]")
+        if self.tile_pixels < LEAST_TILE_PIXELS:
+            raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
+
+
+@dataclass(frozen=True, eq=False)
+class Tiled:
+    """A picture rendered piece by piece."""
+
+    image: Float[Tensor, "3 H W"]
+    visible: int
+    """Splats with a radius on the whole raster."""
+    dropped: int
+    """Splats left out because a value of theirs cannot be drawn."""
+
+
+def render_tiled(
+    splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"], pixels: int
+) -> Tiled:
+    """Render in pieces of at most `pixels`, so that memory does not grow with the picture; clamped to [0, 1]."""
+    mosaic = rasterize_pieces(splats, camera, raster, background=background, pixels=pixels)
+    return Tiled(mosaic.image.clamp_(0, 1), int(mosaic.visible.sum()), mosaic.dropped)
+
+
+@torch.no_grad()
+def render_view(run: Run, view: View, pixels: int) -> Tiled:
+    """The run's model from a view's camera."""
+    run.backbone.begin(max(1, run.step))
+    return render_tiled(run.backbone.splats(view.camera), view.camera, run.raster, run.background, pixels)
+
+
+def render_seconds(times: Sequence[float]) -> float:
+    """Median of up to 10 renders after the first, which warms up; of that one where there is no other."""
+    return statistics.median(times[1:11] or times)
+
+
+def peak_memory_mb(device: torch.device) -> float | None:
+    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes); None where Python is not told it."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
+    """What two results must share to be compared, and its hash."""
+    protocol = {
+        "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
+        "test_views": [view.name for view in run.scene.test],
+        "train_views": len(run.scene.train),
+        "size": list(run.scene.test[0].camera.size),
+        "background": run.scene.background.tolist(),
+        "quantised_to_8_bit": options.quantise,
+        "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
+        "ssim": options.ssim,
+        "lpips": lpips_name,
+        "enlarged": "x1 render, antialiased Keys bicubic",
+    }
+    text = json.dumps(protocol, sort_keys=True, default=str)
+    # which zooms were looked at changes no figure, so it does not enter the hash
+    return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """Mean, or None where a value is missing."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+def highest(values: Sequence[float | None]) -> float | None:
+    """The largest known value, or None where none is known."""
+    return max((value for value in values if value is not None), default=None)
+
+
+def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Means over the views of a group."""
+    keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
+    return {name: mean([view[key] for view in views]) for name, key in keys.items()}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Zoomed:
+    """A view at a zoom: the truth there, the render, and the x1 render resized to it, as they are measured."""
+
+    view: View
+    factor: float
+    truth: Float[Tensor, "3 H W"]
+    render: Float[Tensor, "3 H W"]
+    enlarged: Float[Tensor, "3 H W"]
+
+
+@runtime_checkable
+class Drawing(Protocol):
+    """Who draws views while their truth and renders are at hand; views are counted as in `scene.test`."""
+
+    def choose(self, figures: Sequence[dict[str, Any]]) -> None:
+        """Learns the figures of all views at the training resolution, before the first is drawn."""
+        ...
+
+    def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
+        """A view at the training resolution."""
+        ...
+
+    def zoomed(self, number: int, zoomed: Zoomed) -> None:
+        """The same view at another zoom; all of its zooms come before the next view."""
+        ...
+
+
+Advance = Callable[[float, str], None]
+"""Told after each picture: its size in units of an x1 picture, and what it was."""
+
+
+def silent(amount: float, part: str) -> None:
+    """Tells nobody."""
+
+
+class Evaluator:
+    """Measures one run by one protocol; each view is rendered once at each zoom."""
+
+    def __init__(self, run: Run, options: EvalOptions) -> None:
+        self.run, self.options = run, options
+        self.lpips = load_lpips(options.lpips)
+        self.times: list[float] = []
+        """Seconds of each render at the training resolution."""
+        self.kept: dict[View, Tensor] = {}
+        """Those renders, as bytes where they are quantised."""
+
+    def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """The picture as metrics see it."""
+        return quantise(image) if self.options.quantise else image
+
+    def view(self, view: View) -> dict[str, Any]:
+        """Figures of one view at the training resolution."""
+        begun = time.perf_counter()
+        tiled = render_view(self.run, view, self.options.tile_pixels)
+        self.times.append(time.perf_counter() - begun)
+        image, truth = self.measured(tiled.image), view.image()
+        self.kept[view] = to_uint8(image) if self.options.quantise else image
+        return {
+            "name": view.name,
+            "group": view.group,
+            "psnr": psnr(image, truth),
+            "ssim": ssim(image, truth, self.options.ssim),
+            "lpips": None if self.lpips is None else self.lpips.distance(image, truth),
+            "visible": tiled.visible,
+            "left_out": tiled.dropped,
+        }
+
+    def whole(self, view: View) -> Float[Tensor, "3 H W"]:
+        """The render of a view that was measured."""
+        kept = self.kept[view]
+        return kept.float() / 255 if self.options.quantise else kept
+
+    def zoomed(self, view: View, factor: float) -> Zoomed | None:
+        """A measured view at `factor` times the resolution, or None where there is no truth."""
+        finer = view.zoom(factor)
+        if finer is None:
+            return None
+        whole, render = self.whole(view), render_view(self.run, finer, self.options.tile_pixels).image
+        return Zoomed(
+            view=finer,
+            factor=factor,
+            truth=finer.image(),
+            render=self.measured(render),
+            enlarged=self.measured(bicubic(whole, *finer.camera.size)),
+        )
+
+    def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
+        """Figures of one view at a zoom, beside those of its competitor."""
+        kind = self.options.ssim
+        return {
+            "psnr": psnr(zoomed.render, zoomed.truth),
+            "ssim": ssim(zoomed.render, zoomed.truth, kind),
+            "enlarged_psnr": psnr(zoomed.enlarged, zoomed.truth),
+            "enlarged_ssim": ssim(zoomed.enlarged, zoomed.truth, kind),
+        }
+
+    def work(self) -> float:
+        """What `advance` will be told in all."""
+        test = self.run.scene.test
+        zooms = [f for view in test for f in self.options.zoom if f != 1 and view.zoom(f) is not None]
+        return len(test) + sum(factor**2 for factor in zooms)
+
+    def views(self, advance: Advance = silent) -> list[dict[str, Any]]:
+        """Figures of all views at the training resolution."""
+        out = []
+        for view in self.run.scene.test:
+            out.append(self.view(view))
+            advance(1, view.name)
+        return out
+
+    def zooms(
+        self, views: Sequence[dict[str, Any]], drawing: Drawing | None = None, advance: Advance = silent
+    ) -> dict[str, dict[str, Any]]:
+        """Mean figures at each zoom, from those of `views` and of zoomed views; all of them are drawn on the way."""
+        found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
+        for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
+            if drawing is not None:
+                drawing.whole(number, view, self.whole(view))
+            for factor, figures in found.items():
+                if factor == 1:  # nothing is enlarged
+                    figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
+                elif zoomed := self.zoomed(view, factor):
+                    figures.append(self.zoom_figures(zoomed))
+                    if drawing is not None:
+                        drawing.zoomed(number, zoomed)
+                    advance(factor**2, f"{view.name} x{factor:g}")
+        return {f"{factor:g}": zoom_entry(factor, figures) for factor, figures in found.items()}
+
+    def evaluate(self, drawing: Drawing | None = None, advance: Advance = silent) -> dict[str, Any]:
+        """The content of evaluation.json."""
+        run, views = self.run, self.views(advance)
+        primitives, size = run.backbone.size()
+        groups = sorted({v["group"] for v in views if v["group"]})
+        by_group = {name: [v for v in views if v["group"] == name] for name in groups}
+        figures = ("psnr", "ssim", "lpips")
+        if drawing is not None:
+            drawing.choose(views)
+        return {
+            "protocol": protocol_of(run, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
+            "step": run.step,
+            **{key: mean([v[key] for v in views]) for key in figures},
+            "primitives": primitives,
+            "visible_primitives": statistics.fmean(v["visible"] for v in views),
+            "left_out": statistics.fmean(v["left_out"] for v in views),
+            **gathered(run.curves),
+            "megabytes": size / 1e6,
+            "render_fps": 1 / render_seconds(self.times),
+            "render_path": path_of(run.raster, run.device),
+            "train_seconds": run.seconds,
+            "peak_memory_mb": highest([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
+            "groups": {name: group_figures(vs) for name, vs in by_group.items()},
+            "zoom": self.zooms(views, drawing, advance),
+            "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
+        }
+
+
+def zoom_entry(factor: float, figures: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Mean figures at one zoom, with the verdict; or a reason why there are none."""
+    if not figures:
+        return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
+    means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
+    gain = means["psnr"] - means["enlarged_psnr"]
+    return means | {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
+
+
+def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
+    """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
+    stride = max(1, len(run.scene.test) // count)
+    views = run.scene.test[::stride][:count]
+    return statistics.fmean(psnr(render_view(run, v, options.tile_pixels).image, v.image()) for v in views)

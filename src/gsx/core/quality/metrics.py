@@ -1,0 +1,70 @@
+"""PSNR and SSIM by their published definitions (spec 8.2). Images are display values in [0, 1]."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from gsx.core.quality.losses import WINDOW, ssim_map
+from gsx.core.shapes import Float
+
+SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
+STRIP_PIXELS = 1 << 16
+"""Pixels whose SSIM is taken at once: nine maps of them are 2.4 MB."""
+
+
+def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
+    """Rounded to 8 bits as a saved PNG would be: x 255, + 0.5, clamp, truncate."""
+    return (image * 255 + 0.5).clamp(0, 255).floor() / 255
+
+
+def psnr(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
+    """20 log10(1 / sqrt(MSE)) over all pixels and channels, dB; inf for equal images."""
+    error = float((image.double() - target.double()).square().mean())
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant: str) -> float:
+    """Structural similarity in [-1, 1].
+
+    They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
+    `torchmetrics`: the same with reflected borders, as torchmetrics since 1.5. `valid`: mean over the pixels whose
+    window lies inside, as the original SSIM and pytorch-msssim.
+    """
+    if variant == "inria":
+        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4))
+    if variant == "torchmetrics":
+        return whole_windows(reflected(image), reflected(target))
+    if variant == "valid":
+        return whole_windows(image, target)
+    raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
+
+
+def reflected(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+    """Extended by half a window on each side; borders narrower than that are repeated, not reflected."""
+    half = WINDOW // 2
+    return pad(image, (half,) * 4, mode="reflect" if min(image.shape[1:]) > half else "replicate")
+
+
+def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
+    """Mean SSIM where the window fits; pictures smaller than a window are extended by their border first.
+
+    In strips of rows, so that its maps stay in the CPU's cache.
+    """
+    missing = [max(0, WINDOW - size) for size in (image.shape[2], image.shape[1])]
+    margin = [half for size in missing for half in (size // 2, size - size // 2)]
+    if any(missing):
+        image, target = (pad(picture, margin, mode="replicate") for picture in (image, target))
+    count, rows = image.shape[1] - WINDOW + 1, max(1, STRIP_PIXELS // image.shape[2])
+    total = 0.0
+    for top in range(0, count, rows):
+        strip = slice(top, min(top + rows, count) + WINDOW - 1)
+        total += float(ssim_map(image[:, strip], target[:, strip], padding=0).double().sum())
+    return total / (len(image) * count * (image.shape[2] - WINDOW + 1))
+
+
+def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:
+    """Resized by Keys' cubic interpolation, antialiased, clamped to [0, 1]: the naive competitor of a zoomed render."""
+    larger = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)
+    return larger[0].clamp(0, 1)

@@ -1,0 +1,137 @@
+"""Checkpoints: safetensors and a JSON sidecar with its sha256, written atomically, no pickle.
+
+A checkpoint holds everything a resumed run needs to continue bit for bit. The sidecar is written last: a checkpoint
+without one does not exist. A damaged checkpoint is named, and the one before it is used.
+"""
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.errors import CheckpointError
+from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.training.run import Run
+
+logger = logging.getLogger(__name__)
+
+SCHEMA = 1
+GENERATOR = "run.generator"
+
+
+def save(run: Run) -> Path:
+    """Write the checkpoint of the current step and drop all but the newest `training.checkpoints_kept`."""
+    folder = run.folder / "checkpoints"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = write(run, folder)
+    for old in sidecars(folder)[: -run.training.checkpoints_kept]:
+        old.unlink()
+        old.with_suffix(".safetensors").unlink(missing_ok=True)
+    return path
+
+
+def write(run: Run, folder: Path) -> Path:
+    """Write a checkpoint of the current step into a folder."""
+    from safetensors.torch import save as to_bytes
+
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in run.backbone.tensors().items()}
+    tensors[GENERATOR] = run.generator.get_state()
+    data = to_bytes(tensors)
+    path = folder / f"step_{run.step:07d}.safetensors"
+    replace_file(path, data)
+    sidecar = {
+        "schema": SCHEMA,
+        "step": run.step,
+        "seconds": run.seconds,
+        "sampler": run.sampler.order,
+        "orders": run.sampler.begun,
+        "views": names_of(run),
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    write_json(path.with_suffix(".json"), sidecar)
+    return path
+
+
+def names_of(run: Run) -> dict[str, list[str]]:
+    """Names of the training and test views: a run goes on with these or not at all."""
+    return {"train": [v.name for v in run.scene.train], "test": [v.name for v in run.scene.test]}
+
+
+def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
+    """Raise CheckpointError if the scene now has other views, or splits them otherwise, than when it was trained."""
+    for part, names in names_of(run).items():
+        if names != trained[part]:
+            changed = sorted(set(names) ^ set(trained[part]))
+            raise CheckpointError(
+                f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
+                f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
+            )
+
+
+def sidecars(folder: Path) -> list[Path]:
+    """Sidecars of a checkpoint folder, oldest first."""
+    return sorted(folder.glob("step_*.json"))
+
+
+def step_of(sidecar: Path) -> int:
+    """The step a checkpoint was written at."""
+    return int(sidecar.stem.removeprefix("step_"))
+
+
+def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Sidecar and tensors of one checkpoint.
+
+    Raises:
+        CheckpointError: it is missing, truncated, altered, or of another schema.
+    """
+    from safetensors.torch import load as from_bytes
+
+    path = sidecar.with_suffix(".safetensors")
+    try:
+        meta, data = read_json(sidecar), path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+    if meta.get("schema") != SCHEMA:
+        raise CheckpointError(
+            f"checkpoint {path} has schema {meta.get('schema')}, this gsx reads schema {SCHEMA}: "
+            "use the version of gsx named in the run's environment.json"
+        )
+    if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
+        raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
+    return meta, from_bytes(data)
+
+
+def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The newest undamaged checkpoint of a run folder; damaged ones are named in the log.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    problems = []
+    for sidecar in reversed(sidecars(folder / "checkpoints")):
+        try:
+            return read(sidecar)
+        except CheckpointError as error:
+            logger.warning("%s", error)
+            problems.append(str(error))
+    if problems:
+        raise CheckpointError(f"no checkpoint in {folder / 'checkpoints'} is usable: {problems[0]}")
+    raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
+
+
+def restore(run: Run) -> None:
+    """Bring a freshly built run to the state of its newest checkpoint."""
+    meta, tensors = newest(run.folder)
+    refuse_other_views(run, meta["views"])
+    run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
+    run.backbone.restore(tensors)
+    run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
+    run.sampler.order = list(meta["sampler"])
+    run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
+    for sidecar in sidecars(run.folder / "checkpoints") if run.ranks.first else ():
+        # newer ones are damaged; they must not outlive good ones
+        if sidecar.stem > f"step_{run.step:07d}":
+            sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -1,0 +1,152 @@
+"""Which run a composition is: one name for one training, wherever and however it is carried out."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from gsx.core.cache import content_key, tree_stamp
+from gsx.core.errors import InputError
+from gsx.core.locks import lock
+from gsx.core.run_folder.files import RunFiles, part
+
+WHERE = ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
+"""Keys that say where and how a run is carried out."""
+NAMES = ("variant", "length", "budget", "dataset")
+"""Keys that name what other keys hold."""
+JUDGING = ("eval", "metrics")
+"""Keys of what is looked at when training is over."""
+OPERATING = ("cache_gb", "download", "offload", "batch_pixels", "slicing")
+"""Keys of scenes and regenerators that say with which means, and change no result."""
+WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
+"""Keys of `training` that change nothing at all."""
+ELSEWHERE = ("path", "iterations")
+"""Keys of scenes that count as what they lead to: what lies in the folder (`scene_stamp`), the length of the run."""
+
+
+def trained(config: dict[str, Any]) -> dict[str, Any]:
+    """What of a resolved composition decides what is trained, beside what its scene holds (`scene_stamp`)."""
+    told = (*WHERE, *NAMES, *JUDGING, "regenerator")
+    kept = {key: value for key, value in config.items() if key not in told}
+    kept["regenerator"] = {role: without(node, OPERATING) for role, node in asked_for(config).items()}
+    scene = without(part(config, "scene"), OPERATING)
+    kept["scene"] = {key: value for key, value in scene.items() if key not in ELSEWHERE}
+    kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
+    return kept
+
+
+def asked_for(config: dict[str, Any]) -> dict[str, Any]:
+    """The regenerators that augmenters may ask for: those of their roles, or all where one does not name its role."""
+    nodes = [node for node in part(config, "augmenter").values() if isinstance(node, dict)]
+    roles = {node.get("role") for node in nodes}
+    return {role: node for role, node in part(config, "regenerator").items() if roles & {role, None}}
+
+
+def without(node: Any, keys: tuple[str, ...]) -> Any:
+    """A node without some keys, at any depth."""
+    if not isinstance(node, dict):
+        return node
+    return {key: without(value, keys) for key, value in node.items() if key not in keys}
+
+
+def scene_stamp(config: dict[str, Any]) -> str:
+    """What the scene of a composition holds: names, sizes and times of the files in its folder, wherever that lies.
+
+    Empty for scenes without a folder; `absent: FOLDER` where it is not there. Files outside of the folder count if an
+    option of the scene names them.
+    """
+    scene = part(config, "scene")
+    if not scene.get("path"):
+        return ""
+    path = Path(str(scene["path"])).expanduser()
+    if not path.exists():
+        return f"absent: {path}"
+    folder = path if path.is_dir() else path.parent
+    output = Path(str(config.get("output", "outputs")))
+    stamps = [tree_stamp(place, output) for place in (folder, *outside(scene, folder))]
+    return content_key("" if path.is_dir() else path.name, stamps)
+
+
+def outside(scene: dict[str, Any], folder: Path) -> list[Path]:
+    """Files and folders beyond the scene's own that its options name."""
+    values = [value for key, value in scene.items() if key != "path" and isinstance(value, str)]
+    leading = [value for value in values if Path(value).is_absolute() or value.startswith("..")]
+    return [folder / value for value in leading if (folder / value).exists()]
+
+
+def trained_on(files: RunFiles) -> str:
+    """The stamp of the scene when the run began."""
+    return str(part(files.environment, "scene").get("stamp", ""))
+
+
+def other_revision(files: RunFiles, this: str) -> str:
+    """The revision of gsx's source that trained a run, or several; empty if it is `this` one, or unknown."""
+    revision = str(files.environment.get("source") or "")
+    return "" if revision == this else revision
+
+
+def composition_key(config: dict[str, Any], stamp: str) -> str:
+    """A short digest: compositions that train the same have the same; `stamp`: of the scene (`scene_stamp`)."""
+    return content_key(sorted_items(trained(config)), stamp)
+
+
+def sorted_items(value: Any) -> Any:
+    """A value whose text does not depend on the order in which mappings were written, but for that of augmenters."""
+    if isinstance(value, dict):
+        items = [(key, inner) for key, inner in value.items()]
+        return [
+            (key, [(name, sorted_items(node)) for name, node in inner.items()])
+            if key == "augmenter" and isinstance(inner, dict)
+            else (key, sorted_items(inner))
+            for key, inner in sorted(items, key=lambda item: str(item[0]))
+        ]
+    return [sorted_items(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def place_of(config: dict[str, Any], stamp: str) -> Path:
+    """The folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
+    scene = part(config, "scene")
+    name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
+    backbone = str(part(config, "backbone").get("name"))
+    output = Path(str(config.get("output", "outputs")))
+    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config, stamp)
+
+
+def judging(config: dict[str, Any]) -> dict[str, Any]:
+    """How a composition wants to be judged; saved with every evaluation."""
+    return {key: config.get(key) for key in JUDGING}
+
+
+def finished(files: RunFiles, config: dict[str, Any], stamp: str) -> bool:
+    """Whether a run folder holds all that a composition asks for: trained to the end, just so and on a scene of that
+    stamp, and judged the same."""
+    return (
+        files.status.get("state") == "ok"
+        and files.evaluation.get("step") == config["iterations"]
+        and files.evaluation.get("judged") == judging(config)
+        and composition_key(files.config, trained_on(files)) == composition_key(config, stamp)
+    )
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[bool]:
+    """Whether this process alone works on a folder, as long as the context lasts; the claim of a killed one is void."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / f".{folder.name}.lock").open("w") as stream:
+        yield locked(stream, folder)
+
+
+def locked(stream: IO[str], folder: Path) -> bool:
+    """Whether this process has got the lock of an open file.
+
+    Raises:
+        InputError: the file system knows no locks.
+    """
+    try:
+        return lock(stream)
+    except OSError as error:
+        raise InputError(
+            f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
+            "training the same run: choose another place, output=FOLDER"
+        ) from error

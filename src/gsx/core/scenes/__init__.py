@@ -1,1 +1,0 @@
-"""Built-in scene loaders: one per format, one `Scene` out."""

@@ -1,5 +1,0 @@
-"""The built-in scene: a small garden still life, ray-cast in closed form, with exact truth at any zoom and crop."""
-
-from gsx.core.scenes.demo.views import DemoOptions, DemoSource, load
-
-__all__ = ["DemoOptions", "DemoSource", "load"]

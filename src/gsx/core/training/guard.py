@@ -1,0 +1,84 @@
+"""Stops a run that has gone bad: skips steps with a non-finite loss or gradient and names the culprit.
+
+A run on several processes is also stopped when these no longer hold the same model.
+"""
+
+import hashlib
+import logging
+
+import torch
+
+from gsx.core.errors import Disagreement, TrainingError
+from gsx.core.plugins import hookimpl
+from gsx.core.training.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+PATIENCE = 3
+"""Bad steps in a row that end the run (DESIGN section 7)."""
+
+
+class Guard:
+    """Listener: vetoes bad steps; the run ends with a checkpoint after three in a row."""
+
+    def __init__(self) -> None:
+        self.in_a_row = 0
+
+    @hookimpl
+    def gsx_gradients_ready(self, run: Run, step: Step) -> str | None:
+        """The reason to skip the step, if any.
+
+        Raises:
+            TrainingError: this is the third bad step in a row.
+        """
+        reason = culprit(run, step)
+        if reason is None:
+            self.in_a_row = 0
+            return None
+        self.in_a_row += 1
+        logger.warning("step %d on view %s skipped: %s", step.number, step.view.name, reason)
+        if self.in_a_row >= PATIENCE:
+            raise TrainingError(
+                f"{PATIENCE} steps in a row were not finite, last at step {step.number}, view {step.view.name}: "
+                f"{reason}; look at that view, or lower the learning rates"
+            )
+        return reason
+
+
+def culprit(run: Run, step: Step) -> str | None:
+    """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
+    if not bool(torch.isfinite(step.loss)):
+        return f"the loss is {float(step.loss)}"
+    for name, gradient in run.backbone.gradients():
+        if not bool(torch.isfinite(gradient.sum())):
+            rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
+            if rows == 0:  # every value is finite, only their sum overflowed
+                continue
+            return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
+    return None
+
+
+class Agreement:
+    """Listener: at the steps of checkpoints all ranks must hold the same state."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Compare digests when due.
+
+        Raises:
+            Disagreement: they differ.
+        """
+        due = run.step % run.training.checkpoint_every == 0 or run.complete
+        if due and run.ranks.size > 1 and len(set(run.ranks.everyone(digest(run)))) > 1:
+            raise Disagreement(
+                f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
+                f"checkpoint before, if there is one, with gsx resume {run.folder}"
+            )
+
+
+def digest(run: Run) -> str:
+    """Of everything that the next steps depend on."""
+    content = hashlib.sha256(repr((run.sampler.order, run.sampler.begun)).encode())
+    for name, value in sorted({"generator": run.generator.get_state(), **run.backbone.tensors()}.items()):
+        content.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return content.hexdigest()

@@ -1,0 +1,97 @@
+"""Several views in one step, on one process or on several: their gradients, losses and sightings become those of one.
+
+Every view's own loss is sent back, and the sums are divided in the end. Of a step's sightings each counts by its weight
+in the mean loss (`density.Statistics`), so that published thresholds hold for any number of views.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import torch
+
+from gsx.core.training.backbone import Backbone
+from gsx.core.training.run import Run, Step
+
+
+@contextmanager
+def views_of_step(run: Run) -> Iterator[list[int]]:
+    """Numbers of the views of the next step.
+
+    A step that fails has not been taken: a checkpoint written then begins with the same views and colours again.
+    """
+    colours, batch = run.generator.get_state(), run.sampler.take()
+    try:
+        yield batch
+    except Exception:
+        run.generator.set_state(colours)
+        run.sampler.put_back()
+        raise
+
+
+@contextmanager
+def added_up(backbone: Backbone) -> Iterator[None]:
+    """A view begins without gradients, because its terms may forget some, and ends with the sums of all so far."""
+    before = dict(backbone.gradients())
+    for _, parameter in backbone.parameters():
+        parameter.grad = None
+    yield
+    for name, parameter in backbone.parameters():
+        if name in before:
+            parameter.grad = before[name] if parameter.grad is None else before[name].add_(parameter.grad)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Account:
+    """What a rank tells the others of its views after their backward passes."""
+
+    losses: list[float]
+    terms: list[dict[str, float]]
+    dropped: int
+    learnt: set[str]
+    """Parameters that have a gradient."""
+
+
+def account_of(run: Run, steps: Sequence[Step]) -> Account:
+    """The account of this rank, of a step for each of its views."""
+    return Account(
+        losses=[float(step.loss) for step in steps],
+        terms=[step.terms for step in steps],
+        dropped=sum(step.dropped for step in steps),
+        learnt={name for name, _ in run.backbone.gradients()},
+    )
+
+
+def merged(run: Run, steps: Sequence[Step]) -> Step:
+    """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
+    accounts = run.ranks.everyone(account_of(run, steps))
+    average(run, set().union(*(account.learnt for account in accounts)))
+    losses = [loss for account in accounts for loss in account.losses]
+    return replace(
+        steps[0],
+        loss=torch.tensor(losses, device=run.device).mean(),
+        terms=mean_terms(losses, [terms for account in accounts for terms in account.terms]),
+        seen=run.ranks.gathered([seen for step in steps for seen in step.seen], run.device),
+        dropped=sum(account.dropped for account in accounts),
+        others=steps[1:],
+    )
+
+
+def average(run: Run, learnt: set[str]) -> None:
+    """Turn sums of gradients on each rank into the mean over the batch on all; `learnt`: parameters that have any."""
+    moved = [parameter for name, parameter in run.backbone.parameters() if name in learnt]
+    for parameter in moved:
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    gradients = [parameter.grad for parameter in moved if parameter.grad is not None]
+    run.ranks.add(gradients)
+    for gradient in gradients:
+        gradient /= run.training.batch
+
+
+def mean_terms(losses: Sequence[float], terms: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Mean of every part of the loss over views; those without parts have the backbone's own alone. None: no parts."""
+    if not any(terms):
+        return {}
+    whole = [parts or {"own": loss} for loss, parts in zip(losses, terms, strict=True)]
+    names = dict.fromkeys(name for parts in whole for name in parts)
+    return {name: sum(parts.get(name, 0.0) for parts in whole) / len(whole) for name in names}

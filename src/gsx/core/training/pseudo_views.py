@@ -1,0 +1,191 @@
+"""Pseudo details: pictures that nobody took, which training uses as truth for a while (spec 1.1-1.3)."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, Frame
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import Scene
+from gsx.core.files import replace_file
+from gsx.core.shapes import Float, UInt8
+from gsx.core.training.regenerator import Regenerator
+
+if TYPE_CHECKING:
+    from gsx.core.training.run import Run
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PseudoView:
+    """A camera and the picture it is to show."""
+
+    camera: Camera
+    target: UInt8[Tensor, "3 h w"]
+    parent: int
+    """Number of the training view it was made from."""
+    trust: UInt8[Tensor, "h w"] | None = None
+    """Weight of each pixel in the loss, 255 counts whole; None: all count whole."""
+    coarse: UInt8[Tensor, "3 l m"] | None = None
+    """What is known of it at a lower resolution: what it reduces to."""
+    coarse_weight: float = 0.0
+    """Of the mean difference at that resolution, beside that of the pixels."""
+    reduction: Reduction = Reduction()
+    """By which it becomes `coarse`, but for the rim: that takes from beyond the window."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Where it comes from: kind, event, regenerator, seed, hash. JSON-serialisable."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Term:
+    """What an augmenter adds to the loss of one step: the sum of weight times the mean difference."""
+
+    name: str
+    parts: Sequence[tuple[PseudoView, float]]
+    """Pseudo views with their weights."""
+    taken: float
+    """Share of the backbone's own loss that this term takes the place of; 0: it is added (spec 1.3)."""
+    observed: bool
+    """Whether the renders count in density control (the authors' code does so), each by its weight in `parts`. That is
+    the weight of the mean difference whatever its kind: squares, or what is known at a lower resolution beside it."""
+    shared: bool
+    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
+    squared: bool = False
+    """Differences are (render - target)^2 instead of the paper's |render - target|."""
+
+
+@runtime_checkable
+class Augmenter(Protocol):
+    """Makes pseudo views from training views, and says when they count."""
+
+    def term(self, run: "Run", step: int, view: int) -> Term | None:
+        """What this step adds for the training view that was picked; None outside the active windows.
+
+        The first call of a window makes its pseudo views, from the model as it is then.
+        """
+        ...
+
+    def begins(self) -> int:
+        """Steps that a run has in common with one without this augmenter."""
+        ...
+
+    def plan(self) -> dict[str, Any]:
+        """The rescaled schedule in absolute steps, for the log and the report."""
+        ...
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """An augmenter that tells what became of the pictures it asked for; metrics.jsonl and evaluations count them."""
+
+    def told(self, step: int) -> dict[str, Any]:
+        """At the first step that asks for new pictures their `event`, and by scale how many were `asked` for, how many
+        `dropped`, and `warned` of by check; else empty. JSON-serialisable."""
+        ...
+
+
+@runtime_checkable
+class Foretold(Protocol):
+    """Options of an augmenter that tell, before there is a scene, where it begins; plans over many runs ask."""
+
+    def begins(self, iterations: int) -> int:
+        """What `Augmenter.begins` will say in a run of that length."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Setting:
+    """What an augmenter is built from."""
+
+    name: str
+    scene: Scene
+    iterations: int
+    seed: int
+    regenerator: Callable[[str], Regenerator]
+    """The regenerator of a role, `upscale` or `restore`."""
+
+
+def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
+    """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3); that at a lower resolution
+    beside it where that is known (SRGS, spec 6.1). `squared`: (render - target)^2 in both."""
+    size = torch.square if squared else torch.abs
+    difference = size(image - view.target.to(image.device).float() / 255)
+    if view.trust is not None:
+        difference = difference * (view.trust.to(image.device).float() / 255)
+    if view.coarse is None:
+        return difference.mean()
+    reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])
+    off = view.reduction.inner(reduced - view.coarse.to(image.device).float() / 255)
+    return difference.mean() + view.coarse_weight * size(off).mean()
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
+    """Write pseudo views and `facts` as one safetensors file, whole or not at all."""
+    from safetensors.torch import save
+
+    tensors: dict[str, Tensor] = {}
+    listed = []
+    for number, view in enumerate(views):
+        held = {"target": view.target, "rotation": view.camera.rotation, "translation": view.camera.translation}
+        held |= {name: value for name in ("trust", "coarse") if (value := getattr(view, name)) is not None}
+        tensors |= {
+            f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
+        }
+        entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
+        listed.append(entry | {"camera": intrinsics(view.camera), "reduction": asdict(view.reduction)})
+    text = json.dumps({"facts": facts, "views": listed})
+    replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
+
+
+def intrinsics(camera: Camera) -> dict[str, Any]:
+    """Everything of a camera but its pose, as plain values."""
+    frame = camera.cut_from
+    return {
+        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")},
+        "cut_from": None if frame is None else [frame.left, frame.top, frame.width, frame.height],
+    }
+
+
+def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
+    """(views, facts) as `save_views` wrote them.
+
+    Raises:
+        OSError, ValueError: the file cannot be read.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            content = json.loads(file.metadata()["gsx"])
+            names = set(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names}
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
+    return [view_of(number, entry, tensors) for number, entry in enumerate(content["views"])], content["facts"]
+
+
+def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> PseudoView:
+    """One view of a file."""
+    values = dict(entry["camera"])
+    frame = values.pop("cut_from")
+    corner = None if frame is None else Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])
+    camera = Camera(
+        rotation=tensors[f"{number}.rotation"], translation=tensors[f"{number}.translation"], cut_from=corner, **values
+    )
+    return PseudoView(
+        camera=camera,
+        target=tensors[f"{number}.target"],
+        parent=entry["parent"],
+        trust=tensors.get(f"{number}.trust"),
+        coarse=tensors.get(f"{number}.coarse"),
+        coarse_weight=entry["coarse_weight"],
+        reduction=Reduction(**entry.get("reduction", {})),
+        provenance=entry["provenance"],
+    )

@@ -1,0 +1,117 @@
+"""What a reader must know beside the figures of a run: growth held at a cap, pictures lost, splats left out."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from gsx.core.plugins import hookimpl
+from gsx.core.training.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+CHECKS = {
+    "colour": "changed their mean colour",
+    "agreement": "disagree with their input",
+    "displacement": "are displaced",
+}
+"""What pictures did that a check has warned of."""
+
+
+class CapNotice:
+    """Listener: says once that growth is held at a cap."""
+
+    def __init__(self) -> None:
+        self.said = False
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """A resumed run has said it."""
+        self.said = any(line.get("withheld") for line in run.curves)
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Say it at the first step that adds fewer primitives than density control asks for."""
+        count = step.changes.get("withheld", 0)
+        if count and not self.said:
+            self.said = True
+            logger.warning(
+                "step %d: %d primitives find no room under backbone.max_primitives, which holds growth from here on: "
+                "raise it, or set it to 0 for no cap",
+                step.number,
+                count,
+            )
+
+
+# -- from metrics to evaluation.json -----------------------------------------------------------------------------------
+
+
+def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, and pictures of `pseudo` views.
+
+    Only what there is.
+    """
+    lines = list(lines)
+    held = [line for line in lines if line.get("withheld")]
+    cap = {"step": held[0]["step"], "primitives": sum(line["withheld"] for line in held)} if held else {}
+    told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
+    pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
+    return ({"withheld": cap} if cap else {}) | ({"pseudo": pseudo} if pseudo else {})
+
+
+def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
+    asked = added(event["asked"] for event in events)
+    checks = dict.fromkeys(check for event in events for check in event["warned"])
+    return {
+        "asked": asked,
+        "dropped": shares(added(event["dropped"] for event in events), asked),
+        "warned": {check: shares(added(event["warned"].get(check, {}) for event in events), asked) for check in checks},
+    }
+
+
+def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Sums by scale."""
+    total: Counter[str] = Counter()
+    for count in counts:
+        total.update(count)
+    return dict(sorted(total.items(), key=lambda item: float(item[0])))
+
+
+def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, float]:
+    """Counts by scale as shares of what was asked for at that scale; none left out."""
+    return {scale: counts.get(scale, 0) / count for scale, count in asked.items()}
+
+
+# -- in words ----------------------------------------------------------------------------------------------------------
+
+
+def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
+    """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
+    return [*cap_remarks(evaluation), *pseudo_remarks(evaluation), *left_out_remarks(evaluation)]
+
+
+def cap_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Whether growth was held."""
+    cap = evaluation.get("withheld")
+    if cap:
+        yield f"growth is held at backbone.max_primitives from step {cap['step']:,} on: the model may be too small"
+
+
+def pseudo_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Pictures of pseudo views that were lost, or kept though they stray."""
+    for name, facts in (evaluation.get("pseudo") or {}).items():
+        for scale, share in facts["dropped"].items():
+            if share > 0:
+                yield f"{name} lost {share:.1%} of its x{scale} pictures"
+        for check, by_scale in facts.get("warned", {}).items():
+            for scale, share in by_scale.items():
+                if share > 0:
+                    yield f"{share:.1%} of {name}'s x{scale} pictures {CHECKS.get(check, check)}"
+
+
+def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Splats that held-out renders lack."""
+    count = evaluation.get("left_out") or 0
+    if count:
+        yield f"renders leave out {count:,.1f} splats a view, whose values cannot be drawn"

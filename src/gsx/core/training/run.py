@@ -1,0 +1,158 @@
+"""A run: everything that belongs to one training, and one step as listeners see it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.scene import Scene, View
+from gsx.core.quality.metrics import psnr
+from gsx.core.rasterizer import RasterSettings, Rendering
+from gsx.core.seeds import derived_seed
+from gsx.core.shapes import Float
+from gsx.core.training.backbone import Backbone, Observation
+from gsx.core.training.distributed import Ranks
+from gsx.core.training.pseudo_views import Augmenter
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """Options of the loop; values in conf/config.yaml."""
+
+    ssim_weight: float
+    random_background: bool
+    log_every: int
+    checkpoint_every: int
+    checkpoints_kept: int
+    test_points: int
+    batch: int = 1
+    """Views per step, whose mean loss it lowers. The default: runs older than this option."""
+
+    def __post_init__(self) -> None:
+        for name in ("batch", "log_every", "checkpoint_every", "checkpoints_kept"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"training.ssim_weight is {self.ssim_weight}; give a value from 0 to 1")
+
+
+@dataclass(eq=False)
+class Sampler:
+    """Training views without replacement, reshuffled when all have been seen (spec 7).
+
+    Each order comes from the seed and its number alone, so that those to come can be told.
+    """
+
+    count: int
+    seed: int
+    order: list[int] = field(default_factory=list)
+    """What is left of the current order, the next one last."""
+    begun: int = 0
+    """Orders begun so far."""
+    batch: int = 1
+    """Views of one step."""
+    taken: list[int] = field(default_factory=list)
+    """Those of the step under way."""
+
+    def take(self) -> list[int]:
+        """Indices of the views of the next step, in order."""
+        self.taken = [self.next() for _ in range(self.batch)]
+        return self.taken
+
+    def put_back(self) -> None:
+        """Undo `take`: the same views come next again."""
+        self.order += reversed(self.taken)
+        self.taken = []
+
+    def next(self) -> int:
+        """Index of the next view."""
+        if not self.order:
+            self.order, self.begun = self.shuffled(self.begun), self.begun + 1
+        return self.order.pop()
+
+    def coming(self, steps: int) -> set[int]:
+        """Indices of the views of the next steps."""
+        ahead = replace(self, order=list(self.order))
+        return {ahead.next() for _ in range(steps * self.batch)}
+
+    def shuffled(self, number: int) -> list[int]:
+        """The order of that number."""
+        generator = torch.Generator().manual_seed(derived_seed("views", self.seed, number))
+        return torch.randperm(self.count, generator=generator).tolist()
+
+
+@dataclass(eq=False, kw_only=True)
+class Run:
+    """State of one training. What must survive an interruption is in `checkpoint.py`."""
+
+    config: dict[str, Any]
+    """The composed configuration, resolved, JSON-serialisable."""
+    folder: Path
+    scene: Scene
+    backbone: Backbone
+    raster: RasterSettings
+    training: TrainingOptions
+    iterations: int
+    device: torch.device
+    generator: torch.Generator
+    sampler: Sampler
+    anew: Callable[[Scene, int, torch.Generator], Backbone] | None = None
+    """A backbone of the same options at step 0, for a scene, so many steps and a generator; None: the run is only
+    looked at."""
+    augmenters: Sequence[Augmenter] = ()
+    ranks: Ranks = Ranks()
+    """The processes that train it together."""
+    step: int = 0
+    """Steps done."""
+    trunk: Path | None = None
+    """Where states are kept that other runs may branch from; None: nowhere, as for all runs that were resumed."""
+    seconds: float = 0.0
+    """Time spent in training steps, without evaluation and files."""
+    stopping: bool = False
+    """Set to end after the current step."""
+    curves: list[dict[str, float]] = field(default_factory=list)
+    """Lines of metrics.jsonl so far."""
+
+    @property
+    def complete(self) -> bool:
+        """All iterations are done."""
+        return self.step >= self.iterations
+
+    @property
+    def background(self) -> Float[Tensor, "3"]:
+        """The scene's background on the run's device."""
+        return self.scene.background.to(self.device)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step:
+    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first."""
+
+    number: int
+    view: View
+    target: Float[Tensor, "3 H W"]
+    rendering: Rendering
+    loss: Float[Tensor, ""]
+    """Mean over the batch."""
+    seen: Sequence[Observation] = ()
+    """What density control learns from the renders of the batch, in its order."""
+    dropped: int = 0
+    """Splats that renders of training views left out because a value of theirs is not finite."""
+    others: Sequence["Step"] = ()
+    """This rank's other views, as steps of their own."""
+    changes: dict[str, int] = field(default_factory=dict)
+    """What density control did."""
+    terms: dict[str, float] = field(default_factory=dict)
+    """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
+    pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By augmenter, what became of the pictures that it asked for at this step (`pseudo.Telling`); mostly none."""
+    skipped: str = ""
+    """Why nothing was updated; empty for an ordinary step."""
+
+    def psnr(self) -> float:
+        """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
+        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target)
+        return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))

@@ -1,0 +1,218 @@
+"""The training loop. Density control, learning rates and the like live in backbones; everything else listens."""
+
+import logging
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
+from gsx.core.plugins import Plugins
+from gsx.core.quality.losses import photometric
+from gsx.core.rasterizer import Rendering, rasterize
+from gsx.core.shapes import Float
+from gsx.core.training.backbone import Observation
+from gsx.core.training.minibatch import added_up, merged, views_of_step
+from gsx.core.training.pseudo_views import PseudoView, Telling, Term, pseudo_loss
+from gsx.core.training.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+
+def train(run: Run, plugins: Plugins) -> None:
+    """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
+    plugins.emit.gsx_run_started(run=run)
+    while not (run.complete or any(run.ranks.everyone(run.stopping))):
+        begun = time.perf_counter()
+        step = take_step(run, plugins)
+        run.seconds += time.perf_counter() - begun
+        plugins.emit.gsx_step_finished(run=run, step=step)
+    plugins.emit.gsx_training_finished(run=run)
+
+
+def take_step(run: Run, plugins: Plugins) -> Step:
+    """One step in the order of the published loop (spec 7): render, backward, statistics, density, Adam."""
+    step = backward(run)
+    reason = veto(run, step, plugins)
+    if reason:
+        run.backbone.discard()
+    else:
+        for seen in step.seen:
+            run.backbone.record(seen)
+        step.changes.update(run.backbone.adapt(step.number))
+        run.backbone.update()
+    run.step = step.number
+    synchronise(run.device)
+    return step if not reason else replace(step, skipped=reason)
+
+
+def veto(run: Run, step: Step, plugins: Plugins) -> str:
+    """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
+    removed = healed(run, step) if step.dropped else ""
+    reason = removed or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
+    reason = next(filter(None, run.ranks.everyone(reason)), "")
+    return reason if removed or not reason else "; ".join(filter(None, [reason, healed(run, step)]))
+
+
+def healed(run: Run, step: Step) -> str:
+    """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
+    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken])
+    if removed:
+        logger.warning(
+            "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
+        )
+    return f"removed {removed} primitives" if removed else ""
+
+
+def backward(run: Run) -> Step:
+    """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
+    number = run.step + 1
+    with views_of_step(run) as batch:
+        picked = run.ranks.share(batch)
+        terms = [terms_of(run, number, view) for view in picked]
+        colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
+        run.backbone.begin(number)
+        steps = [of_view(run, number, *each) for each in zip(picked, terms, colours, strict=True)]
+        step = steps[0] if len(batch) == 1 else merged(run, steps)
+        return replace(step, pseudo=asked_for(run, number))
+
+
+def asked_for(run: Run, number: int) -> dict[str, dict[str, Any]]:
+    """By augmenter, what became of the pictures that it asked for at this step."""
+    named = zip(run.config.get("augmenter") or {}, run.augmenters, strict=False)
+    told = {name: augmenter.told(number) for name, augmenter in named if isinstance(augmenter, Telling)}
+    return {name: facts for name, facts in told.items() if facts}
+
+
+def terms_of(run: Run, number: int, picked: int) -> list[Term]:
+    """What augmenters add to the loss of a training view."""
+    return [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
+
+
+def of_view(run: Run, number: int, picked: int, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+    """The step of one view; its gradients are added to those of the views before it."""
+    with added_up(run.backbone):
+        return backward_of(run, number, run.scene.train[picked], terms, colour)
+
+
+def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+    """Render a view, and the pseudo views that go with it, and send the loss back (spec 1.3).
+
+    Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
+    gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
+    compared with its own render.
+    """
+    target, seen = view.image().to(run.device), list[Observation]()
+    divided = [divide(run, term, view.camera) for term in terms]
+    ordered = sorted(divided, key=lambda pair: pair[0].shared)
+    parts = {term.name: add_term(run, term, number, seen) for term, _ in ordered}
+    own = 1 - sum(term.taken for term in terms)
+    splats = run.backbone.splats(view.camera)
+    rendering = rasterize(
+        splats,
+        view.camera,
+        run.raster,
+        background=colour,
+        absolute_gradient=run.backbone.absolute_gradient,
+    )
+    loss = photometric(rendering.image, target, run.training.ssim_weight)
+    extra = run.backbone.regulariser()
+    if extra is not None:
+        loss = loss + extra
+    loss = loss if own == 1 else own * loss
+    named = {"own": float(loss.detach())} | parts if parts else {}
+    for term, here in divided:
+        for pseudo, weight in here:
+            value = weight * pseudo_loss(rendering.image, pseudo, term.squared)
+            named[term.name] += float(value.detach())
+            loss = loss + value
+    loss.backward()
+    served = sum(weight for _, here in divided for _, weight in here)
+    seen.append(observation(run, rendering, number, own + served))
+    return Step(
+        number=number,
+        view=view,
+        target=target,
+        rendering=without_graph(rendering),
+        loss=loss.detach() + sum(parts.values()),
+        terms=named,
+        seen=seen,
+        dropped=rendering.dropped,
+    )
+
+
+def without_graph(rendering: Rendering) -> Rendering:
+    """The picture alone, so that the steps of a batch do not hold on to what made theirs."""
+    return replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach())
+
+
+def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
+    """(the term without them, its parts that need no render of their own): the camera draws just what these see.
+
+    Terms that density control is not to learn from have none: it could not tell their gradients from the view's own.
+    """
+    if run.training.random_background or not (term.shared and term.observed):
+        return term, ()
+    here = [part for part in term.parts if part[0].camera.draws_as(camera)]
+    return replace(term, parts=[part for part in term.parts if part not in here]), here
+
+
+def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> float:
+    """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
+    total = 0.0
+    for view, weight in term.parts:
+        rendering = rasterize(
+            run.backbone.splats(view.camera),
+            view.camera,
+            run.raster,
+            background=run.background,
+            absolute_gradient=run.backbone.absolute_gradient,
+        )
+        loss = weight * pseudo_loss(rendering.image, view, term.squared)
+        loss.backward()
+        total += float(loss.detach())
+        if term.observed and math.isfinite(total) and finite_shift(rendering):
+            seen.append(observation(run, rendering, number, weight))
+    if not term.shared:
+        for parameter in run.backbone.shared():
+            parameter.grad = None
+    return total
+
+
+def observation(run: Run, rendering: Rendering, number: int, weight: float) -> Observation:
+    """What density control learns from a render of that weight in the loss of its view; of weight 0 nothing.
+
+    The step's loss is the mean over the batch: the weight is divided by it, and the gradients of the screen means are,
+    as those of the parameters will be.
+    """
+    if not weight > 0:
+        return {}
+    views = run.training.batch
+    for moved in (rendering.screen.shift, rendering.screen.probe):
+        if views > 1 and moved is not None and moved.grad is not None:
+            moved.grad /= views
+    return run.backbone.observe(rendering, number, weight / views)
+
+
+def finite_shift(rendering: Rendering) -> bool:
+    """Whether the screen gradients that density control gathers are finite: those of a step to be vetoed may not be."""
+    gradient = rendering.screen.shift.grad
+    return gradient is None or bool(torch.isfinite(gradient).all())
+
+
+def background(run: Run) -> Float[Tensor, "3"]:
+    """The scene's background, or a new random colour."""
+    if run.training.random_background:
+        return torch.rand(3, generator=run.generator).to(run.device)
+    return run.background
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait for a GPU, so that times mean something."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,1 @@
+"""Pages on one run and on many."""

@@ -1,0 +1,215 @@
+"""One page over many runs in any state: a table, what cannot be compared, curves, PSNR against its cost, pictures.
+
+Pictures are not copied: the page refers to those in the runs' folders.
+"""
+
+import csv
+import io
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from gsx import __version__
+from gsx.core.errors import InputError
+from gsx.core.files import replace_file
+from gsx.core.run_folder.files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+from gsx.core.run_folder.run_key import WHERE
+from gsx.experiments.reports.baselines import control_rows
+from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
+from gsx.experiments.reports.page import template
+from gsx.experiments.reports.side_by_side import pictures_of
+
+DIFFERENCES = 6
+"""Configuration keys in which runs differ that an overview shows."""
+FIELDS = (
+    "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
+    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "protocol",
+    "comparable",
+)  # fmt: skip
+"""Columns of report.csv."""
+
+
+def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
+    """Write report.html and report.csv into a folder, over the runs chosen, or over all runs below it.
+
+    Raises:
+        InputError: there is no run below it.
+    """
+    runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
+    rows, controls = overview_rows(folder, runs), control_rows(runs)
+    groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
+    replace_file(folder / "report.csv", csv_of(rows).encode())
+    context = {
+        "title": title_of(folder, runs),
+        "version": __version__,
+        "rows": rows,
+        "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
+        "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
+        "mixed": mixed_protocols(rows),
+        "groups": [compared_runs(group) | {"pictures": pictures_of(group, folder)} for group in groups],
+        "controls": controls,
+        "control_zooms": sorted({factor for entry in controls for factor in entry["gains"]}, key=float),
+        "any_lpips": any(is_number(row["lpips"]) for row in rows),
+    }
+    path = folder / "report.html"
+    replace_file(path, template("reports/overview.html").render(context).encode())
+    return path
+
+
+def title_of(folder: Path, runs: Sequence[RunFiles]) -> str:
+    """How many runs, and where they are if that is one place."""
+    count = f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}"
+    together = all(Path(os.path.abspath(run.folder)).is_relative_to(os.path.abspath(folder)) for run in runs)
+    return f"{count} below {folder.resolve().name or folder}" if together else count
+
+
+def runs_in(folders: Sequence[Path]) -> list[Path]:
+    """The runs that these folders are or hold, each once, however many ways lead to it.
+
+    Raises:
+        InputError: one of them is no folder, or neither is a run nor holds any.
+    """
+    found: dict[Path, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder} is no folder: give a run, or a folder with runs below it")
+        runs = [folder] if (folder / "config.yaml").is_file() else list(runs_below(folder))
+        if not runs:
+            raise InputError(f"there is no run below {folder} (no folder with a config.yaml): give a folder of runs")
+        for run in runs:
+            found.setdefault(run.resolve(), run)
+    return list(found.values())
+
+
+def common_folder(folders: Sequence[Path]) -> Path:
+    """Where an overview of these folders is written: the closest folder above them all that is no run itself.
+
+    Raises:
+        InputError: they have nothing but the root of the file system in common.
+    """
+    try:
+        common = Path(os.path.commonpath([os.path.abspath(folder) for folder in folders]))
+    except ValueError:  # on different drives
+        common = Path(folders[0].anchor)
+    while (common / "config.yaml").is_file():
+        common = common.parent
+    if common == common.parent:
+        raise InputError(f"{folders[0]} and the others have no folder in common: say where with --to FOLDER")
+    return common
+
+
+def overview_rows(folder: Path, runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
+    """One row for each run."""
+    told = differences(runs)
+    rows = [overview_row(folder, run, told[i]) for i, run in enumerate(runs)]
+    mixed, names = mixed_protocols(rows), names_of(rows)
+    return [
+        row
+        | {"name": names[i]}
+        | {"comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"}
+        for i, row in enumerate(rows)
+    ]
+
+
+def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
+    """The figures of a run."""
+    state, reason = state_of(run)
+    e = run.evaluation
+    zoom = {factor: entry for factor, entry in part(e, "zoom").items() if factor != "1"}
+    gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
+    report = run.folder / "report.html"
+    return {
+        "run": place(run.folder, folder),
+        "link": quote(place(report, folder)) if report.is_file() else "",
+        "state": state,
+        "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values()) if word)),
+        "scene": run.scene,
+        "backbone": run.backbone,
+        "variant": run.variant,
+        "differences": told,
+        "iterations": run.iterations,
+        **{
+            key: e.get(key)
+            for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
+        },
+        "render_path": e.get("render_path"),
+        "seconds": e.get("train_seconds"),
+        "gains": gains,
+        "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},
+        "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
+        "protocol": run.protocol_hash,
+    }
+
+
+def place(path: Path, folder: Path) -> str:
+    """A path as links in the folder have it."""
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def differences(runs: Sequence[RunFiles]) -> list[str]:
+    """For each run its values of the configuration keys in which runs of its scene and variant differ."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, run in enumerate(runs):
+        groups.setdefault((run.scene, run.variant), []).append(i)
+    flat = [flattened(run.config) for run in runs]
+    out = [""] * len(runs)
+    for members in groups.values():
+        varied = varied_keys([flat[i] for i in members])
+        more = f", and {len(varied) - DIFFERENCES} more" if len(varied) > DIFFERENCES else ""
+        for i in members:
+            out[i] = ", ".join(f"{key}={flat[i].get(key, 'absent')}" for key in varied[:DIFFERENCES]) + more
+    return out
+
+
+def names_of(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What each run is called: its variant; where a scene has several of those, also what differs, or its folder."""
+    names = [row["variant"] for row in rows]
+    told = [" ".join(word.split(".")[-1] for word in row["differences"].split(", ") if word) for row in rows]
+    for more in (told, [Path(row["run"]).name for row in rows]):
+        same = Counter((row["scene"], name) for row, name in zip(rows, names, strict=True))
+        names = [
+            f"{name} · {word}" if word and same[row["scene"], name] > 1 else name
+            for row, name, word in zip(rows, names, more, strict=True)
+        ]
+    return names
+
+
+def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
+    """Keys whose values are not the same in all configurations, in their order."""
+    keys = dict.fromkeys(key for config in configs for key in config)
+    return [key for key in keys if len({repr(config.get(key)) for config in configs}) > 1]
+
+
+def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys and values, without those that say where a run ran."""
+    out: dict[str, Any] = {}
+    for key, value in node.items():
+        if f"{prefix}{key}" in (*WHERE, "length"):
+            continue
+        if isinstance(value, dict):
+            out |= flattened(value, f"{prefix}{key}.")
+        else:
+            out[f"{prefix}{key}"] = value
+    return out
+
+
+def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """Scenes evaluated by several protocols: how many runs by each hash."""
+    counts: dict[str, dict[str, int]] = {}
+    for row in rows:
+        if row["protocol"]:
+            by_hash = counts.setdefault(row["scene"], {})
+            by_hash[row["protocol"]] = by_hash.get(row["protocol"], 0) + 1
+    return {scene: by_hash for scene, by_hash in counts.items() if len(by_hash) > 1}
+
+
+def csv_of(rows: Sequence[dict[str, Any]]) -> str:
+    """report.csv: missing figures are empty."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, FIELDS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()

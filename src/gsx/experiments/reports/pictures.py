@@ -1,0 +1,195 @@
+"""Pictures of a run for people: test views beside their truth, error maps, and zoomed crops beside their competitor.
+
+Everything goes to the run's `renders/`, listed in `index.json`, from which the report is built again at any time.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Sequence, Set
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from gsx.core.data.images import write_image
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.evaluation.evaluator import Zoomed
+from gsx.core.files import read_json, write_json
+from gsx.core.quality.metrics import psnr
+from gsx.core.shapes import Float
+
+SHOWN = 6
+"""Test views that are drawn."""
+PICTURE_WIDTH = 1600
+"""Wider pictures are saved reduced to this, in px: they are for looking, and the report embeds them."""
+LOSSLESS_PIXELS = 400_000
+"""Larger pictures are saved as JPEG."""
+WINDOW = 192
+"""Edge of a zoomed crop on the finer raster, px: the report shows three side by side at twice that."""
+WINDOW_STEP = 8
+"""Crops are looked for on a grid of this many px."""
+ERROR_FULL = 0.2
+"""Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
+ERROR_COLOURS = (
+    (0.00, (0, 0, 4)),
+    (0.15, (55, 14, 92)),
+    (0.32, (130, 28, 106)),
+    (0.47, (198, 51, 78)),
+    (0.60, (236, 94, 40)),
+    (0.72, (247, 145, 30)),
+    (0.87, (250, 205, 75)),
+    (1.00, (253, 250, 190)),
+)
+"""Error divided by ERROR_FULL and its display RGB. CIE lightness rises evenly, so equal steps look equal."""
+
+
+class Pictures:
+    """Draws up to SHOWN test views and their zoomed crops, and lists them (implements `evaluator.Drawing`)."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self.folder, self.step = folder, step
+        self.shown: dict[int, dict[str, Any]] = {}
+        """What is known of the views to be drawn."""
+        self.names: dict[int, str] = {}
+        """Their file names."""
+        self.views: list[dict[str, Any]] = []
+        self.crops: list[dict[str, Any]] = []
+
+    def choose(self, figures: Sequence[dict[str, Any]]) -> None:
+        """Best and worst are among the views drawn; pictures of an earlier evaluation are removed."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        forget(self.folder)
+        best, worst = extremes([figure["psnr"] for figure in figures])
+        roles = {worst: "worst", best: "best"} if best != worst else {}
+        numbers = spread(len(figures), SHOWN, {best, worst})
+        told = ("name", "group", "psnr", "ssim", "lpips")
+        self.shown = {i: {key: figures[i][key] for key in told} | {"role": roles.get(i, "")} for i in numbers}
+        self.names = dict(zip(numbers, file_names([figures[i]["name"] for i in numbers]), strict=True))
+
+    def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
+        """Truth, render and error of a view."""
+        if number not in self.shown:
+            return
+        truth = view.image()
+        images = {"truth": truth, "render": render, "error": error_map(render, truth)}
+        files = {kind: self.save(f"{self.names[number]}.{kind}", reduced(image)) for kind, image in images.items()}
+        self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
+
+    def zoomed(self, number: int, zoomed: Zoomed) -> None:
+        """The window with most detail: truth, render and the x1 render resized."""
+        if number not in self.shown:
+            return
+        window = most_detailed(zoomed.truth, WINDOW)
+        whole = {"truth": zoomed.truth, "render": zoomed.render, "enlarged": zoomed.enlarged}
+        images = {kind: window.cut(image) for kind, image in whole.items()}
+        stem = f"{self.names[number]}.x{zoomed.factor:g}"
+        self.crops.append(
+            {
+                "view": zoomed.view.name,
+                "factor": zoomed.factor,
+                "window": [window.left, window.top, window.width, window.height],
+                "psnr": psnr(images["render"], images["truth"]),
+                "enlarged_psnr": psnr(images["enlarged"], images["truth"]),
+                "files": {kind: self.save(f"{stem}.{kind}", image, True) for kind, image in images.items()},
+            }
+        )
+
+    def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False) -> str:
+        """Write one picture and return its file name."""
+        small = image.shape[1] * image.shape[2] <= LOSSLESS_PIXELS
+        file = f"{stem}.png" if lossless or small else f"{stem}.jpg"
+        write_image(self.folder / file, image)
+        return file
+
+    def write_index(self) -> None:
+        """List what was drawn."""
+        index = {"error_full": ERROR_FULL, "step": self.step, "views": self.views, "zoom": self.crops}
+        write_json(self.folder / "index.json", index)
+
+
+def forget(folder: Path) -> None:
+    """Remove the pictures that an earlier index lists, and first the index itself."""
+    index = folder / "index.json"
+    if not index.is_file():
+        return
+    try:
+        content = read_json(index)
+    except ValueError:
+        content = {"views": [], "zoom": []}
+    index.unlink()
+    for entry in [*content["views"], *content["zoom"]]:
+        for file in entry["files"].values():
+            (folder / Path(file).name).unlink(missing_ok=True)
+
+
+def extremes(qualities: Sequence[float | None]) -> tuple[int, int]:
+    """Indices of the best and the worst; None, no number, is worst of all."""
+    known = [-math.inf if quality is None else quality for quality in qualities]
+    return known.index(max(known)), known.index(min(known))
+
+
+def spread(total: int, count: int, always: Set[int]) -> list[int]:
+    """Up to `count` of `total` indices in order: those in `always`, then an even spacing, then whatever is left."""
+    wanted = min(count, total)
+    even = [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
+    return sorted(list(dict.fromkeys([*sorted(always), *even, *range(total)]))[:wanted])
+
+
+def file_names(names: Iterable[str]) -> list[str]:
+    """View names as file names: without image suffix and odd characters, numbered where two would be equal."""
+    out: list[str] = []
+    for name in names:
+        plain = re.sub(r"\.(png|jpe?g|exr|webp|tiff?)$", "", name, flags=re.IGNORECASE)
+        safe = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_") or "view"
+        taken, number = safe, 2
+        while taken in out:
+            taken, number = f"{safe}_{number}", number + 1
+        out.append(taken)
+    return out
+
+
+def error_map(image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """Mean absolute error over the channels as a colour: black is none, the brightest is ERROR_FULL or more."""
+    return colour_ramp((image - truth).abs().mean(0) / ERROR_FULL)
+
+
+def colour_ramp(values: Float[Tensor, "H W"]) -> Float[Tensor, "3 H W"]:
+    """ERROR_COLOURS, linear in between; values are clamped to [0, 1]."""
+    places = torch.tensor([place for place, _ in ERROR_COLOURS])
+    colours = torch.tensor([colour for _, colour in ERROR_COLOURS]) / 255
+    clamped = values.clamp(0, 1)
+    upper = torch.searchsorted(places, clamped.contiguous()).clamp(1, len(places) - 1)
+    lower = upper - 1
+    fraction = (clamped - places[lower]) / (places[upper] - places[lower])
+    return torch.lerp(colours[lower], colours[upper], fraction[..., None]).permute(2, 0, 1)
+
+
+def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
+    """At most PICTURE_WIDTH wide."""
+    width, height = image.shape[2], image.shape[1]
+    if width <= PICTURE_WIDTH:
+        return image
+    size = (max(1, round(height * PICTURE_WIDTH / width)), PICTURE_WIDTH)
+    return interpolate(image[None], size=size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+
+def most_detailed(image: Float[Tensor, "3 H W"], edge: int) -> Window:
+    """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid."""
+    height, width = min(edge, image.shape[1]), min(edge, image.shape[2])
+    cells = avg_pool2d(gradient_energy(image)[None], WINDOW_STEP, ceil_mode=True)
+    reach = [min(edge // WINDOW_STEP, size) for size in cells.shape[1:]]
+    means = avg_pool2d(cells, reach, stride=1)[0]
+    row, column = divmod(int(means.argmax()), means.shape[1])
+    left, top = min(column * WINDOW_STEP, image.shape[2] - width), min(row * WINDOW_STEP, image.shape[1] - height)
+    return Window(left, top, width, height)
+
+
+def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
+    """Squared differences to the right and lower neighbours, summed over the channels."""
+    energy = torch.zeros_like(image[0])
+    energy[:, :-1] += (image[:, :, 1:] - image[:, :, :-1]).square().sum(0)
+    energy[:-1] += (image[:, 1:] - image[:, :-1]).square().sum(0)
+    return energy

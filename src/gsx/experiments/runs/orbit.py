@@ -1,0 +1,319 @@
+"""A closed camera path through what the training cameras saw, and animations of it.
+
+The path lives in cylindrical coordinates about the point the cameras look at: bearing around the mean up direction,
+distance from that axis, height along it. Cameras that surround the point give a full circle; cameras on one side give
+a small ellipse of bearing and height; cameras that look outward give a turn on the spot they surround.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.images import to_uint8
+from gsx.core.data.scene import Scene
+from gsx.core.errors import InputError, nearest
+from gsx.core.files import replacing
+from gsx.core.shapes import Float, UInt8
+
+UPRIGHT = 0.05
+"""How much the mean image-up counts against level horizons; small: horizons win wherever they say anything."""
+PARALLEL = 0.01
+"""Viewing rays whose mean squared sine against one direction is below this (6 degrees) meet nowhere reliable."""
+OUTWARD = 0.01
+"""Cameras whose rays meet less than this fraction of the scene's depth in front of them look outward."""
+SWING = 0.5
+"""An orbit on one side of the scene keeps to this fraction of the cameras' range: in its middle, views are dense."""
+LEAST_SWING = math.radians(2)
+"""Smallest half-swing, so that something moves with a single camera."""
+LARGEST_EDGE = 8192
+"""Frames larger than this in either direction are refused, px; each frame is written before the next is rendered."""
+GIF_FASTEST = 50
+"""GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orbit:
+    """A closed path about an axis: position and viewing direction as functions of a phase in [0, 2 pi)."""
+
+    target: Float[Tensor, "3"]
+    """World point on the axis."""
+    axes: Float[Tensor, "3 3"]
+    """Rows: bearing 0, bearing 90 degrees, up; orthonormal, world coordinates."""
+    radius: float
+    height: float
+    """Above the target, scene units."""
+    bearing: float
+    """Middle bearing, radians."""
+    swing: float
+    """Half the range of bearings, radians; pi: all around."""
+    rise: float
+    """Half the range of heights, scene units."""
+    outward: bool
+    """Look away from the axis."""
+
+    def direction(self, bearing: float) -> Float[Tensor, "3"]:
+        """Horizontal unit vector from the axis."""
+        return math.cos(bearing) * self.axes[0] + math.sin(bearing) * self.axes[1]
+
+    def pose(self, phase: float) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Eye and a point to look at."""
+        full = self.swing >= math.pi
+        bearing = self.bearing + (phase if full else self.swing * math.cos(phase))
+        height = self.height + self.rise * math.sin(phase)
+        side = self.direction(bearing)
+        eye = self.target + self.radius * side + height * self.axes[2]
+        return eye, (eye + side if self.outward else self.target)
+
+
+def orbit_cameras(scene: Scene, frames: int) -> list[Camera]:
+    """Cameras on a closed orbit with the raster and field of view of the first training camera.
+
+    Raises:
+        InputError: frames is below 2, or the cameras look straight along their own up direction.
+    """
+    if frames < 2:
+        raise InputError(f"an orbit of {frames} frames is none: ask for at least 2, for example --frames 60")
+    path = fit_path([view.camera for view in scene.train], scene.points.positions, scene.extent)
+    return [on_path(path, 2 * math.pi * frame / frames, scene.train[0].camera) for frame in range(frames)]
+
+
+def on_path(path: Orbit, phase: float, model: Camera) -> Camera:
+    """The camera at a phase, with the intrinsics of `model` around the middle of its raster."""
+    eye, goal = path.pose(phase)
+    fov_x = 2 * math.atan(model.width / (2 * model.fx))
+    try:
+        camera = look_at(
+            eye.tolist(), goal.tolist(), up=path.axes[2].tolist(), fov_x=fov_x, width=model.width, height=model.height
+        )
+    except ValueError as error:
+        raise InputError(f"no orbit fits these cameras ({error}): render the test views instead") from error
+    return replace(
+        camera,
+        rotation=camera.rotation.to(model.rotation),
+        translation=camera.translation.to(model.translation),
+        fy=model.fy,
+        near=model.near,
+    )
+
+
+def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: float) -> Orbit:
+    """The path that suits the cameras; `points` say how deep the scene is where viewing rays do not meet."""
+    centres = torch.stack([camera.centre for camera in cameras]).double()
+    rotations = torch.stack([camera.rotation for camera in cameras]).double()
+    forwards = rotations[:, 2]
+    up = upright(rotations)
+    depth = scene_depth(centres, forwards, points.double(), extent)
+    target, inward = look_at_point(centres, forwards, depth)
+    axes = axes_about(up, forwards.mean(0))
+    offsets = (centres - target) @ axes.T
+    sides = offsets if inward else forwards @ axes.T
+    bearing, swing = arc(torch.atan2(sides[:, 1], sides[:, 0]).tolist())
+    full = swing >= math.pi
+    heights = offsets[:, 2]
+    middle = heights.median() if full else (heights.max() + heights.min()) / 2
+    radius = float(offsets[:, :2].norm(dim=1).median())
+    swing = swing if full else max(SWING * swing, LEAST_SWING)
+    return Orbit(
+        target=target,
+        axes=axes,
+        radius=radius,
+        height=float(middle),
+        bearing=bearing,
+        swing=swing,
+        rise=0.0 if full else max(SWING * float(heights.max() - heights.min()) / 2, swing * radius / 4),
+        outward=not inward,
+    )
+
+
+def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
+    """The scene's up direction: near the mean image-up, and across the images' horizontal axes where those differ.
+
+    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
+    """
+    right, up = rotations[:, 0], -rotations[:, 1]
+    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
+    solved = torch.linalg.solve(level, up.mean(0))
+    if solved.norm() < 1e-6:  # cameras rolled every way
+        return up[0]
+    return solved / solved.norm()
+
+
+def scene_depth(
+    centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], points: Float[Tensor, "P 3"], extent: float
+) -> float:
+    """Median depth of the points in front of the mean camera, scene units."""
+    mean = forwards.mean(0)
+    depths = (points - centres.mean(0)) @ mean / mean.norm().clamp_min(1e-9)
+    front = depths[depths > 0]
+    return float(front.median()) if len(front) else max(extent, 1.0)
+
+
+def look_at_point(
+    centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], depth: float
+) -> tuple[Float[Tensor, "3"], bool]:
+    """The point closest to all viewing rays, and whether it lies in front of the cameras.
+
+    Nearly parallel rays meet nowhere: then the point at `depth` in front of the mean camera.
+    """
+    across = torch.eye(3, dtype=centres.dtype) - forwards[:, :, None] * forwards[:, None, :]
+    if float(torch.linalg.eigvalsh(across.mean(0))[0]) < PARALLEL:
+        return centres.mean(0) + depth * forwards.mean(0) / forwards.mean(0).norm(), True
+    point = torch.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0])
+    ahead = ((point - centres) * forwards).sum(1).mean()
+    return point, float(ahead) > OUTWARD * depth
+
+
+def axes_about(up: Float[Tensor, "3"], hint: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Right-handed orthonormal rows with `up` last and the first as near to `hint` as can be."""
+    level = hint - (hint @ up) * up
+    if level.norm() < 1e-3:
+        level = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+        level = level - (level @ up) * up
+    first = level / level.norm()
+    return torch.stack([first, torch.linalg.cross(up, first), up])
+
+
+def arc(bearings: Sequence[float]) -> tuple[float, float]:
+    """Middle and half-width, radians, of the shortest arc that holds all bearings; half-width pi if they surround."""
+    ordered = sorted(bearings)
+    following = [*ordered[1:], ordered[0] + 2 * math.pi]
+    gap, start = max((b - a, b) for a, b in zip(ordered, following, strict=True))
+    if gap < math.pi:
+        return 0.0, math.pi
+    half = (2 * math.pi - gap) / 2
+    return start + half, half
+
+
+# -- animations ----------------------------------------------------------------------------------------------------
+
+
+def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: float) -> None:
+    """Write frames, display values in [0, 1], one at a time: .gif anywhere; .webp and .mp4 with the extra `video`.
+
+    The file appears whole or not at all.
+
+    Raises:
+        InputError: the suffix, the speed or a frame size is unsuitable, there are no frames, or PyAV is missing.
+    """
+    writer = writer_for(path)
+    if not 0 < fps <= (GIF_FASTEST if writer is write_gif else 1000):
+        raise InputError(f"{path} cannot play at {fps} frames per second: use 1 to {GIF_FASTEST}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
+        writer(partial, checked(path, frames), fps)
+
+
+def writer_for(path: Path) -> Callable[[Path, Iterator[Tensor], float], None]:
+    """What writes this kind of file.
+
+    Raises:
+        InputError: nothing does, or PyAV is needed and missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in WRITERS:
+        choices = ", ".join(WRITERS)
+        raise InputError(f"'{path}' is no animation gsx can write: use {choices}.{nearest(suffix, WRITERS)}")
+    writer = WRITERS[suffix]
+    if writer is not write_gif:
+        import_av(path)
+    return writer
+
+
+def import_av(path: Path) -> Any:
+    """PyAV, which brings FFmpeg's encoders."""
+    try:
+        import av
+    except ImportError as error:
+        raise InputError(
+            f"{path} needs PyAV (OpenImageIO animates only GIF): pip install 'gsx[video]', or write a .gif"
+        ) from error
+    return av
+
+
+def checked(path: Path, frames: Iterable[Float[Tensor, "3 H W"]]) -> Iterator[UInt8[Tensor, "H W 3"]]:
+    """Frames as bytes, each of the size of the first, none too large."""
+    size = None
+    for frame in frames:
+        width, height = frame.shape[2], frame.shape[1]
+        size = size or (width, height)
+        if (width, height) != size:
+            raise InputError(
+                f"{path}: a frame is {width} x {height}, the first is {size[0]} x {size[1]}; make them equal"
+            )
+        if max(size) > LARGEST_EDGE:
+            raise InputError(f"{path}: frames of {width} x {height} px are too large: at most {LARGEST_EDGE} px a side")
+        yield to_uint8(frame.detach().cpu()).permute(1, 2, 0).contiguous()
+    if size is None:
+        raise InputError(f"{path}: there are no frames to write, ask for at least one")
+
+
+def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
+    """An endless GIF; the delay is rounded to hundredths of a second."""
+    import OpenImageIO as oiio
+
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise InputError(f"{path} cannot be written, this OpenImageIO has no GIF writer: use .mp4 instead")
+    delay = max(1, round(100 / fps))
+    mode = "Create"
+    try:
+        for frame in frames:
+            spec = oiio.ImageSpec(frame.shape[1], frame.shape[0], 3, "uint8")
+            spec.attribute("FramesPerSecond", "rational", (100, delay))
+            if not (output.open(str(path), spec, mode) and output.write_image(frame.numpy())):
+                raise InputError(f"{path} cannot be written ({output.geterror()}): check the folder and its space")
+            mode = "AppendSubimage"
+    finally:
+        output.close()
+
+
+def write_webp(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
+    """An endless animated WebP."""
+    encode(
+        path, frames, fps, codec="libwebp_anim", pixels="yuv420p", quality={"quality": "85"}, container={"loop": "0"}
+    )
+
+
+def write_mp4(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
+    """H.264 that every browser plays, with its index first."""
+    container = {"movflags": "+faststart"}
+    encode(path, frames, fps, codec="libx264", pixels="yuv420p", quality={"crf": "18"}, container=container)
+
+
+def encode(
+    path: Path,
+    frames: Iterator[UInt8[Tensor, "H W 3"]],
+    fps: float,
+    *,
+    codec: str,
+    pixels: str,
+    quality: dict[str, str],
+    container: dict[str, str],
+) -> None:
+    """Encode with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
+    av = import_av(path)
+    first = next(frames)
+    height, width = (size // 2 * 2 for size in first.shape[:2])
+    with av.open(str(path), mode="w", options=container) as output:
+        stream = output.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=quality)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
+        for frame in chain([first], frames):
+            picture = av.VideoFrame.from_ndarray(frame[:height, :width].contiguous().numpy(), format="rgb24")
+            output.mux(stream.encode(picture))
+        output.mux(stream.encode())
+
+
+WRITERS: dict[str, Callable[[Path, Iterator[Tensor], float], None]] = {
+    ".gif": write_gif,
+    ".webp": write_webp,
+    ".mp4": write_mp4,
+}
+"""Writer by suffix."""

@@ -1,0 +1,187 @@
+"""Progress for people and files: one live line on a terminal, plain lines elsewhere, metrics.jsonl."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from gsx.core.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
+from gsx.core.files import replace_file
+from gsx.core.plugins import hookimpl
+from gsx.core.training.run import Run, Step
+
+METRICS = "metrics.jsonl"
+LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0
+"""Time between updates on a terminal, and elsewhere (a Slurm log stays readable)."""
+SMOOTHING = 0.3
+"""Weight of the newest line in the displayed loss, PSNR and speed."""
+
+
+def clock(seconds: float) -> str:
+    """m:ss, or h:mm:ss."""
+    whole = max(0, int(seconds))
+    hours, rest = divmod(whole, 3600)
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"
+
+
+class Line:
+    """One line that is written over on a terminal; plain lines elsewhere, less often."""
+
+    def __init__(self) -> None:
+        self.stream = sys.stderr
+        self.live = self.stream.isatty()
+        self.shown = time.monotonic() - PLAIN_SECONDS
+        self.width = 0
+
+    def due(self) -> bool:
+        """Whether it is time to show another; then the time counts from now on."""
+        now = time.monotonic()
+        due = now - self.shown >= (LIVE_SECONDS if self.live else PLAIN_SECONDS)
+        self.shown = now if due else self.shown
+        return due
+
+    def show(self, text: str) -> None:
+        """Write over the last line on a terminal, below it elsewhere."""
+        end, start = ("", "\r") if self.live else ("\n", "")
+        self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
+        self.stream.flush()
+        self.width = len(text)
+
+    def end(self) -> None:
+        """Leave the last line standing."""
+        if self.live and self.width:
+            self.stream.write("\n")
+            self.width = 0
+
+
+class Countdown:
+    """Shows how far a piece of work has come, and the time left if the rest of it goes as fast."""
+
+    def __init__(self, what: str, total: float) -> None:
+        self.what, self.total, self.line = what, total, Line()
+        self.done, self.begun = 0.0, time.monotonic()
+
+    def advance(self, amount: float, part: str) -> None:
+        """So much more of `total` is done, the last of it `part`."""
+        self.done += amount
+        left = max(0.0, self.total - self.done)
+        last = left < 1e-6 * self.total
+        if self.line.due() or last:
+            seconds = (time.monotonic() - self.begun) * left / self.done
+            self.line.show(f"{self.what} {self.done / self.total:.0%}  {part}  ETA {clock(seconds)}")
+        if last:
+            self.line.end()
+
+
+class Progress:
+    """Listener: shows step, speed, loss, PSNR, primitives, memory and time left."""
+
+    def __init__(self) -> None:
+        self.output = Line()
+        self.done = (0, 0.0)
+        self.averages: dict[str, float] = {}
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Speed is measured from here on."""
+        self.done = (run.step, run.seconds)
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Show the line when it is time."""
+        if not self.output.due() and not run.complete:
+            return
+        self.average("loss", float(step.loss))
+        self.average("psnr", step.psnr())
+        steps, seconds = run.step - self.done[0], run.seconds - self.done[1]
+        self.average("speed", steps / max(seconds, 1e-9))
+        self.done = (run.step, run.seconds)
+        self.output.show(self.line(run))
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Leave the last line standing."""
+        self.output.end()
+
+    def average(self, name: str, value: float) -> None:
+        """Exponential average of what was shown."""
+        old = self.averages.get(name, value)
+        self.averages[name] = old + SMOOTHING * (value - old)
+
+    def line(self, run: Run) -> str:
+        """The line as shown."""
+        a, primitives, memory = self.averages, run.backbone.size()[0], peak_memory_mb(run.device)
+        megabytes = "" if memory is None else f"{memory:,.0f} MB  "
+        return (
+            f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
+            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {megabytes}"
+            f"ETA {clock((run.iterations - run.step) / a['speed'])}"
+        )
+
+
+def read_curves(folder: Path) -> list[dict[str, Any]]:
+    """Lines of a run's metrics.jsonl; one that a crash cut off is left out."""
+    path = folder / METRICS
+    written = path.read_text().splitlines() if path.exists() else []
+    return [json.loads(line) for line in written if line.endswith("}")]
+
+
+class MetricsLog:
+    """Listener: appends to metrics.jsonl every `training.log_every` steps, test PSNR at evenly spaced points."""
+
+    def __init__(self, options: EvalOptions) -> None:
+        self.options = options
+        self.stream: IO[str] | None = None
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Open the file; a resumed run drops lines later than its checkpoint."""
+        path = run.folder / METRICS
+        run.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
+        replace_file(path, "".join(json.dumps(line) + "\n" for line in run.curves).encode())
+        self.stream = path.open("a")
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Write a line when due, or when something noteworthy happened."""
+        points = run.training.test_points
+        tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
+        told = step.changes or step.pseudo or step.skipped
+        if not (run.step % run.training.log_every == 0 or told or tested or run.step == 1):
+            return
+        line = self.entry(run, step)
+        if tested and run.scene.test:
+            line["test_psnr"] = quick_psnr(run, self.options)
+        run.curves.append(line)
+        assert self.stream is not None
+        self.stream.write(json.dumps(line) + "\n")
+        self.stream.flush()
+
+    def entry(self, run: Run, step: Step) -> dict:
+        """One line of metrics.jsonl."""
+        memory = peak_memory_mb(run.device)
+        line = {
+            "step": run.step,
+            "seconds": round(run.seconds, 3),
+            "loss": float(step.loss),
+            "psnr": step.psnr(),
+            "primitives": run.backbone.size()[0],
+            "pairs": step.rendering.pairs,
+            "memory_mb": None if memory is None else round(memory, 1),
+            **({"terms": step.terms} if step.terms else {}),
+            **({"pseudo": step.pseudo} if step.pseudo else {}),
+            **({"left_out": step.dropped} if step.dropped else {}),
+            **step.changes,
+        }
+        return line | ({"skipped": step.skipped} if step.skipped else {})
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, however training ended."""
+        if self.stream is not None:
+            self.stream.close()

@@ -1,0 +1,59 @@
+"""Pictures of pseudo views for people: what was redrawn, the result, and what the model shows there after training."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx.core.data.images import write_image
+from gsx.core.evaluation.evaluator import EvalOptions, render_tiled
+from gsx.core.files import write_json
+from gsx.core.training.pseudo_views import PseudoView, load_views
+from gsx.core.training.run import Run
+
+logger = logging.getLogger(__name__)
+
+SHOWN = 6
+"""Pseudo views of each augmenter that are shown."""
+
+
+def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
+    """Render pseudo views of the last events from the trained model, beside what augmenters left to be looked at."""
+    folder = run.folder / "pseudo"
+    entries: list[dict[str, Any]] = []
+    latest = {path.stem.rpartition("_")[0]: path for path in sorted(folder.glob("*.safetensors"))}
+    for augmenter, path in latest.items():
+        try:
+            views, _ = load_views(path)
+        except (OSError, ValueError) as error:
+            logger.warning("%s cannot be read (%s): its pseudo views are not shown", path, error)
+            continue
+        entries += [shown(run, options, augmenter, view) for view in with_pictures(folder, augmenter, views)[:SHOWN]]
+    if entries:
+        write_json(folder / "index.json", {"views": entries})
+
+
+def picture_name(augmenter: str, view: PseudoView) -> str:
+    """File of what a pseudo view was made from, the result, and their difference, side by side."""
+    known = view.provenance
+    return f"{augmenter}_{known['event']:07d}_{view.parent}_x{known['scale']}_{known['kind']}.png"
+
+
+def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list[PseudoView]:
+    """One view for each picture that there is."""
+    complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
+    by_name = {picture_name(augmenter, view): view for view in complete}
+    return [view for name, view in by_name.items() if (folder / name).is_file()]
+
+
+@torch.no_grad()
+def shown(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
+    """Render one of them; returns its entry in the index."""
+    run.backbone.begin(max(1, run.step))
+    splats = run.backbone.splats(view.camera)
+    after = render_tiled(splats, view.camera, run.raster, run.background, options.tile_pixels).image.cpu()
+    made = picture_name(augmenter, view)
+    name = made.replace(".png", "_after.png")
+    write_image(run.folder / "pseudo" / name, after)
+    return {"augmenter": augmenter, "made": made, "after": name, **view.provenance}

@@ -1,0 +1,120 @@
+"""Trackers: listeners that tell other programs of a run. A tracker may fail; the run goes on without it.
+
+A factory takes the options and returns an object with `@hookimpl` events. It checks what can be checked before training
+begins, and raises ConfigError; whatever its events raise is warned of once, and the tracker hears no more.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+import pluggy
+
+from gsx.core.errors import ConfigError, TrainingError, first_line
+from gsx.core.plugins import GROUP, Hooks, Plugins, hookimpl, refuse_unmarked
+from gsx.core.training.run import Run, Step
+from gsx.experiments.runs.config import Chosen
+
+logger = logging.getLogger(__name__)
+
+
+def build_trackers(trackers: Mapping[str, Chosen]) -> "list[Tracking]":
+    """The chosen trackers as listeners.
+
+    Raises:
+        ConfigError: a tracker lacks a package or cannot work with its options.
+    """
+    return [Tracking(name, chosen.component.factory(chosen.options)) for name, chosen in trackers.items()]
+
+
+def require(tracker: str, packages: Sequence[str], extra: str) -> None:
+    """Raise ConfigError if a package cannot be imported; `extra`: what pip is to install."""
+    for package in packages:
+        try:
+            import_module(package)
+        except ImportError as error:
+            remedy = f"pip install '{extra}'"
+            raise ConfigError(f"tracker {tracker} needs {package} ({first_line(error)}): {remedy}") from error
+
+
+class Tracking:
+    """Listener: passes the events of a run on to one tracker, but for vetoes, until the tracker fails.
+
+    Raises:
+        TypeError, pluggy.PluginValidationError: the tracker has a hook that is unmarked or unknown.
+    """
+
+    def __init__(self, name: str, tracker: object) -> None:
+        refuse_unmarked(tracker)
+        self.name, self.begun, self.lost = name, False, ""
+        self.manager = pluggy.PluginManager(GROUP)  # of its own, so that its errors do not reach other listeners
+        self.manager.add_hookspecs(Hooks)
+        self.manager.register(tracker)
+        self.manager.check_pending()
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        """Pass on."""
+        self.begun = True
+        self.tell("gsx_run_started", run)
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Pass on."""
+        self.tell("gsx_step_finished", run, step=step)
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Pass on."""
+        self.tell("gsx_training_finished", run)
+        if not run.complete:
+            self.remind()
+
+    @hookimpl
+    def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
+        """Pass on."""
+        self.tell("gsx_evaluated", run, evaluation=evaluation)
+
+    @hookimpl
+    def gsx_run_finished(self, run: Run) -> None:
+        """Pass on."""
+        self.tell("gsx_run_finished", run)
+        self.remind()
+
+    @hookimpl
+    def gsx_run_failed(self, run: Run, reason: str) -> None:
+        """Pass on, unless the tracker has not heard of the run yet."""
+        self.tell("gsx_run_failed", run, reason=reason)
+        self.remind()
+
+    def tell(self, hook: str, run: Run, **more: Any) -> None:
+        """Call the tracker's hook; its first error is the last thing that is heard of it."""
+        if self.lost or not self.begun:
+            return
+        try:
+            getattr(self.manager.hook, hook)(run=run, **more)
+        except Exception as error:  # a full disk, a server that is down, a mistake of a third party
+            self.lost = f"step {run.step}"
+            reason = f"{type(error).__name__}: {first_line(error)}"
+            logger.warning("tracker %s failed at %s (%s): the run goes on without it", self.name, self.lost, reason)
+
+    def remind(self) -> None:
+        """Say at the end that something is missing."""
+        if self.lost:
+            logger.warning("tracker %s is incomplete from %s on; the run folder has everything", self.name, self.lost)
+
+
+@contextmanager
+def telling_of_failure(run: Run, plugins: Plugins) -> Iterator[None]:
+    """Listeners hear of what ends a run before its time; an error of theirs does not hide it."""
+    try:
+        yield
+    except BaseException as error:
+        reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
+        try:
+            plugins.emit.gsx_run_failed(run=run, reason=reason)
+        except Exception as another:
+            logger.warning("a listener failed while it heard of the run's failure: %s", first_line(another))
+        raise

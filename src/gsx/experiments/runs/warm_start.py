@@ -1,0 +1,132 @@
+"""What runs have in common until the first of them makes pseudo views: trained once, kept, and branched from.
+
+With `init=trunk` a run starts from the latest state that an earlier run of the same composition, but for its
+augmenters, has left behind, and leaves states for later ones. The result is bit for bit that of a run from scratch.
+"""
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_revision, trim
+from gsx.core.device import machine_stamp
+from gsx.core.errors import CheckpointError, InputError
+from gsx.core.files import read_json, write_json
+from gsx.core.plugins import hookimpl
+from gsx.core.run_folder import checkpoint
+from gsx.core.run_folder.run_key import scene_stamp, trained
+from gsx.core.training.run import Run, Step
+
+logger = logging.getLogger(__name__)
+
+BRANCH = "branch.json"
+"""File of a run that branched: at which step, and how many seconds of training it did not have to take."""
+
+SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
+"""Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
+(spec 1.8)."""
+
+
+def common_steps(run: Run) -> int:
+    """Steps that the run shares with its control: up to the first pseudo views, or all of them."""
+    return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
+
+
+def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
+    """Where states of runs like this one are kept; `plugins`: versions of those installed."""
+    machine = (*machine_stamp(run.device), run.raster.path)
+    parts = (
+        json.dumps(trained(without_augmenters(run.config)), sort_keys=True, default=str),
+        scene_stamp(run.config),  # test views are among the lines that are kept with a state
+        seen_by(run),
+        source_revision(),
+        sorted(plugins.items()),
+        machine,
+    )
+    return cache_folder("trunks", content_key(*parts))
+
+
+def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The composition of the control."""
+    return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator")}
+
+
+def seen_by(run: Run) -> str:
+    """A digest of what the run is trained on: cameras, points, and the files of photographs."""
+    digest = hashlib.sha256(run.scene.points.positions.numpy().tobytes())
+    digest.update(run.scene.points.colours.numpy().tobytes())
+    for view in run.scene.train:
+        camera, path = view.camera, getattr(view.source, "path", None)
+        digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
+        digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
+        digest.update(repr(file_stamp(Path(path)) if path is not None else "").encode())
+    return digest.hexdigest()
+
+
+def adopt(run: Run, folder: Path) -> None:
+    """Bring a new run to the latest state that it has in common with an earlier one, if there is any."""
+    common = common_steps(run)
+    for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
+        try:
+            checkpoint.read(sidecar)
+            folder.touch()  # the last to make room
+            branch(run, sidecar)
+        except (CheckpointError, OSError) as error:
+            logger.warning("%s", error)
+            continue
+        return
+    logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
+
+
+def branch(run: Run, sidecar: Path) -> None:
+    """Start from a kept state: its checkpoint and its lines of metrics.jsonl become the run's own."""
+    own = run.folder / "checkpoints"
+    own.mkdir(parents=True, exist_ok=True)
+    for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
+        shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
+    (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
+    checkpoint.restore(run)
+    write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
+    logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
+
+
+def default_steps(run: Run) -> set[int]:
+    """Where the paper's variants begin."""
+    return {round(share * run.iterations) for share in SHARES}
+
+
+def lines_of(sidecar: Path) -> list[dict[str, Any]]:
+    """Lines of metrics.jsonl up to a kept state."""
+    path = sidecar.with_name(f"lines_{sidecar.stem}.json")
+    return read_json(path)["lines"] if path.is_file() else []
+
+
+class TrunkKeeper:
+    """Listener: keeps states that other runs can branch from."""
+
+    def __init__(self, folder: Path, budget: float, steps: Collection[int] = ()) -> None:
+        self.folder, self.budget, self.steps = folder, budget, steps
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
+        wanted = {*(self.steps or default_steps(run)), common_steps(run)}
+        if run.step not in wanted or run.step > common_steps(run) or run.complete:
+            return
+        try:
+            self.keep(run)
+        except (OSError, InputError) as error:
+            logger.warning("init=trunk: the state of step %d is not kept (%s)", run.step, error)
+
+    def keep(self, run: Run) -> None:
+        """Write the state where other runs look for it."""
+        folder = make_folder(self.folder)
+        if any(checkpoint.step_of(path) == run.step for path in checkpoint.sidecars(folder)):
+            return
+        write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
+        checkpoint.write(run, folder)
+        trim("trunks", self.budget, folder)

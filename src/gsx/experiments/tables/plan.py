@@ -1,0 +1,220 @@
+"""From a table to runs: which there are, which are done, and which have a beginning in common.
+
+Runs of one scene, backbone and seed that differ in their augmenters alone are identical until the first of them makes
+pseudo views. One of each such group, the one that goes on longest without (the control, where there is one), is trained
+first and leaves its state wherever another of them sets out; the others branch from there (`core.trunk`).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import content_key
+from gsx.core.errors import ConfigError, nearest
+from gsx.core.run_folder.files import read_run
+from gsx.core.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
+from gsx.core.training.pseudo_views import Foretold
+from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.warm_start import without_augmenters
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """A table to be filled; values in conf/experiment."""
+
+    name: str
+    title: str
+    published: str
+    """The paper's table, a file of conf/published; empty: there is none."""
+    datasets: list[str]
+    """Of conf/dataset; dataset=NAME on the command line takes their place."""
+    baseline: str
+    """Row that gains are over."""
+    rows: dict[str, str]
+    """Variants by row."""
+    quoted: dict[str, str] = field(default_factory=dict)
+    """Rows that are not run, and why."""
+    overrides: list[str] = field(default_factory=list)
+    """Of every run."""
+    seeds: list[int] = field(default_factory=lambda: [0])
+    only: list[str] = field(default_factory=list)
+    """Rows that are run; none given: all."""
+    scenes: list[str] = field(default_factory=list)
+    """Scenes that are run; none given: all of the datasets."""
+    dry: bool = False
+    """Say what would be run, and run nothing."""
+
+    def __post_init__(self) -> None:
+        for row in self.only:
+            if row not in self.rows:
+                raise ValueError(
+                    f"experiment.only: '{row}' is no row of {self.name}; it has {', '.join(self.rows)}."
+                    f"{nearest(row, self.rows)}"
+                )
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"experiment.seeds is {list(self.seeds)}; give different ones, for example [0,1,2]")
+
+    @property
+    def chosen(self) -> dict[str, str]:
+        """Variants by row that is run."""
+        return {row: variant for row, variant in self.rows.items() if not self.only or row in self.only}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cell:
+    """One run of a table."""
+
+    row: str
+    dataset: str
+    scene: str
+    """Folder name."""
+    seed: int
+    overrides: list[str]
+    settings: Settings
+    stamp: str
+    """Of its scene, when the table was planned."""
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved composition."""
+        return self.settings.resolved
+
+    @property
+    def folder(self) -> Path:
+        """Where its run lies; other cells with the same composition share it."""
+        return place_of(self.config, self.stamp)
+
+    @property
+    def finished(self) -> bool:
+        """Whether its run is done."""
+        return finished(read_run(self.folder), self.config, self.stamp)
+
+    @property
+    def begins(self) -> int:
+        """Steps in common with a run without augmenters; 0 where an augmenter does not foretell it."""
+        iterations, options = self.settings.general.iterations, [a.options for a in self.settings.augmenters.values()]
+        told = [option.begins(iterations) if isinstance(option, Foretold) else 0 for option in options]
+        return min([iterations, *told])
+
+    @property
+    def trunk(self) -> str:
+        """What runs share that can branch from each other."""
+        return content_key(sorted_items(trained(without_augmenters(self.config))), self.stamp)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan:
+    """What is to be done."""
+
+    experiment: Experiment
+    datasets: dict[str, Any]
+    """The datasets as composed, by name."""
+    cells: list[Cell]
+    done: int
+    """Different runs that are finished."""
+    phases: list[list[list[str]]]
+    """Overrides of the runs to be started, phase by phase."""
+    steps: int
+    """Steps of the runs to be started."""
+    shared: int
+    """Of these, steps that are not taken again."""
+
+
+def cells_of(
+    experiment: Experiment,
+    datasets: dict[str, Any],
+    words: Callable[[str], Sequence[str]],
+    compose: Callable[[list[str]], Settings],
+) -> Iterator[Cell]:
+    """Every run of a table, in its order: scene by scene, row by row, seed by seed. `words`: overrides by variant.
+
+    Raises:
+        ConfigError: a composition is wrong.
+    """
+    stamps: dict[str, str] = {}
+    for name, dataset in datasets.items():
+        for scene in dataset["scenes"]:
+            if experiment.scenes and scene not in experiment.scenes:
+                continue
+            for row, variant in experiment.chosen.items():
+                for seed in experiment.seeds:
+                    overrides = [f"dataset={name}", f"variant={variant}", *experiment.overrides, *words(variant)]
+                    overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true"]
+                    settings = compose(overrides)
+                    options = str(settings.resolved["scene"])  # folders may be large: each is looked at once
+                    stamps[options] = stamps.get(options) or scene_stamp(settings.resolved)
+                    yield Cell(
+                        row=row,
+                        dataset=name,
+                        scene=scene,
+                        seed=seed,
+                        overrides=overrides,
+                        settings=settings,
+                        stamp=stamps[options],
+                    )
+
+
+def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Cell], together: bool = False) -> Plan:
+    """What of the cells is to be run, and in which order; `together`: by a launcher that runs several at once.
+
+    One after the other each group is run as a whole, so that few states need be kept at a time.
+    """
+    runs = {cell.folder: cell for cell in reversed(cells)}  # of cells with one run the first
+    due = [cell for cell in cells if runs[cell.folder] is cell and not cell.finished]
+    groups: dict[str, list[Cell]] = {}
+    for cell in due:
+        groups.setdefault(cell.trunk, []).append(cell)
+    first: list[list[str]] = []
+    second: list[list[str]] = []
+    shared = 0
+    for members in groups.values():
+        leader = max(members, key=lambda cell: cell.begins)
+        others = [cell for cell in members if cell is not leader]
+        first.append(with_states(leader, others))
+        (second if together else first).extend(with_states(cell, others) for cell in others)
+        shared += sum(cell.begins for cell in others)
+    return Plan(
+        experiment=experiment,
+        datasets=datasets,
+        cells=list(cells),
+        done=len(runs) - len(due),
+        phases=[phase for phase in (first, second) if phase],
+        steps=sum(cell.settings.general.iterations for cell in due),
+        shared=shared,
+    )
+
+
+def with_states(cell: Cell, others: Sequence[Cell]) -> list[str]:
+    """A run's overrides, so that it leaves its state where others set out."""
+    steps = sorted({other.begins for other in others if 0 < other.begins < other.settings.general.iterations})
+    if not steps:
+        return [*cell.overrides, "init=scratch"]
+    return [*cell.overrides, "init=trunk", f"trunk_at=[{','.join(map(str, steps))}]"]
+
+
+def told(plan: Plan) -> list[str]:
+    """The plan in words."""
+    runs = sum(map(len, plan.phases))
+    rows, seeds = len(plan.experiment.chosen), len(plan.experiment.seeds)
+    scenes = len({(cell.dataset, cell.scene) for cell in plan.cells})
+    lines = [
+        f"{plan.experiment.title}: {rows} rows, {scenes} {'scene' if scenes == 1 else 'scenes'}, {seeds} "
+        f"{'seed' if seeds == 1 else 'seeds'}: {plan.done} runs finished, {runs} to train"
+    ]
+    if plan.shared:
+        lines.append(f"common beginnings are trained once: {plan.shared:,} of {plan.steps:,} steps are saved")
+    return lines
+
+
+def check_scenes(experiment: Experiment, datasets: dict[str, Any]) -> None:
+    """Raise ConfigError for scenes that no dataset has."""
+    known = [scene for dataset in datasets.values() for scene in dataset["scenes"]]
+    for scene in experiment.scenes:
+        if scene not in known:
+            raise ConfigError(
+                f"experiment.scenes: '{scene}' is no scene of {', '.join(datasets)}; there are {', '.join(known)}."
+                f"{nearest(scene, known)}"
+            )
+    if not known:
+        raise ConfigError(f"{', '.join(datasets)} has no scenes: name them, +dataset.scenes.FOLDER=NAME")

@@ -1,0 +1,207 @@
+"""A table from its command line to its files: plan, run what is missing, gather, write."""
+
+import logging
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import content_key
+from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.files import replace_file
+from gsx.core.plugins import Plugins
+from gsx.core.run_folder.run_key import sorted_items
+from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.runs.config import Compositions, parse_overrides, typed
+from gsx.experiments.tables.datasets import missing
+from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, planned, told
+from gsx.experiments.tables.published import read_table
+from gsx.experiments.tables.table import Table, protocol_differences, table_of
+from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
+
+logger = logging.getLogger(__name__)
+
+PARTS = ("regenerator", "augmenter", "backbone")
+"""Groups whose keys not every row has."""
+TAKEN = {
+    "seed": "experiment.seeds=[0,1,2]",
+    "variant": "experiment.only=[ROW,...] chooses rows",
+    "dataset.scene": "experiment.scenes=[NAME,...] chooses scenes",
+    "reuse": "leave it out",
+    "init": "leave it out",
+    "trunk_at": "leave it out",
+    "folder": "output=FOLDER",
+}
+"""Keys that are set for each run, and what to say instead."""
+OWN = ("experiment", "dataset", "hydra")
+"""Keys of the command line that are not handed on to every run as they are."""
+
+
+def key_of(word: str) -> str:
+    """The key of an override, without what is below it."""
+    return word.lstrip("+~").partition("=")[0].split(".")[0].split("/")[0].split("@")[0]
+
+
+def is_below_dataset(word: str) -> bool:
+    """Whether an override changes something of the dataset instead of choosing one."""
+    return word.lstrip("+~").startswith("dataset.")
+
+
+def is_table(words: Sequence[str]) -> bool:
+    """Whether a command line asks for a table."""
+    return any(word.lstrip("+").startswith("experiment=") for word in words)
+
+
+def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any]) -> tuple[str, int]:
+    """Run what is missing of a table; returns its text and the exit code: 2 if figures are missing.
+
+    `job` carries out one composition.
+
+    Raises:
+        ConfigError: an experiment, dataset or override is wrong; nothing was run.
+    """
+    words = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in words]
+    common = [word for word in words if key_of(word) not in OWN or is_below_dataset(word)]
+    launching = [word for word in words if key_of(word) == "hydra"]
+    with Compositions(plugins) as compositions:
+        refuse_sweeps(common)
+        refuse_taken(common)
+        chosen = [word for word in words if key_of(word) == "experiment"]
+        experiment = experiment_of([*chosen, *launching], compositions)
+        datasets = datasets_of(experiment, words, compositions)
+        check_scenes(experiment, datasets)
+        fitting = fitting_words(experiment, list(datasets), common, compositions)
+        cells = list(cells_of(experiment, datasets, fitting.__getitem__, compositions.settings))
+        plain = experiment_of([word for word in chosen if is_table([word])], compositions)
+        foreign = protocol_of(plain, cells, compositions)
+        lacking = lacking_of(cells, datasets)
+        due = [cell for cell in cells if (cell.dataset, cell.scene) not in lacking]
+        plan = planned(experiment, datasets, due, together=any("launcher=" in word for word in launching))
+        folder = folder_of(plan, plain, cells[0].config, common)
+        tell(plan, lacking)
+        if experiment.dry:
+            return "".join(f"gsx {shlex.join(job)}\n" for phase in plan.phases for job in phase), 0
+        for number, phase in enumerate(plan.phases):
+            launched(compositions, launching, folder / "launched" / str(number), phase, job)
+    published = read_table(experiment.published) if experiment.published else None
+    table = table_of(experiment, datasets, cells, published, lacking, foreign)
+    write_table(table, folder, [cell.folder for cell in cells if cell.folder.is_dir()])
+    return f"{as_text(table)}\n{folder / 'table.md'}\n", 0 if set(table.states) == {"ok"} else 2
+
+
+def launched(
+    compositions: Compositions,
+    words: Sequence[str],
+    folder: Path,
+    jobs: Sequence[Sequence[str]],
+    job: Callable[[Any], Any],
+) -> None:
+    """Carry out a phase. A launcher that gives up, for one killed process perhaps, does not cost the table."""
+    try:
+        compositions.launch(words, folder, jobs, job)
+    except Exception as error:
+        logger.warning(
+            "the launcher gave up (%s: %s): give the same command again for what is missing",
+            type(error).__name__,
+            first_line(error),
+        )
+
+
+def experiment_of(words: Sequence[str], compositions: Compositions) -> Experiment:
+    """The table that these words choose and change."""
+    experiment: Experiment = typed(Experiment, compositions.node(words, "experiment"), "experiment")
+    return experiment
+
+
+def fitting_words(
+    experiment: Experiment, datasets: Sequence[str], words: Sequence[str], compositions: Compositions
+) -> dict[str, list[str]]:
+    """The overrides of each variant: those of a component (PARTS) only where the variant has such a key.
+
+    Raises:
+        ConfigError: no variant has it.
+    """
+    particular = [word for word in words if key_of(word) in PARTS and "." in word.partition("=")[0]]
+    others = [word for word in words if word not in particular]
+    variants = set(experiment.chosen.values())
+    known = {v: compositions.keys([f"dataset={datasets[0]}", f"variant={v}", *others]) for v in variants if particular}
+    every = sorted({key for keys in known.values() for key in keys})
+    for word in particular:
+        if not word.startswith(("+", "~")) and (key := word.partition("=")[0]) not in every:
+            raise ConfigError(f"'{key}' is no configuration key of any row.{nearest(key, every)}")
+
+    def fits(word: str, variant: str) -> bool:
+        return word not in particular or word.startswith(("+", "~")) or word.partition("=")[0] in known[variant]
+
+    return {variant: [word for word in words if fits(word, variant)] for variant in variants}
+
+
+def refuse_taken(words: Sequence[str]) -> None:
+    """Raise ConfigError for words that each run of a table has of its own."""
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        if key in TAKEN or word.startswith("~dataset"):
+            remedy = TAKEN.get(key, "experiment.scenes=[NAME,...] chooses scenes")
+            raise ConfigError(f"'{word}' is not for tables, whose runs have it of their own: {remedy}")
+
+
+def refuse_sweeps(words: Sequence[str]) -> None:
+    """Raise ConfigError for words that ask for several values: a table has rows, scenes and seeds for that."""
+    for override in parse_overrides(words):
+        if override.is_sweep_override():
+            remedy = "experiment.seeds=[0,1,2]" if override.key_or_group == "seed" else "another table"
+            raise ConfigError(f"'{override.input_line}' asks for several values, which a table does not take: {remedy}")
+
+
+def datasets_of(experiment: Experiment, words: Sequence[str], compositions: Compositions) -> dict[str, Any]:
+    """The datasets of a table as composed, by name: that of the command line, or the paper's."""
+    asked = [word.partition("=")[2] for word in words if word.startswith("dataset=")]
+    below = [word for word in words if is_below_dataset(word)]
+    names = asked[-1:] or experiment.datasets
+    return {name: compositions.node([f"dataset={name}", *below], "dataset") for name in names}
+
+
+def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Compositions) -> list[str]:
+    """In what the rows differ from the paper's, by one scene of each."""
+    home = experiment.datasets[0]
+    of_rows = {cell.row: cell for cell in reversed(cells)}.values()
+
+    def published(cell: Cell) -> dict[str, Any]:
+        name = cell.dataset if cell.dataset in experiment.datasets else home
+        variant = experiment.rows[cell.row]
+        return compositions.settings([f"dataset={name}", f"variant={variant}", *experiment.overrides]).resolved
+
+    return protocol_differences([(cell.config, published(cell)) for cell in of_rows])
+
+
+def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[str, str], str]:
+    """Why scenes cannot be trained, by dataset and scene."""
+    places = {(cell.dataset, cell.scene): Path(cell.settings.general.data_root) for cell in cells}
+    reasons = {(name, scene): missing(datasets[name], scene, root) for (name, scene), root in places.items()}
+    return {place: reason for place, reason in reasons.items() if reason}
+
+
+def folder_of(plan: Plan, plain: Experiment, config: dict[str, Any], common: Sequence[str]) -> Path:
+    """Where a table is written: with other overrides than the published ones it is another folder."""
+    told = [plan.experiment.name, *plan.datasets, config["budget"]["name"]]
+    others = [word for word in common if key_of(word) not in ("budget", "output", "data_root")]
+    changed = others or plan.experiment != plain
+    key = [content_key(others, sorted_items(vars(plan.experiment)))[:6]] if changed else []
+    return Path(config["output"]) / "experiments" / "_".join([*told, *key])
+
+
+def tell(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:
+    """Say what is about to happen."""
+    for line in told(plan):
+        logger.info("%s", line)
+    for reason in dict.fromkeys(lacking.values()):
+        logger.warning("not run: %s (`gsx datasets` says where to get it)", reason)
+
+
+def write_table(table: Table, folder: Path, runs: Sequence[Path]) -> None:
+    """table.csv, table.md and table.tex, and the report over the runs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (("table.csv", as_csv(table)), ("table.md", as_markdown(table)), ("table.tex", as_latex(table))):
+        replace_file(folder / name, text.encode())
+    if runs:
+        write_overview(folder, list(dict.fromkeys(runs)))

@@ -1,0 +1,370 @@
+"""Figures of a table from the folders of its runs, beside those of the paper."""
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import source_revision
+from gsx.core.files import read_json
+from gsx.core.run_folder.files import RunFiles, is_number, part, read_run, state_of
+from gsx.core.run_folder.run_key import NAMES, OPERATING, WATCHING, WHERE, asked_for, other_revision, without
+from gsx.core.training.remarks import remarks_of
+from gsx.experiments.reports.baselines import spread
+from gsx.experiments.reports.overview import flattened
+from gsx.experiments.runs.warm_start import BRANCH
+from gsx.experiments.tables.plan import Cell, Experiment
+from gsx.experiments.tables.published import Published
+
+MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "PSNR": lambda e: e.get("psnr"),
+    "SSIM": lambda e: e.get("ssim"),
+    "LPIPS": lambda e: e.get("lpips"),
+    "kGS": lambda e: thousandth(e.get("visible_primitives")),
+    "MB": lambda e: e.get("megabytes"),
+}
+"""By metric, from an evaluation or one of its groups; Mem is the size of the model (spec 1.10, 32)."""
+PLACES = ("model", "revision", "variant", "dtype", "tiling")
+"""Keys of regenerators that say where a model comes from and how it fits into memory."""
+SHOWN_KEYS = 12
+"""Differences from the paper's protocol that are listed."""
+
+
+def thousandth(value: Any) -> float | None:
+    """A number in thousands."""
+    return value / 1000 if is_number(value) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scope:
+    """What a figure is a mean over: the scenes of a dataset, one of them, or a group of views in all of them."""
+
+    title: str
+    """As in the paper's table."""
+    dataset: str
+    scenes: list[str]
+    group: str = ""
+    paper: str = ""
+    """Scope of the paper's figures beside it; empty: there are none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """One cell of a table."""
+
+    row: str
+    scope: str
+    metric: str
+    ours: float | None
+    spread: float | None
+    """Half of the range over the seeds; None with a single one."""
+    seeds: int
+    whole: tuple[str, ...]
+    """Scenes with a figure for every seed."""
+    of_scenes: int
+    paper: float | None
+    difference: float | None
+    gain: float | None = None
+    """Over the baseline's row."""
+    paper_gain: float | None = None
+    problem: str = ""
+    """Why there is no figure."""
+    remarks: tuple[str, ...] = ()
+    """What a reader must know of the runs behind it."""
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes the figure is a mean over."""
+        return len(self.whole)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Table:
+    """A finished table."""
+
+    experiment: Experiment
+    figures: list[Figure]
+    scopes: list[Scope]
+    metrics: list[str]
+    foreign: list[str]
+    """In what it differs from the paper's protocol; empty: in nothing."""
+    notes: list[str]
+    seconds: float
+    """Of training, as far as it was taken."""
+    saved: float
+    """Of training that was not taken again, since runs branched."""
+    states: dict[str, int] = field(default_factory=dict)
+    """Runs by state."""
+
+    def at(self, row: str, scope: str, metric: str) -> Figure:
+        """The figure of a row, scope and metric."""
+        return next(f for f in self.figures if (f.row, f.scope, f.metric) == (row, scope, metric))
+
+
+def scopes_of(datasets: dict[str, Any], scenes: Sequence[str], published: Published | None) -> list[Scope]:
+    """The columns: those of the paper's table where its datasets are run, else each dataset as a whole."""
+    own = [
+        Scope(title=dataset["title"], dataset=name, scenes=chosen_scenes(dataset, scenes))
+        for name, dataset in datasets.items()
+    ]
+    known = [scope for title in (published.scopes if published else []) if (scope := matching(title, datasets, scenes))]
+    if published and not known:
+        known = [Scope(title=s.title, dataset=s.dataset, scenes=s.scenes, paper=published.scopes[0]) for s in own]
+    singles = [
+        Scope(title=datasets[s.dataset]["scenes"][scene], dataset=s.dataset, scenes=[scene])
+        for s in own
+        for scene in s.scenes
+        if len(s.scenes) > 1
+    ]
+    told = {(tuple(scope.scenes), scope.group) for scope in known}
+    return known + [scope for scope in [*own, *singles] if (tuple(scope.scenes), "") not in told]
+
+
+def chosen_scenes(dataset: dict[str, Any], scenes: Sequence[str]) -> list[str]:
+    """The scenes of a dataset that are run."""
+    return [scene for scene in dataset["scenes"] if not scenes or scene in scenes]
+
+
+def matching(title: str, datasets: dict[str, Any], scenes: Sequence[str]) -> Scope | None:
+    """The scope that the paper calls so, if it is among those that are run."""
+    for name, dataset in datasets.items():
+        chosen = chosen_scenes(dataset, scenes)
+        some = "" if len(chosen) == len(dataset["scenes"]) else f" ({len(chosen)} of {len(dataset['scenes'])} scenes)"
+        if title in (dataset["title"], f"{dataset['title']} (Average)"):
+            return Scope(title=title + some, dataset=name, scenes=chosen, paper="" if some else title)
+        if title.startswith("Scale-"):
+            paper = "" if some else title
+            return Scope(title=title + some, dataset=name, scenes=chosen, group=title.lower(), paper=paper)
+        for scene in chosen:
+            if dataset["scenes"][scene] == title:
+                return Scope(title=title, dataset=name, scenes=[scene], paper=title)
+    return None
+
+
+def table_of(
+    experiment: Experiment,
+    datasets: dict[str, Any],
+    cells: Sequence[Cell],
+    published: Published | None,
+    lacking: dict[tuple[str, str], str],
+    foreign: list[str],
+) -> Table:
+    """The table, as far as its runs have come; `lacking`: why scenes could not be run, by dataset and scene."""
+    files = {cell.folder: read_run(cell.folder) for cell in cells}
+    scopes = scopes_of(datasets, experiment.scenes, published)
+    zooms = sorted({z for run in files.values() for z in part(run.evaluation, "zoom") if float(z) > 1}, key=float)
+    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS"]), *(f"PSNR x{zoom}" for zoom in zooms)]
+    figures = [
+        figure(row, scope, metric, [c for c in cells if c.row == row], files, published, lacking)
+        for scope in scopes
+        for row in rows_of(experiment)
+        for metric in metrics
+    ]
+    return Table(
+        experiment=experiment,
+        figures=with_gains(figures, experiment.baseline),
+        scopes=scopes,
+        metrics=metrics,
+        foreign=foreign,
+        notes=notes_of(experiment, cells, files, published),
+        seconds=sum(seconds_of(run) for run in files.values()),
+        saved=sum(saved_by(folder) for folder in files),
+        states=counted(files, cells, lacking),
+    )
+
+
+def rows_of(experiment: Experiment) -> list[str]:
+    """Rows of the table: quoted ones first."""
+    return [*experiment.quoted, *experiment.chosen]
+
+
+def figure(
+    row: str,
+    scope: Scope,
+    metric: str,
+    cells: Sequence[Cell],
+    files: dict[Path, RunFiles],
+    published: Published | None,
+    lacking: dict[tuple[str, str], str],
+) -> Figure:
+    """One cell: the mean over scenes of the mean over seeds, if all of them are there."""
+    inside = [cell for cell in cells if cell.dataset == scope.dataset and cell.scene in scope.scenes]
+    found = {(cell.scene, cell.seed): measured(files[cell.folder], metric, scope.group) for cell in inside}
+    values = {place: value for place, value in found.items() if value is not None}
+    seeds = sorted({cell.seed for cell in inside})
+    whole = [scene for scene in scope.scenes if seeds and all((scene, seed) in values for seed in seeds)]
+    complete = bool(whole) and len(whole) == len(scope.scenes)
+    by_seed = [statistics.fmean(values[scene, seed] for scene in whole) for seed in seeds] if whole else []
+    ours = statistics.fmean(by_seed) if by_seed else None
+    paper = published.figures.get((row, scope.paper, metric)) if published else None
+    return Figure(
+        row=row,
+        scope=scope.title,
+        metric=metric,
+        ours=ours,
+        spread=spread(by_seed) if len(by_seed) > 1 else None,
+        seeds=len(seeds),
+        whole=tuple(whole),
+        of_scenes=len(scope.scenes),
+        paper=paper,
+        difference=ours - paper if complete and ours is not None and paper is not None else None,
+        problem="" if complete else problem_of(inside, files, lacking, metric),
+        remarks=tuple(dict.fromkeys(told for cell in inside for told in remarks_on(cell, files))),
+    )
+
+
+def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
+    """What a reader must know of a run, with its row and scene."""
+    return [f"{cell.row}, {cell.scene}: {remark}" for remark in remarks_of(files[cell.folder].evaluation)]
+
+
+def measured(files: RunFiles, metric: str, group: str) -> float | None:
+    """A figure of a run that is done."""
+    if state_of(files)[0] != "ok":
+        return None
+    if metric.startswith("PSNR x"):
+        entry = part(files.evaluation, "zoom").get(metric.removeprefix("PSNR x")) or {}
+        value = None if group else entry.get("psnr")
+    else:
+        value = MEASURES[metric](part(part(files.evaluation, "groups"), group) if group else files.evaluation)
+    return value if is_number(value) else None
+
+
+def problem_of(
+    cells: Sequence[Cell], files: dict[Path, RunFiles], lacking: dict[tuple[str, str], str], metric: str
+) -> str:
+    """Why figures are missing, by the first run that lacks one."""
+    for cell in cells:
+        if (reason := lacking.get((cell.dataset, cell.scene))) and not files[cell.folder].evaluation:
+            return f"no data: {reason}"
+        state, why = state_of(files[cell.folder])
+        if not files[cell.folder].config:
+            return "not run yet"
+        if state != "ok":
+            return f"{state}: {why}"
+    remedy = ": give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE" if metric == "LPIPS" else ""
+    return f"{metric} is not measured{remedy}" if cells else "not run"
+
+
+def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
+    """The figures with their gains over the baseline's row."""
+    base = {(f.scope, f.metric): f for f in figures if f.row == baseline}
+
+    def gain(f: Figure, value: float | None, other: float | None) -> float | None:
+        return value - other if value is not None and other is not None and f.row != baseline else None
+
+    out = []
+    for f in figures:
+        b = base.get((f.scope, f.metric))
+        same = b is not None and f.whole == b.whole
+        ours = gain(f, f.ours, b.ours) if b and same else None
+        theirs = gain(f, f.paper, b.paper) if b else None
+        out.append(Figure(**(vars(f) | {"gain": ours, "paper_gain": theirs})))
+    return out
+
+
+def seconds_of(files: RunFiles) -> float:
+    """Seconds of training that a run has taken itself."""
+    seconds = files.evaluation.get("train_seconds")
+    if not is_number(seconds):
+        seconds = files.lines[-1].get("seconds", 0.0) if files.lines else 0.0
+    return max(0.0, float(seconds) - saved_by(files.folder))
+
+
+def saved_by(folder: Path) -> float:
+    """Seconds of training that a run did not have to take, since it branched from another."""
+    try:
+        return float(read_json(folder / BRANCH)["seconds"])
+    except (OSError, ValueError, KeyError):
+        return 0.0
+
+
+def counted(files: dict[Path, RunFiles], cells: Sequence[Cell], lacking: dict[tuple[str, str], str]) -> dict[str, int]:
+    """Runs by state."""
+    counts: dict[str, int] = {}
+    for folder, run in files.items():
+        absent = any((cell.dataset, cell.scene) in lacking for cell in cells if cell.folder == folder)
+        state = state_of(run)[0] if run.config else "without data" if absent else "not run"
+        counts[state] = counts.get(state, 0) + 1
+    return counts
+
+
+def notes_of(
+    experiment: Experiment, cells: Sequence[Cell], files: dict[Path, RunFiles], published: Published | None
+) -> list[str]:
+    """What a reader must know beside the figures."""
+    notes = [f"{row}: {reason}" for row, reason in experiment.quoted.items()]
+    notes += dict.fromkeys(f"* {told}" for cell in cells for told in remarks_on(cell, files))
+    notes += [f"corrected: {note}" for note in (published.notes if published else [])]
+    shared: dict[Path, list[str]] = {}
+    for cell in cells:
+        if cell.row not in shared.setdefault(cell.folder, []):
+            shared[cell.folder].append(cell.row)
+    same = [" and ".join(rows) for rows in shared.values() if len(rows) > 1]
+    notes += dict.fromkeys(f"{rows} are the same composition here" for rows in same)
+    notes += of_other_revisions(cells, files)
+    devices = {str(run.environment.get("device")) for run in files.values() if run.environment}
+    if len(devices) > 1:
+        notes.append(f"these runs were trained on different devices: {', '.join(sorted(devices))}")
+    return notes
+
+
+def of_other_revisions(cells: Sequence[Cell], files: dict[Path, RunFiles]) -> list[str]:
+    """Which rows hold results of another revision of gsx's source than this one, and in how many of their runs."""
+    this = source_revision()
+    found = {folder: other_revision(run, this) for folder, run in files.items() if run.evaluation}
+    notes = []
+    for revision in sorted({revision for revision in found.values() if revision}):
+        shares = [share_of(row, revision, cells, found) for row in dict.fromkeys(cell.row for cell in cells)]
+        told = ", ".join(share for share in shares if share)
+        notes.append(f"trained by another revision of gsx's source ({revision}, this is {this}): {told}")
+    return notes
+
+
+def share_of(row: str, revision: str, cells: Sequence[Cell], found: dict[Path, str]) -> str:
+    """How many results of a row are of that revision, in words; empty if none is. `found`: revisions by folder."""
+    own = [found[folder] for folder in {cell.folder for cell in cells if cell.row == row} if folder in found]
+    count = own.count(revision)
+    return f"{row} ({count} of {len(own)} runs)" if count else ""
+
+
+def protocol_differences(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:
+    """In which keys compositions (as run, as published) differ, each with its values, those of most rows first."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for own, paper in pairs:
+        for key, value, published in differing(own, paper):
+            found.setdefault(key, []).append((value, published))
+    ranked = sorted(found, key=lambda key: -len(found[key]))
+    told = []
+    for key in ranked:
+        ours, theirs = zip(*found[key], strict=True)
+        told.append(f"{key}={listed(ours)} (paper: {listed(theirs)})")
+    more = [f"and {len(told) - SHOWN_KEYS} more"] if len(told) > SHOWN_KEYS else []
+    return told[:SHOWN_KEYS] + more
+
+
+def listed(values: Sequence[str]) -> str:
+    """Different values, in order."""
+    return ", ".join(dict.fromkeys(values))
+
+
+def differing(own: dict[str, Any], paper: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
+    mine, theirs = (flattened(judged(config)) for config in (own, paper))
+    others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
+    for key in dict.fromkeys([*mine, *theirs]):
+        inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)
+        if mine.get(key) != theirs.get(key) and not inside:
+            yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
+
+
+def judged(config: dict[str, Any]) -> dict[str, Any]:
+    """What of a composition makes its protocol: all but where it runs, its seed, and which zooms are looked at."""
+    kept = {key: value for key, value in config.items() if key not in (*WHERE, *NAMES, "seed")}
+    kept["dataset"] = part(config, "dataset").get("title")
+    kept["eval"] = {key: value for key, value in part(config, "eval").items() if key not in ("zoom", "tile_pixels")}
+    kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
+    kept["scene"] = {k: v for k, v in part(config, "scene").items() if k not in ("path", "cache_gb", "iterations")}
+    kept["metrics"] = {key: part(part(config, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
+    return kept | {"regenerator": without(asked_for(config), (*OPERATING, *PLACES))}

@@ -1,0 +1,188 @@
+"""A table as text: for the terminal, as CSV, Markdown and LaTeX."""
+
+import csv
+import io
+from collections.abc import Sequence
+
+from gsx.experiments.tables.published import METRICS
+from gsx.experiments.tables.table import Figure, Scope, Table, rows_of
+
+DIGITS = {"PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1}
+FIELDS = (
+    "row", "scope", "scenes", "of_scenes", "seeds", "metric", "ours", "spread", "paper", "difference", "gain",
+    "paper_gain", "problem", "remarks",
+)  # fmt: skip
+
+
+def digits(metric: str) -> int:
+    """Decimals of a metric, as the paper prints it."""
+    return DIGITS.get(metric, 2)
+
+
+def name_of(metric: str) -> str:
+    """A metric as the paper calls it."""
+    return METRICS.get(metric, metric)
+
+
+def number(value: float | None, metric: str, sign: bool = False) -> str:
+    """A figure, or nothing; with a sign where it is a difference."""
+    return "" if value is None else f"{value:{'+' if sign else ''}.{digits(metric)}f}"
+
+
+def ours(figure: Figure) -> str:
+    """Our figure with its spread; in brackets where scenes are missing, with a star where a note tells more of it."""
+    if figure.ours is None:
+        return "-"
+    text = number(figure.ours, figure.metric)
+    if figure.spread is not None:
+        text += f" ± {number(figure.spread, figure.metric)}"
+    text += " *" if figure.remarks else ""
+    return text if figure.scenes == figure.of_scenes else f"({text}: {figure.scenes} of {figure.of_scenes})"
+
+
+def headings(table: Table, scope: Scope) -> list[tuple[str, str]]:
+    """(metric, what of it) of each column."""
+    columns = []
+    for metric in shown(table, scope):
+        columns.append((metric, "ours"))
+        if any(table.at(row, scope.title, metric).paper is not None for row in rows_of(table.experiment)):
+            columns += [(metric, "paper"), (metric, "difference")]
+    return columns
+
+
+def shown(table: Table, scope: Scope) -> list[str]:
+    """Metrics that have figures in this scope, of ours or the paper's."""
+
+    def told(metric: str) -> bool:
+        figures = [table.at(row, scope.title, metric) for row in rows_of(table.experiment)]
+        return any(f.ours is not None or f.paper is not None for f in figures)
+
+    return [metric for metric in table.metrics if told(metric)]
+
+
+def cells(table: Table, scope: Scope) -> list[list[str]]:
+    """The grid of a scope: headings, then rows; with gains in the first metric over the baseline."""
+    columns, lead = headings(table, scope), next(iter(shown(table, scope)), "")
+    head = ["", *(f"{name_of(m)} {what}" if what == "ours" else what for m, what in columns)]
+    gains = ["gain", "gain in the paper"] if lead else []
+    rows = []
+    for row in rows_of(table.experiment):
+        line = [row]
+        for metric, what in columns:
+            f = table.at(row, scope.title, metric)
+            values = {"paper": number(f.paper, metric), "difference": number(f.difference, metric, sign=True)}
+            line.append(ours(f) if what == "ours" else values[what])
+        if lead:
+            f = table.at(row, scope.title, lead)
+            line += [number(f.gain, lead, sign=True), number(f.paper_gain, lead, sign=True)]
+        rows.append(line)
+    return [[*head, *gains], *rows]
+
+
+def problems(table: Table) -> list[str]:
+    """Why figures are missing: each reason once, with the rows it holds for."""
+    rows: dict[str, list[str]] = {}
+    for f in table.figures:
+        if f.problem and f.row not in table.experiment.quoted and f.row not in rows.setdefault(f.problem, []):
+            rows[f.problem].append(f.row)
+    everything = len(table.experiment.chosen)
+    return [f"{reason}: {'all rows' if len(r) == everything else ', '.join(r)}" for reason, r in rows.items()]
+
+
+def face(table: Table) -> list[str]:
+    """What a reader must see before any figure."""
+    lines = [table.experiment.title]
+    if table.foreign:
+        lines.append(f"NOT the paper's protocol: {'; '.join(table.foreign)}")
+    return lines
+
+
+def foot(table: Table) -> list[str]:
+    """What stands below the figures."""
+    states = ", ".join(f"{count} {state}" for state, count in table.states.items())
+    lines = [f"runs: {states}", f"gains are over {table.experiment.baseline}"]
+    seeds = table.experiment.seeds
+    if len(seeds) > 1:
+        lines.append(f"means over {len(seeds)} seeds, ± half of their range")
+    if table.saved:
+        lines.append(
+            f"{table.saved:,.0f} s of training saved by common beginnings, {table.seconds:,.0f} s taken "
+            f"({100 * table.saved / (table.saved + table.seconds):.0f} % less)"
+        )
+    return [*lines, *table.notes, *problems(table)]
+
+
+def as_text(table: Table) -> str:
+    """For the terminal."""
+    blocks = ["\n".join(face(table))]
+    for scope in table.scopes:
+        grid = cells(table, scope)
+        blocks.append("\n".join([title_of(scope), *aligned(grid)]))
+    return "\n\n".join([*blocks, "\n".join(foot(table))]) + "\n"
+
+
+def title_of(scope: Scope) -> str:
+    """A scope, and the paper's beside it where that is another one."""
+    beside = f", beside {scope.paper} in the paper" if scope.paper and scope.paper != scope.title else ""
+    count = f" ({len(scope.scenes)} scenes)" if len(scope.scenes) > 1 else ""
+    return f"{scope.title}{count}{beside}"
+
+
+def aligned(grid: Sequence[Sequence[str]]) -> list[str]:
+    """Columns under each other, figures to the right."""
+    widths = [max(len(line[i]) for line in grid) for i in range(len(grid[0]))]
+    padded = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in grid]
+    return ["  ".join(words).rstrip() for words in padded]
+
+
+def as_csv(table: Table) -> str:
+    """One line for each figure; missing ones are empty."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+    writer.writeheader()
+    for f in table.figures:
+        line = {key: getattr(f, key) for key in FIELDS} | {"remarks": "; ".join(f.remarks)}
+        writer.writerow({key: "" if value is None else value for key, value in line.items()})
+    return stream.getvalue()
+
+
+def as_markdown(table: Table) -> str:
+    """For a page."""
+    title, *warnings = face(table)
+    blocks = [f"# {title}", *(f"**{warning}**" for warning in warnings)]
+    for scope in table.scopes:
+        head, *rows = cells(table, scope)
+        rule = "|".join(["---", *("--:" for _ in head[1:])])
+        lines = [f"| {' | '.join(line)} |" for line in [head, *rows]]
+        blocks.append("\n".join([f"## {title_of(scope)}", "", lines[0], f"|{rule}|", *lines[1:]]))
+    return "\n\n".join([*blocks, "\n".join(f"* {line}" for line in foot(table))]) + "\n"
+
+
+def as_latex(table: Table) -> str:
+    """For a paper: one tabular for each scope, with package booktabs."""
+    title, *warnings = face(table)
+    out = [f"% {line}" for line in [title, *warnings]]
+    for scope in table.scopes:
+        head, *rows = cells(table, scope)
+        caption = ". ".join(escaped(text) for text in [title, title_of(scope), *warnings])
+        body = [" & ".join(escaped(word) for word in line) + r" \\" for line in rows]
+        out += [
+            r"\begin{table}",
+            rf"\caption{{{caption}.}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
+            r"\toprule",
+            " & ".join(escaped(word) for word in head) + r" \\",
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+    return "\n".join(out) + "\n"
+
+
+def escaped(text: str) -> str:
+    """Text with LaTeX's special characters taken literally."""
+    for character in "\\&%$#_{}":
+        text = text.replace(character, r"\textbackslash " if character == "\\" else f"\\{character}")
+    return text.replace("±", r"$\pm$").replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")

@@ -1,0 +1,1 @@
+"""What each setting of the rasterizer costs, and what it changes."""

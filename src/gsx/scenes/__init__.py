@@ -1,0 +1,1 @@
+"""Loaders: one per format, a `Scene` out of each."""

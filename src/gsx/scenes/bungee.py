@@ -1,0 +1,282 @@
+"""BungeeNeRF cities, seen from the street to the sky, with every view labelled by its scale.
+
+Cameras come from a COLMAP model (as the Scaffold-GS and Octree-GS authors distribute these scenes) or, without one,
+from `poses_enu.json` of the original data (scaffold and octree spec, section 6). Scale-1 is the closest and scale-4
+the farthest: the columns of the published tables count 522 k Gaussians drawn at scale-1 and 5,821 k at scale-4, and
+only a distant camera sees the whole city.
+
+Train and test views keep the order of the sorted file names, so the first n training cameras that the published
+augmentation uses are `scene.train[:n]`.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import checked_size
+from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.shapes import Float
+from gsx.scenes import colmap
+from gsx.scenes.colmap_model import model_folders
+from gsx.scenes.points import grey_points, read_points
+from gsx.scenes.posed import (
+    Shot,
+    pose_from_opengl,
+    provenance,
+    read_json,
+    reduction_of,
+    refuse_too_few,
+    views_of,
+)
+from gsx.scenes.splits import Split, split_names
+
+POSES_FILE = "poses_enu.json"
+POSE_VALUES = 17  # 3 x 5 [R | t | height, width, focal], near, far
+SUFFIXES = (".jpg", ".jpeg", ".png")
+SCALES = 4
+FEW_HELD_OUT = 50  # Scaffold-GS: with lod below this the first images are test, from it on they are train
+BUILDING_HEIGHT = 250.0  # metres; nothing is higher, as BungeeNeRF's bounds along rays assume
+RAYS_PER_POINT = 4  # some end in the sky
+
+
+@dataclass(frozen=True, kw_only=True)
+class BungeeOptions(colmap.ColmapOptions):
+    """What `conf/scene/bungee.yaml` sets.
+
+    `split` can be `lod:N` as well (Scaffold-GS): of the sorted images those up to number N are test and the rest
+    train, or from N = 50 on the other way round.
+    """
+
+    points: str
+    """For scenes without COLMAP model. random: in what the cameras see, up to 250 m high | a PLY file."""
+    random_points: int
+    seed: int
+    """Of the random points."""
+
+
+def load(options: BungeeOptions) -> Scene:
+    """Loads a BungeeNeRF scene.
+
+    Raises:
+        ConfigError: the split rule cannot be read.
+        InputError: a file is missing or damaged, or there are fewer than two training images.
+    """
+    folder = Path(options.path).expanduser()
+    if model_folders(folder):
+        scene = colmap.load(replace(options, split="none"))
+        centre = scene.points.positions.median(dim=0).values
+    else:
+        scene = load_enu(options, folder)
+        centre = torch.zeros(3)
+    groups, basis = _scales(scene.train, centre, folder, options.images)
+    views = [replace(view, group=f"scale-{scale}") for view, scale in zip(scene.train, groups, strict=True)]
+    train, test = split_views([view.name for view in views], options.split, folder)
+    refuse_too_few(train_views := [views[i] for i in train], folder)
+    return replace(
+        scene,
+        train=train_views,
+        test=[views[i] for i in test],
+        extent=extent_of([view.camera for view in train_views]),
+        notes=[*scene.notes, _scale_note(views, basis)],
+        provenance={**scene.provenance, "format": options.name, "split": options.split, "scales": basis},
+    )
+
+
+def split_views(names: Sequence[str], rule: str, folder: Path) -> Split:
+    """Positions of training and test names; `lod:N`, or any rule of `gsx.scenes.splits`.
+
+    Raises:
+        ConfigError: the rule cannot be read.
+        InputError: it leaves no image to train on or none to test on.
+    """
+    kind, _, number = rule.partition(":")
+    if kind != "lod":
+        return split_names(list(names), rule, folder)
+    if not number.isdecimal() or int(number) < 1:
+        raise ConfigError(f"scene.split is '{rule}', give a whole number above 0 after lod, for example lod:30.")
+    order, _ = split_names(list(names), "none")
+    first, rest = order[: int(number) + 1], order[int(number) + 1 :]  # up to and including N, as published
+    if not rest:
+        raise InputError(f"scene.split '{rule}' leaves none of {len(names)} images over, choose a smaller number.")
+    return (rest, first) if int(number) < FEW_HELD_OUT else (first, rest)
+
+
+def load_enu(options: BungeeOptions, folder: Path) -> Scene:
+    """The scene of `poses_enu.json`, all views in `train`.
+
+    Poses are OpenGL camera-to-world in scaled east-north-up coordinates with the ground at height 0.
+
+    Raises:
+        InputError: a file is missing or damaged, or images and poses differ in number.
+    """
+    file = folder / POSES_FILE
+    if not file.is_file():
+        raise InputError(
+            f"'{folder}' has neither a COLMAP model nor {POSES_FILE}, set scene.path to a folder with one."
+        )
+    content = read_json(file)
+    poses = _poses(content, file)
+    photos = image_files(folder / options.images)
+    if len(photos) != len(poses):
+        raise InputError(
+            f"'{file}' has {len(poses)} poses and '{folder / options.images}' {len(photos)} images: put back the"
+            " images that belong to it."
+        )
+    shots = [_shot(pose, photo, file) for pose, photo in zip(poses, photos, strict=True)]
+    views = views_of(shots, options)
+    points, note = _points(views, content, options, file)
+    return Scene(
+        name=folder.resolve().name,
+        train=views,
+        test=[],
+        points=points,
+        background=torch.tensor(list(options.background), dtype=torch.float32),
+        reduction=reduction_of(options),
+        extent=extent_of([view.camera for view in views]),
+        notes=[f"Cameras come from {POSES_FILE}.", note],
+        provenance=provenance(options, len(views), points=options.points),
+    )
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder sorted by name, which is from near to far in the original data."""
+    files = folder.iterdir() if folder.is_dir() else []
+    return sorted(file for file in files if file.suffix.lower() in SUFFIXES)
+
+
+def _poses(content: dict[str, Any], file: Path) -> Float[Tensor, "N 17"]:
+    try:
+        poses = torch.tensor(content.get("poses"), dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"'{file}' has poses that are no table of numbers, copy it anew.") from None
+    if poses.ndim != 2 or poses.shape[1] != POSE_VALUES or not poses.isfinite().all():
+        raise InputError(f"'{file}' has poses that are not rows of {POSE_VALUES} finite numbers, copy it anew.")
+    return poses
+
+
+def _shot(pose: Float[Tensor, "17"], photo: Path, file: Path) -> Shot:
+    matrix = pose[:15].reshape(3, 5)
+    place = f"The pose of '{photo.name}' in '{file}'"
+    rotation, translation = pose_from_opengl(matrix[:, :4].tolist(), place)
+    height, width, focal = matrix[:, 4].tolist()
+    if min(height, width, focal) < 1:
+        raise InputError(f"{place} has size {width:g} x {height:g} and focal length {focal:g}, copy the file anew.")
+    expected = round(width), round(height)
+    camera = Camera(
+        rotation=rotation,
+        translation=translation,
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        width=expected[0],
+        height=expected[1],
+    )
+    whole = camera.resize(*checked_size(photo, expected))
+    return Shot(name=photo.name, photo=photo, whole=whole, expected_size=expected)
+
+
+def _points(
+    views: Sequence[View], content: dict[str, Any], options: BungeeOptions, file: Path
+) -> tuple[PointCloud, str]:
+    """Points and a note on where they come from."""
+    if options.points != "random":
+        cloud = read_points(file.parent / options.points)
+        return cloud, f"Starts from the {len(cloud)} points of {options.points}."
+    scale = content.get("scene_scale")
+    if not isinstance(scale, float | int) or not 0 < scale < float("inf"):
+        raise InputError(
+            f"'{file}' has scene_scale {scale!r}, give a number above 0 or set scene.points to a PLY file."
+        )
+    generator = torch.Generator().manual_seed(options.seed)
+    cameras = [view.camera for view in views]
+    cloud = city_points(cameras, options.random_points, BUILDING_HEIGHT * scale, generator)
+    return cloud, f"Starts from {len(cloud)} random points on rays of the cameras, up to {BUILDING_HEIGHT:g} m high."
+
+
+def city_points(cameras: Sequence[Camera], count: int, height: float, generator: torch.Generator) -> PointCloud:
+    """Grey points where rays through random pixels of random cameras reach a random level in [0, `height`].
+
+    Points lie as densely as the cameras look, at all scales; none is farther from the origin than every camera.
+
+    Raises:
+        InputError: no ray comes down to the ground.
+    """
+    rays = count * RAYS_PER_POINT
+    chosen = torch.randint(len(cameras), (rays,), generator=generator)
+    eyes = torch.stack([camera.centre for camera in cameras])
+    directions = torch.stack([camera.rotation.T @ _pixel_to_ray(camera) for camera in cameras])
+    pixels = torch.rand(rays, 3, 1, generator=generator, dtype=torch.float64)
+    pixels[:, 2] = 1
+    way = (directions[chosen] @ pixels)[..., 0]
+    level = torch.rand(rays, generator=generator, dtype=torch.float64) * height
+    depth = (level - eyes[chosen, 2]) / way[:, 2]
+    positions = eyes[chosen] + depth[:, None] * way
+    usable = (depth > 0) & (positions.norm(dim=1) <= eyes.norm(dim=1).max())
+    if not usable.any():
+        raise InputError("No camera of the scene looks down on a city, set scene.points to a PLY file.")
+    return grey_points(positions[usable][:count])
+
+
+def _pixel_to_ray(camera: Camera) -> Float[Tensor, "3 3"]:
+    """Takes (x / width, y / height, 1) to the ray of that pixel in camera coordinates, at depth 1."""
+    return torch.tensor(
+        [
+            [camera.width / camera.fx, 0, -camera.cx / camera.fx],
+            [0, camera.height / camera.fy, -camera.cy / camera.fy],
+            [0, 0, 1],
+        ],
+        dtype=torch.float64,
+    )
+
+
+def _scales(views: Sequence[View], centre: Float[Tensor, "3"], folder: Path, images: str) -> tuple[list[int], str]:
+    """The scale of each view, from 1, and what it is based on."""
+    file = folder / POSES_FILE
+    content = read_json(file) if file.is_file() else {}
+    names = [photo.name for photo in image_files(folder / images)]
+    if "scale_split" in content and len(names) == len(_poses(content, file)):
+        starts = _starts(content["scale_split"], file)
+        return [scale_of_number(names.index(Path(view.name).name), starts) for view in views], f"{POSES_FILE}"
+    distances = torch.stack([(view.camera.centre - centre).norm() for view in views])
+    return scales_of_distances(distances), "four bins of equal width in log distance from the scene centre"
+
+
+def _starts(value: Any, file: Path) -> list[int]:
+    """The numbers of the first image of each scale, farthest scale first."""
+    if (
+        not isinstance(value, list)
+        or not all(isinstance(start, int) for start in value)
+        or value != sorted(set(value), reverse=True)
+        or value[-1:] != [0]
+    ):
+        raise InputError(f"'{file}' has scale_split {value}, which must be whole numbers falling to 0.")
+    return value
+
+
+def scale_of_number(number: int, starts: Sequence[int]) -> int:
+    """Scale of an image by its number among the sorted ones: they run from near (1) to far."""
+    return sum(number >= start for start in starts)
+
+
+def scales_of_distances(distances: Float[Tensor, "N"]) -> list[int]:
+    """Scales 1 (near) to 4: bins of equal width between the smallest and the largest log distance."""
+    logs = distances.double().clamp(min=torch.finfo(torch.float64).tiny).log()
+    low, high = logs.min(), logs.max()
+    if low == high:
+        return [1] * len(logs)
+    bins = (SCALES * (logs - low) / (high - low)).long().clamp(max=SCALES - 1)
+    return (bins + 1).tolist()
+
+
+def _scale_note(views: Sequence[View], basis: str) -> str:
+    counts = sorted(Counter(view.group for view in views).items())
+    listed = ", ".join(f"{group}: {count}" for group, count in counts)
+    return f"Views of each scale, 1 closest (by {basis}): {listed}."

@@ -1,0 +1,181 @@
+"""Scenes from a COLMAP model and its photos (spec 2.1, 2.4, 8.1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import Scene, View, extent_of
+from gsx.core.errors import InputError
+from gsx.core.shapes import Bool, Float
+from gsx.scenes.colmap_model import Model, ModelImage, find_model, read_model
+from gsx.scenes.options import SceneOptions
+from gsx.scenes.posed import (
+    MIN_IMAGES,
+    Shot,
+    lens_notes,
+    named,
+    provenance,
+    reduction_of,
+    refuse_too_few,
+    shot_through,
+    views_of,
+)
+from gsx.scenes.splits import split_names
+from gsx.scenes.undistort import (
+    METHOD,
+    pinhole_of,
+    undistort_points,
+)
+
+MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observations that could be compared instead
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapOptions(SceneOptions):
+    """What `conf/scene/colmap.yaml` sets."""
+
+    images: str
+    """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
+    max_reprojection_px: float
+    """The scene is refused when the median reprojection error exceeds this, in pixels of the model's cameras."""
+
+
+def load(options: ColmapOptions) -> Scene:
+    """Load a COLMAP scene.
+
+    Raises:
+        InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
+    """
+    path = Path(options.path).expanduser()
+    folder, notes = find_model(path)
+    return build(read_model(folder), path / options.images, options, notes)
+
+
+def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str]) -> Scene:
+    """The scene of a model whose images are in the folder `photos`; `notes` come first among the scene's.
+
+    Raises:
+        InputError: as `load`.
+    """
+    path = Path(options.path).expanduser()
+    present = present_images(model, photos)
+    shots = [shot_of(model, image, photos) for image in present]
+    views = views_of(shots, options)
+    fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
+    train, test = split_names([view.name for view in views], options.split, path)
+    refuse_too_few([views[index] for index in train], path)
+    return Scene(
+        name=path.resolve().name,
+        train=[views[index] for index in train],
+        test=[views[index] for index in test],
+        points=model.points,
+        background=torch.tensor(list(options.background), dtype=torch.float32),
+        reduction=reduction_of(options),
+        extent=extent_of([views[index].camera for index in train]),
+        notes=[*notes, *model.notes, *_missing_note(model, present), *lens_notes(shots), fit],
+        provenance=_provenance(model, shots, options),
+    )
+
+
+def present_images(model: Model, photos: Path) -> list[ModelImage]:
+    """The images of the model whose photo exists.
+
+    Raises:
+        InputError: none or only one exists.
+    """
+    present = [image for image in model.images if (photos / image.name).is_file()]
+    if not present and model.images:
+        raise InputError(
+            f"None of the {len(model.images)} images of {model.folder} is in {photos} (looked for "
+            f"{named([image.name for image in model.images])}): set scene.images to the folder that holds them."
+        )
+    if len(present) < MIN_IMAGES:
+        raise InputError(
+            f"{model.folder} has {len(model.images)} registered images, {len(present)} of them in {photos}, but "
+            f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
+        )
+    return present
+
+
+def shot_of(model: Model, image: ModelImage, photos: Path) -> Shot:
+    """An image of the model as the pinhole photo that gsx uses.
+
+    Raises:
+        InputError: the photo's size is no uniform reduction of its camera's, or that has no pinhole equivalent.
+    """
+    lens = model.cameras[image.camera_id]
+    return shot_through(lens, image.name, photos / image.name, image.rotation, image.translation)
+
+
+def check_cameras(
+    model: Model, images: Sequence[ModelImage], shots: Sequence[Shot], views: Sequence[View], limit: float
+) -> str:
+    """Compare the cameras to train with against what the model observed; returns the finding as a note.
+
+    Raises:
+        InputError: the median error exceeds `limit` pixels of the model, or (no observations) few points are in view.
+    """
+    # views without their centring, if any: that is an approximation asked for, not a mistake to be found
+    cameras = [shot.whole.resize(*view.camera.size) for shot, view in zip(shots, views, strict=True)]
+    lenses = [model.cameras[image.camera_id] for image in images]
+    errors = torch.cat([reprojection_errors(*fit) for fit in zip(images, lenses, cameras, strict=True)])
+    if not len(errors):
+        return _check_visible(model, cameras)
+    median = float(errors.median())
+    if not median <= limit:
+        raise InputError(
+            f"The cameras of {model.folder} miss the observed keypoints by {median:.3g} px (median; the limit is "
+            f"scene.max_reprojection_px={limit:g}): poses, intrinsics or files of different reconstructions are mixed."
+        )
+    return f"Reprojection error {median:.2f} px (median of {len(errors)} observations, at the model's resolution)."
+
+
+def reprojection_errors(image: ModelImage, lens: Any, camera: Camera) -> Float[Tensor, "K"]:
+    """Distance of projected points from their keypoints in pixels of the model; infinite behind the camera.
+
+    `camera` is the image's pinhole camera on any raster, `lens` the model's pycolmap camera.
+    """
+    pinhole = pinhole_of(lens)
+    observed = undistort_points(lens, pinhole, image.keypoints)
+    projected, depth = camera.project(image.observed)
+    to_model = projected.new_tensor([pinhole.width / camera.width, pinhole.height / camera.height])
+    errors = (projected * to_model - observed).norm(dim=1)
+    return torch.where(depth > 0, errors, torch.inf)
+
+
+def _check_visible(model: Model, cameras: Sequence[Camera]) -> str:
+    visible = torch.stack([_in_view(camera, model.points.positions) for camera in cameras]).any(dim=0)
+    fraction = float(visible.double().mean())
+    if fraction < MIN_VISIBLE_FRACTION:
+        raise InputError(
+            f"Only {fraction:.0%} of the points of {model.folder} are in view of any camera (at least "
+            f"{MIN_VISIBLE_FRACTION:.0%} should be): points and poses belong to different reconstructions."
+        )
+    return f"The model keeps no observations to check the cameras by; {fraction:.0%} of its points are in view."
+
+
+def _in_view(camera: Camera, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+    pixels, depth = camera.project(points)
+    inside = (pixels >= 0) & (pixels <= pixels.new_tensor(camera.size))
+    return inside.all(dim=1) & (depth > 0)
+
+
+def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
+    missing = sorted({image.name for image in model.images} - {image.name for image in present})
+    return [f"Skipped {len(missing)} images whose photos are missing: {named(missing)}."] if missing else []
+
+
+def _provenance(model: Model, shots: Sequence[Shot], options: ColmapOptions) -> dict[str, Any]:
+    bent = any(shot.remap is not None for shot in shots)
+    return provenance(
+        options,
+        len(shots),
+        image_folder=Path(options.images).name,
+        camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
+        undistortion=METHOD if bent else None,
+    )

@@ -1,0 +1,289 @@
+"""COLMAP models as plain data: finding, checking and reading `cameras`, `images`, `points3D` (spec 2.1).
+
+pycolmap reads every layout (binary and text, 3.x and 4.x with rigs and frames) but does not notice where a binary
+file ends: what lies past the end comes out as noise. The files are therefore walked record by record beforehand.
+"""
+
+import copy
+import logging
+import mmap
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.data.scene import PointCloud
+from gsx.core.errors import InputError
+from gsx.core.shapes import Bool, Float
+
+logger = logging.getLogger(__name__)
+
+REQUIRED = ("cameras", "images", "points3D")
+OBSERVATIONS_PER_IMAGE = 1000  # read of each image: the reprojection check is a median over all images
+
+U64, ID_MODEL_SIZE = struct.Struct("<Q"), struct.Struct("<iiQQ")
+RIG, SENSOR, FRAME = struct.Struct("<II"), struct.Struct("<iI?"), struct.Struct("<II7dI")
+RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and translation; (type, id, data id)
+IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
+POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelImage:
+    """A registered image and what it observed."""
+
+    name: str
+    """Path relative to the image folder, with `/`."""
+    camera_id: int
+    rotation: Float[Tensor, "3 3"]
+    """camera_from_world, float64."""
+    translation: Float[Tensor, "3"]
+    """camera_from_world, float64."""
+    keypoints: Float[Tensor, "K 2"]
+    """Observed positions in pixels of the model's camera, pixel centres at +0.5, float64; evenly drawn from all."""
+    observed: Float[Tensor, "K 3"]
+    """The world points seen there, float64."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """A COLMAP model; `cameras` are pycolmap cameras by id, `images` are sorted by name."""
+
+    folder: Path
+    cameras: dict[int, Any]
+    images: list[ModelImage]
+    points: PointCloud
+    mean_error: float
+    """Mean reprojection error that COLMAP states, in pixels."""
+    notes: list[str]
+
+
+def find_model(path: Path) -> tuple[Path, list[str]]:
+    """The model folder below `path` with the most images, and a note where there was a choice.
+
+    Raises:
+        InputError: no model in `path`/sparse/*, `path`/sparse or `path`, or a file of it is missing.
+    """
+    folders = model_folders(path)
+    if not folders:
+        raise InputError(
+            f"No COLMAP model (cameras.bin or cameras.txt) in {path / 'sparse' / '0'}, {path / 'sparse'} or {path}: "
+            "scene.path must be the folder that holds sparse/ and images/ (photos only: use scene=photos)."
+        )
+    counts = {folder: count_images(folder) for folder in folders}
+    best = max(folders, key=lambda folder: counts[folder])  # max keeps the first of equals
+    if len(folders) == 1:
+        return best, []
+    others = ", ".join(f"{folder.name} ({counts[folder]})" for folder in folders if folder != best)
+    return best, [f"Took sub-model {best.name} with {counts[best]} images; not used, with images: {others}."]
+
+
+def model_folders(path: Path) -> list[Path]:
+    """Folders that hold a model: `sparse/*` in order of name, `sparse`, `path` itself."""
+    sparse = path / "sparse"
+    inner = sorted(folder for folder in sparse.iterdir() if folder.is_dir()) if sparse.is_dir() else []
+    return [folder for folder in (*inner, sparse, path) if _suffix(folder)]
+
+
+def count_images(folder: Path) -> int:
+    """The number of images of a model, from the head of images.bin or the lines of images.txt."""
+    file = _files(folder)["images"]
+    if file.suffix == ".txt":
+        return _count_text(file)
+    with file.open("rb") as stream:
+        head = stream.read(U64.size)
+    return int(U64.unpack(head)[0]) if len(head) == U64.size else 0
+
+
+def _count_text(file: Path) -> int:
+    count = 0
+    with file.open() as lines:
+        for line in lines:
+            if line.strip() and not line.startswith("#"):
+                count += 1
+                next(lines, None)  # the line of keypoints, which may be empty
+    return count
+
+
+def read_model(folder: Path) -> Model:
+    """Read a model.
+
+    Raises:
+        InputError: a file is missing, truncated or corrupt, a camera model is unknown, or there are no points.
+    """
+    files = _files(folder)
+    if _suffix(folder) == ".bin":
+        check_binary(folder)
+    reconstruction = _reconstruction(folder)
+    numbers = sorted(reconstruction.points3D)
+    points = [reconstruction.point3D(number) for number in numbers]
+    positions = _stack([point.xyz for point in points], 3)
+    usable = _usable(positions)
+    if not usable.any():
+        raise InputError(
+            f"{files['points3D']} holds no points with finite coordinates, but training starts from points: "
+            "triangulate the model (colmap point_triangulator) or reconstruct the photos with scene=photos."
+        )
+    colours = torch.from_numpy(np.array([point.color for point in points]))
+    return Model(
+        folder=folder,
+        cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
+        images=_images(reconstruction, dict(zip(numbers, positions, strict=True)), files["points3D"]),
+        points=PointCloud(positions[usable].float(), colours[usable]),
+        mean_error=reconstruction.compute_mean_reprojection_error(),
+        notes=_dropped_note(int((~usable).sum())),
+    )
+
+
+def check_binary(folder: Path) -> None:
+    """Walk every binary file of a model to its end.
+
+    Raises:
+        InputError: a file ends within a record, or names a camera model that pycolmap does not know.
+    """
+    walks = {
+        "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig,
+        "frames": _skip_frame,
+    }  # fmt: skip
+    for name, skip in walks.items():
+        file = folder / f"{name}.bin"
+        if file.exists():
+            _walk(file, skip)
+
+
+def _suffix(folder: Path) -> str:
+    """`.bin` or `.txt` for a model folder (binary first, as 3D-GS), else an empty string."""
+    return next((suffix for suffix in (".bin", ".txt") if (folder / f"cameras{suffix}").is_file()), "")
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    files = {name: folder / f"{name}{_suffix(folder)}" for name in REQUIRED}
+    for file in files.values():
+        if not file.is_file():
+            raise InputError(f"The COLMAP model {folder} lacks {file.name}: copy the whole model folder again.")
+    return files
+
+
+def _walk(file: Path, skip: Callable[[mmap.mmap, int], int]) -> None:
+    size = file.stat().st_size
+    if size < U64.size:
+        raise _truncated(file, 0, 0)
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,) = U64.unpack_from(data, 0)
+        at = U64.size
+        for index in range(count):
+            try:
+                at = skip(data, at)
+            except struct.error:
+                raise _truncated(file, index, count) from None
+            except ValueError as problem:
+                raise InputError(f"{file} is corrupt at record {index}: {problem}; make the model again.") from None
+            if at > size:
+                raise _truncated(file, index, count)
+
+
+def _truncated(file: Path, index: int, count: int) -> InputError:
+    size = file.stat().st_size
+    return InputError(
+        f"{file} is truncated: its {size} bytes end within record {index} of {count}; copy or make the model again."
+    )
+
+
+def _skip_camera(data: mmap.mmap, at: int) -> int:
+    import pycolmap
+
+    _, model, width, height = ID_MODEL_SIZE.unpack_from(data, at)
+    known = {int(member): name for name, member in pycolmap.CameraModelId.__members__.items() if int(member) >= 0}
+    if model not in known:
+        raise ValueError(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
+    if not (0 < width < 2**31 and 0 < height < 2**31):
+        raise ValueError(f"a camera of {width}x{height} pixels")
+    parameters = pycolmap.Camera.create_from_model_name(1, known[model], 1.0, 1, 1).params
+    return at + ID_MODEL_SIZE.size + 8 * len(parameters)
+
+
+def _skip_image(data: mmap.mmap, at: int) -> int:
+    end = data.find(b"\0", at + IMAGE_HEAD)
+    if end < 0:
+        raise struct.error
+    (keypoints,) = U64.unpack_from(data, end + 1)
+    return int(end + 1 + U64.size + KEYPOINT * keypoints)
+
+
+def _skip_point(data: mmap.mmap, at: int) -> int:
+    (track,) = U64.unpack_from(data, at + POINT_HEAD)
+    return int(at + POINT_HEAD + U64.size + TRACK_ELEMENT * track)
+
+
+def _skip_rig(data: mmap.mmap, at: int) -> int:
+    _, sensors = RIG.unpack_from(data, at)
+    at += RIG.size + (RIG_REFERENCE if sensors else 0)
+    for _ in range(sensors - 1):
+        *_, posed = SENSOR.unpack_from(data, at)
+        at += SENSOR.size + (POSE if posed else 0)
+    return at
+
+
+def _skip_frame(data: mmap.mmap, at: int) -> int:
+    return int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1])
+
+
+def _reconstruction(folder: Path) -> Any:
+    import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
+        raise InputError(
+            f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in _present(folder))}): "
+            f"{str(problem).strip()}; copy or make the model again."
+        ) from None
+
+
+def _present(folder: Path) -> Iterator[Path]:
+    names = (*REQUIRED, "rigs", "frames")
+    return (file for name in names if (file := folder / f"{name}{_suffix(folder)}").is_file())
+
+
+def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+    """Which points are finite in float32; false for NaN as well."""
+    return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
+
+
+def _dropped_note(dropped: int) -> list[str]:
+    return [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
+
+
+def _images(reconstruction: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> list[ModelImage]:
+    images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
+    return [_image(image, positions, file) for image in sorted(images, key=lambda image: image.name)]
+
+
+def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> ModelImage:
+    """An image with its observations; `file` is named if it lacks one of the points in `positions`."""
+    indices = image.get_observation_point2D_idxs()
+    step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
+    seen = [image.point2D(index) for index in indices[::step]]
+    lost = next((point.point3D_id for point in seen if point.point3D_id not in positions), None)
+    if lost is not None:
+        raise InputError(f"{file} is truncated: {image.name} observes its point {lost}; copy or make the model again.")
+    observed = _stack([positions[point.point3D_id] for point in seen], 3)
+    usable, pose = _usable(observed), image.cam_from_world()
+    return ModelImage(
+        name=image.name,
+        camera_id=image.camera_id,
+        rotation=torch.from_numpy(pose.rotation.matrix().copy()),
+        translation=torch.from_numpy(pose.translation.copy()),
+        keypoints=_stack([point.xy for point in seen], 2)[usable],
+        observed=observed[usable],
+    )
+
+
+def _stack(rows: Sequence[Any], width: int) -> Float[Tensor, "K W"]:
+    """Rows of numbers as a float64 matrix, also when there are none."""
+    return torch.from_numpy(np.array(rows, dtype=np.float64).reshape(-1, width))

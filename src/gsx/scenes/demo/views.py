@@ -1,0 +1,226 @@
+"""The built-in scene as data: cameras on a spiral, pictures rendered when asked for, points on what they see."""
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.cache import cache_folder, content_key
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.images import ImageCache, read_image, training_size, write_image
+from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.shapes import Float, UInt8
+from gsx.scenes.demo.still_life import StillLife, make_still_life
+from gsx.scenes.demo.tracing import rays_through, render, shade, trace
+from gsx.scenes.options import SceneOptions
+
+logger = logging.getLogger(__name__)
+
+TARGET = (0.0, 0.05, 0.50)  # every camera looks here
+FIELD_OF_VIEW = math.radians(50.0)  # horizontal
+TURNS = 3.0  # of the spiral
+ELEVATION = (math.radians(8.0), math.radians(46.0))  # at its beginning and its end
+DISTANCE, SWAY, SWAYS = 3.3, 0.65, 5.0  # mean distance from the target, its variation, and how often it varies
+SAME = 1e-6  # intrinsics that agree to this many pixels are the same
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(SceneOptions):
+    """The built-in scene; `path`, `split` and what concerns photographs do not apply to it."""
+
+    width: int
+    """Width of the pictures before `downscale`, pixels."""
+    height: int
+    train_views: int
+    test_views: int
+    points: int
+    """Number of initial points."""
+    samples: int
+    """Rays per pixel, averaged in display light."""
+    seed: int
+    """Of the initial points."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DemoSource:
+    """Exact truth of one view at any resolution; whole views are kept on disk, everything in memory."""
+
+    life: StillLife
+    own: Camera
+    samples: int
+    cache: ImageCache
+    folder: Path
+
+    def max_zoom(self, camera: Camera) -> float:
+        """There is no end to the detail."""
+        return math.inf
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """What `camera` sees; a crop gives the very bytes of the picture it is cut from."""
+        key = camera_key(camera)
+        return self.cache.get((key, self.samples), lambda: self.picture(camera, self.folder / f"{key}.png"))
+
+    def picture(self, camera: Camera, path: Path) -> UInt8[Tensor, "3 H W"]:
+        """Rendered, or read where an earlier run has rendered it."""
+        if not same_view(camera, self.own):
+            return render(self.life, camera, self.samples)
+        kept = kept_picture(path, camera)
+        return keep_picture(path, render(self.life, camera, self.samples)) if kept is None else kept
+
+
+def same_view(camera: Camera, own: Camera) -> bool:
+    """Whether `camera` is `own` at some resolution, and no crop of it."""
+    pose = torch.equal(camera.rotation, own.rotation) and torch.equal(camera.translation, own.translation)
+    back = camera.resize(*own.size)
+    intrinsics = ((back.fx, own.fx), (back.fy, own.fy), (back.cx, own.cx), (back.cy, own.cy))
+    return pose and all(abs(a - b) < SAME for a, b in intrinsics)
+
+
+def kept_picture(path: Path, camera: Camera) -> UInt8[Tensor, "3 H W"] | None:
+    """The picture on disk, unless there is none or it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        picture = read_image(path)
+    except InputError as error:
+        logger.warning("the kept picture is rendered again: %s", error)
+        return None
+    return picture if picture.shape == (3, camera.height, camera.width) else None
+
+
+def keep_picture(path: Path, picture: UInt8[Tensor, "3 H W"]) -> UInt8[Tensor, "3 H W"]:
+    """The same picture, also on disk where that can be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, picture)
+    except (OSError, InputError) as error:
+        logger.warning("rendered pictures are not kept for the next run: %s", error)
+    return picture
+
+
+def camera_key(camera: Camera) -> str:
+    """A digest of everything that a picture depends on."""
+    pose = camera.rotation.tolist(), camera.translation.tolist()
+    return content_key(*pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+
+
+@lru_cache
+def scene_version() -> str:
+    """A digest of the code that makes the pictures."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return content_key(*[(source.name, source.read_text(encoding="utf-8")) for source in sources])
+
+
+def spiral_camera(place: float, width: int, height: int) -> Camera:
+    """The camera at `place` in [0, 1) of a rising spiral around the scene that sways nearer and farther."""
+    azimuth = 2 * math.pi * TURNS * place - math.pi / 2
+    elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * place
+    distance = DISTANCE - SWAY * math.cos(2 * math.pi * SWAYS * place)
+    flat = distance * math.cos(elevation)
+    eye = (flat * math.cos(azimuth), flat * math.sin(azimuth), distance * math.sin(elevation))
+    eye = (TARGET[0] + eye[0], TARGET[1] + eye[1], TARGET[2] + eye[2])
+    return look_at(eye, TARGET, fov_x=FIELD_OF_VIEW, width=width, height=height)
+
+
+def training_places(train: int) -> list[float]:
+    """Evenly along the spiral."""
+    return [index / train for index in range(train)]
+
+
+def test_places(train: int, test: int) -> list[float]:
+    """Half-way between neighbouring training cameras, spread over the spiral."""
+    return [(index * train // test + 0.5) / train for index in range(test)]
+
+
+def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
+    """Surface and sky points with their colours: what random rays of the cameras meet, equally many from each."""
+    shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
+    found = [view_points(life, camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
+    positions, colours = (torch.cat(parts, dim=1).T.contiguous() for parts in zip(*found, strict=True))
+    return PointCloud(positions, (colours * 255.0 + 0.5).to(torch.uint8))
+
+
+def view_points(
+    life: StillLife, camera: Camera, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"]]:
+    """What random rays of one camera meet: positions and colours."""
+    u, v = torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
+    rays = rays_through(camera, u, v)
+    hits = trace(life, rays)
+    return rays.origin.float()[:, None] + rays.directions * hits.depth, shade(life, rays, hits)
+
+
+def check(options: DemoOptions) -> None:
+    """Refuse options that make no scene.
+
+    Raises:
+        ConfigError: a count is too small, there are more test than training views, or the background is no colour.
+    """
+    if options.path:
+        raise ConfigError(
+            f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "
+            f"scene=colmap, photos, blender, transforms or bungee (gsx scenes {options.path} tells)."
+        )
+    if options.unit != 1:
+        raise ConfigError(f"scene=demo knows its truth in its own units only, but scene.unit is {options.unit}.")
+    least = {
+        "width": 1, "height": 1, "train_views": 2, "test_views": 1, "points": 1, "samples": 1, "downscale": 1
+    }  # fmt: skip
+    for name, bound in least.items():
+        if getattr(options, name) < bound:
+            raise ConfigError(f"scene.{name}={getattr(options, name)} is too small: use {bound} or more.")
+    if options.test_views > options.train_views:
+        raise ConfigError(
+            f"scene.test_views={options.test_views} exceeds scene.train_views={options.train_views}: test cameras "
+            "stand between training cameras, so use as many at most."
+        )
+    if len(options.background) != 3 or not all(0 <= value <= 1 for value in options.background):
+        raise ConfigError(f"scene.background is {list(options.background)}, give red, green and blue in [0, 1].")
+
+
+def make_views(group: str, cameras: Sequence[Camera], source: Callable[..., DemoSource]) -> list[View]:
+    """Numbered views, each with its own source."""
+    return [View(f"{group}_{index:03d}", camera, source(own=camera)) for index, camera in enumerate(cameras)]
+
+
+def load(options: DemoOptions) -> Scene:
+    """The built-in scene; its pictures are rendered when first asked for.
+
+    Raises:
+        ConfigError: see `check`.
+    """
+    check(options)
+    life, size = make_still_life(), training_size(options.width, options.height, options.downscale, options.max_width)
+    train = [spiral_camera(place, *size) for place in training_places(options.train_views)]
+    test = [spiral_camera(place, *size) for place in test_places(options.train_views, options.test_views)]
+    folder = cache_folder("demo", content_key(scene_version(), options.samples))
+    cache = ImageCache(int(options.cache_gb * 1e9))
+    source = partial(DemoSource, life=life, samples=options.samples, cache=cache, folder=folder)
+    return Scene(
+        name=options.name,
+        train=make_views("train", train, source),
+        test=make_views("test", test, source),
+        points=sample_points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
+        background=torch.tensor(options.background),
+        extent=extent_of(train),
+        provenance=provenance(options, size),
+    )
+
+
+def provenance(options: DemoOptions, size: tuple[int, int]) -> dict[str, Any]:
+    """What decides how the pictures look, for the evaluation protocol."""
+    return {
+        "format": "demo",
+        "version": scene_version(),
+        "size": list(size),
+        "samples": options.samples,
+        "light": "display",
+        "split": f"{options.train_views} on a spiral, {options.test_views} between them",
+    }

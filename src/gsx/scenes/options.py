@@ -1,0 +1,35 @@
+"""What every loader of photographs can be told; the values and their sources are in conf/scene/*.yaml."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Fields common to all loaders; each format adds its own."""
+
+    name: str
+    """Name of the format, which is also the name of its file in conf/scene."""
+    background: list[float]
+    """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (spec 2.2)."""
+    iterations: int = 0
+    """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
+    published one."""
+    path: str = ""
+    """Folder of the scene."""
+    downscale: int = 1
+    """Train on images reduced by this factor; the originals stay the truth of zoomed-in views (spec 8.1)."""
+    max_width: int = 1600
+    """With downscale=1, wider images are reduced to this many pixels; 0: no limit (spec 8.1)."""
+    resize_filter: str = "bicubic"
+    """bicubic (as published) | area | lanczos; all of them prefilter."""
+    resize_light: str = "display"
+    """display (as published): filter the stored values; linear: filter light, after undoing the sRGB curve."""
+    principal_point: str = "exact"
+    """exact | centred; centred ignores the measured principal point, as 3D-GS does (spec 2.1)."""
+    unit: float = 1.0
+    """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
+    0.2, least distances, limits of scales) expect scenes of a few units."""
+    cache_gb: float = 2.0
+    """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
+    split: str = "every:8"
+    """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""

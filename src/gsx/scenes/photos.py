@@ -1,0 +1,174 @@
+"""Scenes from a folder with nothing but photos: reconstructed once, kept in the cache, then a COLMAP scene."""
+
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.core.data.images import image_size
+from gsx.core.data.scene import Scene
+from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.scenes import colmap, sfm
+from gsx.scenes.colmap_model import Model, read_model
+from gsx.scenes.options import SceneOptions
+from gsx.scenes.posed import named
+
+logger = logging.getLogger(__name__)
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")  # what both pycolmap and gsx read
+MATCHERS = ("auto", "exhaustive", "sequential")
+CAMERA_MODES = ("auto", "single", "per_image")
+MIN_PHOTOS = 2
+METHOD = "sfm/1"  # part of the cache key: raise the number when the reconstruction changes
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotosOptions(SceneOptions, sfm.SfmOptions):
+    """What `conf/scene/photos.yaml` sets."""
+
+    max_reprojection_px: float
+    """As for scene=colmap."""
+
+
+def load(options: PhotosOptions) -> Scene:
+    """Reconstruct a folder of photos, or take the reconstruction from the cache, and load it.
+
+    Raises:
+        ConfigError: an option has no such value.
+        InputError: there are fewer than two photos, or they cannot be reconstructed.
+    """
+    refuse_unknown(options)
+    folder, photos = find_photos(Path(options.path).expanduser())
+    sizes, notes = readable_sizes(folder, photos)
+    model = read_model(reconstruct(folder, sizes, options))
+    notes += report(model, list(sizes))
+    scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
+    name = folder.resolve().parent.name if folder.name == "images" else folder.resolve().name
+    return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
+
+
+def refuse_unknown(options: sfm.SfmOptions) -> None:
+    """Raise ConfigError for a word that is none of its option's values."""
+    import pycolmap
+
+    models = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
+    choices = {"matcher": MATCHERS, "camera_mode": CAMERA_MODES, "camera_model": models}
+    for key, known in choices.items():
+        word = getattr(options, key)
+        if word not in known:
+            raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(known)}.{nearest(word, known)}")
+
+
+def find_photos(path: Path) -> tuple[Path, list[str]]:
+    """The folder with the photos (`path`, else `path`/images) and their names relative to it, sorted.
+
+    Raises:
+        InputError: there is no such folder, or it has fewer than two photos.
+    """
+    if not path.is_dir():
+        raise InputError(f"scene.path '{path}' is no folder: name the folder that holds the photos.")
+    folder = path / "images" if not photos_in(path, "*") and (path / "images").is_dir() else path
+    names = photos_in(folder, "*") or photos_in(folder, "**/*")
+    if len(names) < MIN_PHOTOS:
+        found = ", ".join(sorted({file.suffix for file in folder.rglob("*") if file.is_file()})) or "nothing"
+        raise InputError(
+            f"{folder} holds {len(names)} photos ({', '.join(PHOTO_SUFFIXES)}; found: {found}), but reconstruction "
+            f"needs at least {MIN_PHOTOS}: name another folder or convert the photos to JPEG."
+        )
+    return folder, names
+
+
+def photos_in(folder: Path, pattern: str) -> list[str]:
+    """Sorted names of photos below `folder` that match `pattern`; hidden files do not count."""
+    files = (file for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
+    return sorted(file.relative_to(folder).as_posix() for file in files if not file.name.startswith("."))
+
+
+def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
+    """Sizes of the photos by name, without those that cannot be read, and a note on the latter.
+
+    Raises:
+        InputError: fewer than two photos can be read.
+    """
+    sizes = {}
+    for name in photos:
+        with suppress(InputError):
+            sizes[name] = image_size(folder / name)
+    broken = [name for name in photos if name not in sizes]
+    if len(sizes) < MIN_PHOTOS:
+        raise InputError(f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: export them again.")
+    return sizes, [f"Skipped {len(broken)} photos that cannot be read: {named(broken)}."] if broken else []
+
+
+def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path:
+    """The folder with the model of these photos: computed once, then found in the cache.
+
+    Raises:
+        InputError: no two photos can be placed.
+    """
+    final = cache_folder("sfm", _key(folder, sizes, options))
+    if final.is_dir():
+        logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
+        return final
+    make_folder(final.parent)
+    with tempfile.TemporaryDirectory(prefix=f"{final.name}.partial-", dir=final.parent) as work:
+        best = sfm.reconstruct(folder, sizes, options, Path(work))
+        _refuse_nothing(best, folder, sizes)
+        model = make_folder(Path(work) / "model")
+        best.write_binary(model)
+        _publish(model, final)
+    return final
+
+
+def _publish(model: Path, final: Path) -> None:
+    """Move the finished model to its place, unless another process has finished the same in the meantime."""
+    try:
+        os.rename(model, final)
+    except OSError:
+        if not final.is_dir():
+            raise
+
+
+def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> str:
+    import pycolmap
+
+    stamps = [(name, *file_stamp(folder / name)) for name in sizes]
+    return content_key(METHOD, pycolmap.__version__, stamps, settings(options))
+
+
+def settings(options: sfm.SfmOptions) -> dict[str, Any]:
+    """The options that the reconstruction depends on."""
+    deciding = {field.name for field in fields(sfm.SfmOptions)} - {"num_threads"}
+    return {key: value for key, value in asdict(options).items() if key in deciding}
+
+
+def report(model: Model, photos: Sequence[str]) -> list[str]:
+    """What became of the photos, in sentences."""
+    lost = sorted(set(photos) - {image.name for image in model.images})
+    placed = (
+        f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, mean reprojection "
+        f"error {model.mean_error:.2f} px."
+    )
+    return (
+        [placed, f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."]
+        if lost
+        else [placed]
+    )
+
+
+def _refuse_nothing(best: Any, folder: Path, sizes: sfm.Sizes) -> None:
+    if best is None or best.num_reg_images() < MIN_PHOTOS:
+        raise InputError(
+            f"None of the {len(sizes)} photos in {folder} could be placed: they need texture, 60 to 80 % overlap and a "
+            "camera that moves between shots; try scene.matcher=exhaustive or a larger scene.max_feature_size."
+        )
+
+
+def _colmap_options(options: PhotosOptions, folder: Path) -> colmap.ColmapOptions:
+    common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
+    return colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)

@@ -1,0 +1,55 @@
+"""Initial points of scenes that no reconstruction comes with: from a PLY file, or random (spec 1.5)."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.data.scene import PointCloud
+from gsx.core.errors import InputError
+from gsx.core.gaussians.ply import read_ply
+from gsx.core.shapes import Float
+
+GREY = 127  # colour of points without one: the published random clouds store this byte
+
+
+def random_points(
+    count: int, low: Float[Tensor, "3"], high: Float[Tensor, "3"], generator: torch.Generator
+) -> PointCloud:
+    """`count` grey points, uniform in the box from `low` to `high`.
+
+    Raises:
+        InputError: `count` is below 1 or the box has no volume.
+    """
+    if count < 1 or not bool((low < high).all()):
+        raise InputError(
+            f"{count} random points in the box {low.tolist()} to {high.tolist()} cannot start a scene: set"
+            " scene.random_points to at least 1, or scene.points to a PLY file."
+        )
+    return grey_points(low + (high - low) * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+
+
+def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
+    """Points without a colour of their own."""
+    return PointCloud(positions.float(), torch.full((len(positions), 3), GREY, dtype=torch.uint8))
+
+
+def read_points(path: Path) -> PointCloud:
+    """Points of a PLY file: x, y, z and, where present, 8-bit red, green, blue; those not finite are left out.
+
+    Raises:
+        InputError: the file cannot be read, has no coordinates, or holds no finite point.
+    """
+    columns = read_ply(path)
+    if not {"x", "y", "z"} <= set(columns):
+        raise InputError(f"'{path}' has no x, y, z but {', '.join(columns)}, give a point cloud.")
+    positions = torch.from_numpy(np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1))
+    finite = positions.isfinite().all(dim=1)
+    if not finite.any():
+        raise InputError(f"'{path}' holds no point with finite coordinates, give another or scene.points=random.")
+    names = ("red", "green", "blue")
+    if any(name not in columns or columns[name].dtype != np.uint8 for name in names):
+        return grey_points(positions[finite])
+    colours = torch.from_numpy(np.stack([columns[name] for name in names], axis=1))
+    return PointCloud(positions[finite], colours[finite])

@@ -1,0 +1,228 @@
+"""What the loaders of photographs with poses share: reading, axes, lenses, views, provenance."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, centred
+from gsx.core.data.images import ImageCache, PhotoSource, ResizeRule, Size, checked_size, training_size
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import View
+from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.shapes import Float
+from gsx.scenes.options import SceneOptions
+from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
+
+MIN_IMAGES = 2  # one photo leaves depth undetermined
+NAMED_AT_MOST = 5  # file names spelt out in a note
+ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
+PRINCIPAL_POINTS = ("exact", "centred")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot:
+    """A photo on disk and the camera that took it."""
+
+    name: str
+    photo: Path
+    whole: Camera
+    """Camera of the whole photo, once undistorted, at the photo's own resolution."""
+    expected_size: Size
+    """(width, height) that the poses file states for the photo."""
+    remap: StoredUndistortion | None = None
+
+
+def shot_through(
+    lens: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+) -> Shot:
+    """A photo taken through `lens`, a pycolmap camera, as the pinhole photo that gsx uses.
+
+    Raises:
+        InputError: the photo's size is no uniform reduction of the lens's, or that has no pinhole equivalent.
+    """
+    pinhole, expected = pinhole_of(lens), (lens.width, lens.height)
+    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
+    return Shot(
+        name=name,
+        photo=photo,
+        whole=camera_of(pinhole, rotation, translation).resize(*size),
+        expected_size=expected,
+        remap=None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size),
+    )
+
+
+def lens_notes(shots: Sequence[Shot]) -> list[str]:
+    """One note for each kind of camera that is undistorted."""
+    kinds = {(shot.remap.lens.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
+    return [
+        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
+        for name, (width, height), (new_width, new_height) in sorted(kinds)
+    ]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Raises:
+        InputError: the file is missing or is no JSON object.
+    """
+    if not path.is_file():
+        raise InputError(f"'{path}' does not exist: scene.path must be the folder that holds it.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as problem:
+        raise InputError(f"'{path}' is no valid JSON ({problem}), copy or export it anew.") from None
+    if not isinstance(content, dict):
+        raise InputError(f"'{path}' holds no JSON object, copy or export it anew.")
+    return content
+
+
+def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The content of a transforms file and its frames, each with a file name.
+
+    Raises:
+        InputError: the file is missing or damaged, or lists no frames.
+    """
+    content = read_json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"'{path}' lists no frames, export it anew.")
+    if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
+        raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
+    return content, frames
+
+
+def plain_name(file_path: str) -> str:
+    """A file name of a poses file with forward slashes and without a leading `./`."""
+    return str(PurePosixPath(file_path.replace("\\", "/")))
+
+
+def find_photo(folder: Path, file_path: str) -> Path | None:
+    """The photo of a frame, whose name may lack `.png` (as in NeRF-synthetic); None if it is not there."""
+    photo = folder / plain_name(file_path)
+    candidates = (photo, photo.with_name(f"{photo.name}.png"))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def present_frames(
+    folder: Path, frames: list[dict[str, Any]], file: Path
+) -> tuple[list[tuple[dict[str, Any], Path]], list[str]]:
+    """The frames whose photo is on disk with its path, and a note that names the others.
+
+    Raises:
+        InputError: no photo is there.
+    """
+    photos = [find_photo(folder, frame["file_path"]) for frame in frames]
+    present = [(frame, photo) for frame, photo in zip(frames, photos, strict=True) if photo is not None]
+    missing = [plain_name(frame["file_path"]) for frame, photo in zip(frames, photos, strict=True) if photo is None]
+    if not present:
+        raise InputError(
+            f"None of the {len(frames)} images of '{file}' is in '{folder}' (looked for {named(missing)}): put them"
+            " there or correct the names in the file."
+        )
+    note = f"Skipped {len(missing)} of the {len(frames)} images of {file.name}, not on disk: {named(missing)}."
+    return present, [note] if missing else []
+
+
+def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """Rotation and translation camera_from_world, float64, of an OpenGL camera-to-world matrix (spec 2.2).
+
+    `matrix` holds 3 or 4 rows of 4 numbers; OpenGL cameras have x right, y up, z back. Rotations that text has
+    rounded are replaced by the nearest exact ones.
+
+    Raises:
+        InputError: it is no such matrix, not finite, or no rigid motion; `place` says where it stands.
+    """
+    try:
+        world_from_camera = torch.tensor(matrix, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{place} has a pose that is no matrix of numbers, export it anew.") from None
+    if world_from_camera.shape not in ((3, 4), (4, 4)) or not world_from_camera.isfinite().all():
+        raise InputError(f"{place} has a pose that is not 3 x 4 or 4 x 4 finite numbers, remove or repair it.")
+    u, stretch, vh = torch.linalg.svd(world_from_camera[:3, :3])
+    if (stretch - 1).abs().max() > ROTATION_TOLERANCE or torch.linalg.det(u @ vh) < 0:
+        raise InputError(f"{place} has a pose that scales or mirrors, export cameras without scale.")
+    rotation = (u @ vh @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))).T
+    return rotation, -rotation @ world_from_camera[:3, 3]
+
+
+def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
+    """Views at training size, in the order of `shots`, sharing one image cache.
+
+    Raises:
+        ConfigError: an option of the resize rule or the principal point is unknown.
+    """
+    if options.principal_point not in PRINCIPAL_POINTS:
+        hint = nearest(options.principal_point, PRINCIPAL_POINTS)
+        raise ConfigError(f"scene.principal_point is '{options.principal_point}', use exact or centred.{hint}")
+    red, green, blue = rgb(options.background)
+    rule = ResizeRule(filter=options.resize_filter, light=options.resize_light, background=(red, green, blue))
+    cache = ImageCache(int(options.cache_gb * 1e9))
+    return [_view(shot, options, rule, cache) for shot in shots]
+
+
+def reduction_of(options: SceneOptions) -> Reduction:
+    """How training pictures come from finer ones: by the resize rule."""
+    return Reduction(filter=options.resize_filter, light=options.resize_light)
+
+
+def rgb(background: Sequence[float]) -> tuple[float, float, float]:
+    """The background as a triple.
+
+    Raises:
+        ConfigError: it has not three values.
+    """
+    if len(background) != 3:
+        raise ConfigError(f"scene.background is {list(background)}, give red, green and blue in [0, 1].")
+    red, green, blue = background
+    return red, green, blue
+
+
+def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache) -> View:
+    whole = centred(shot.whole) if options.principal_point == "centred" else shot.whole
+    size = training_size(*whole.size, options.downscale, options.max_width)
+    source = PhotoSource(
+        path=shot.photo,
+        rule=rule,
+        cache=cache,
+        whole=whole,
+        expected_size=shot.expected_size,
+        remap=shot.remap,
+    )
+    return View(shot.name, whole.resize(*size), source)
+
+
+def refuse_too_few(train: Sequence[View], place: Path) -> None:
+    """Raises InputError unless there are images enough to train on."""
+    if len(train) < MIN_IMAGES:
+        raise InputError(
+            f"'{place}' leaves {len(train)} image to train on, but training needs at least {MIN_IMAGES} images: add"
+            " some, or hold out fewer with scene.split."
+        )
+
+
+def provenance(options: SceneOptions, images: int, **details: Any) -> dict[str, Any]:
+    """What an evaluation has to say about its images, for `Scene.provenance`."""
+    return {
+        "format": options.name,
+        "path": Path(options.path).expanduser().resolve().name,
+        "principal_point": options.principal_point,
+        "downscale": options.downscale,
+        "max_width": options.max_width,
+        "resize": {"filter": options.resize_filter, "light": options.resize_light},
+        "split": options.split,
+        "background": list(options.background),
+        "number_of_images": images,
+        **details,
+    }
+
+
+def named(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    more = len(names) - NAMED_AT_MOST
+    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,191 @@
+"""LPIPS with random weights in files shaped like torchvision's and the lpips package's, against plain convolutions."""
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d
+
+from gsx.core.errors import InputError
+from gsx.core.quality.lpips import Lpips, LpipsOptions, load_lpips
+
+# layers of torchvision's `features`: number, channels in and out, kernel; the head reads the last of each stage
+VGG = {
+    0: (3, 64, 3), 2: (64, 64, 3), 5: (64, 128, 3), 7: (128, 128, 3), 10: (128, 256, 3), 12: (256, 256, 3),
+    14: (256, 256, 3), 17: (256, 512, 3), 19: (512, 512, 3), 21: (512, 512, 3), 24: (512, 512, 3), 26: (512, 512, 3),
+    28: (512, 512, 3),
+}  # fmt: skip
+ALEX = {0: (3, 64, 11), 3: (64, 192, 5), 6: (192, 384, 3), 8: (384, 256, 3), 10: (256, 256, 3)}
+LAYERS = {"vgg": VGG, "alex": ALEX}
+READ_AFTER = {"vgg": (2, 7, 14, 21, 28), "alex": (0, 3, 6, 8, 10)}
+SIZE = 36
+
+
+def random_trunk(layers: dict[int, tuple[int, int, int]], generator: torch.Generator) -> dict[str, Tensor]:
+    trunk = OrderedDict()
+    for number, (entering, leaving, kernel) in layers.items():
+        spread = (2 / (entering * kernel**2)) ** 0.5
+        trunk[f"features.{number}.weight"] = spread * torch.randn(
+            leaving, entering, kernel, kernel, generator=generator
+        )
+        trunk[f"features.{number}.bias"] = 0.1 * torch.randn(leaving, generator=generator)
+    trunk["classifier.1.weight"] = torch.randn(4, 4, generator=generator)  # real files hold more than LPIPS uses
+    return trunk
+
+
+def random_head(net: str, generator: torch.Generator) -> dict[str, Tensor]:
+    widths = [LAYERS[net][number][1] for number in READ_AFTER[net]]
+    return {f"lin{i}.model.1.weight": torch.rand(1, width, 1, 1, generator=generator) for i, width in enumerate(widths)}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
+    folder, generator = tmp_path_factory.mktemp("lpips"), torch.Generator().manual_seed(1)
+    files = {net: (folder / f"{net}_trunk.pth", folder / f"{net}_head.pth") for net in LAYERS}
+    for net, (trunk, head) in files.items():
+        torch.save(random_trunk(LAYERS[net], generator), trunk)
+        torch.save(random_head(net, generator), head)
+    return files
+
+
+def options(trunk: Path | str, head: Path | str, net: str = "vgg", input_range: str = "unit") -> LpipsOptions:
+    return LpipsOptions(trunk=str(trunk), head=str(head), net=net, input_range=input_range)
+
+
+@pytest.fixture(scope="module")
+def network(weights: dict[str, tuple[Path, Path]]) -> Callable[[str, str], Lpips]:
+    loaded = {net: load_lpips(options(*weights[net], net)) for net in LAYERS}
+    assert None not in loaded.values()
+    return loaded.__getitem__
+
+
+def pictures(seed: int = 0) -> tuple[Tensor, Tensor]:
+    return tuple(torch.rand(2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(seed)))
+
+
+def vgg_features(picture: Tensor, trunk: dict[str, Tensor]) -> list[Tensor]:
+    outputs, x = [], picture[None]
+    for number in VGG:
+        if number in (5, 10, 17, 24):
+            x = max_pool2d(x, 2, 2)
+        x = conv2d(x, trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"], padding=1).clamp_min(0)
+        outputs += [x[0]] if number in READ_AFTER["vgg"] else []
+    return outputs
+
+
+def alex_features(picture: Tensor, trunk: dict[str, Tensor]) -> list[Tensor]:
+    def layer(x: Tensor, number: int, stride: int, padding: int) -> Tensor:
+        weight, bias = trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"]
+        return conv2d(x, weight, bias, stride, padding).clamp_min(0)
+
+    first = layer(picture[None], 0, 4, 2)
+    second = layer(max_pool2d(first, 3, 2), 3, 1, 2)
+    third = layer(max_pool2d(second, 3, 2), 6, 1, 1)
+    fourth = layer(third, 8, 1, 1)
+    return [x[0] for x in (first, second, third, fourth, layer(fourth, 10, 1, 1))]
+
+
+def distance_by_hand(
+    image: Tensor, target: Tensor, trunk: dict[str, Tensor], head: dict[str, Tensor], net: str
+) -> float:
+    """Zhang et al. 2018, equation 1, in float64; pictures as they enter the normalisation."""
+    shift = torch.tensor([-0.030, -0.088, -0.188], dtype=torch.float64).view(3, 1, 1)
+    scale = torch.tensor([0.458, 0.448, 0.450], dtype=torch.float64).view(3, 1, 1)
+    trunk = {name: value.double() for name, value in trunk.items()}
+    features = vgg_features if net == "vgg" else alex_features
+    first, second = (features((picture.double() - shift) / scale, trunk) for picture in (image, target))
+    total = 0.0
+    for stage, (a, b) in enumerate(zip(first, second, strict=True)):
+        weight = head[f"lin{stage}.model.1.weight"].double().view(-1)
+        _, height, width = a.shape
+        difference = a / a.square().sum(0).sqrt() - b / b.square().sum(0).sqrt()
+        total += float(torch.einsum("c,chw->", weight, difference.square())) / (height * width)
+    return total
+
+
+@pytest.mark.parametrize("net", ["vgg", "alex"])
+def test_distance_equals_plain_convolutions(net: str, network: Callable, weights: dict) -> None:
+    image, target = pictures()
+    trunk, head = (torch.load(path, weights_only=True) for path in weights[net])
+    assert network(net).distance(image, target) == pytest.approx(
+        distance_by_hand(image, target, trunk, head, net), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("net", ["vgg", "alex"])
+def test_distance_is_zero_at_identity_symmetric_and_grows(net: str, network: Callable) -> None:
+    image, target = pictures()
+    assert network(net).distance(image, image) == 0
+    there, back = network(net).distance(image, target), network(net).distance(target, image)
+    assert there == pytest.approx(back, rel=1e-5)
+    little = network(net).distance(image, image + 0.1 * (target - image))
+    assert 0 < little < there
+
+
+def test_input_range_is_named_and_changes_what_enters(network: Callable, weights: dict) -> None:
+    image, target = pictures()
+    signed = load_lpips(options(*weights["alex"], "alex", "signed"))
+    half = signed.distance((image + 1) / 2, (target + 1) / 2)
+    assert half == pytest.approx(network("alex").distance(image, target), rel=1e-5)
+    assert "lpips_alex, input in [-1,1], trunk " in signed.name
+    assert "lpips_alex, input in [0,1], trunk " in network("alex").name
+
+
+def test_name_tells_weights_apart(weights: dict, tmp_path: Path) -> None:
+    torch.save(random_head("alex", torch.Generator().manual_seed(9)), tmp_path / "other.pth")
+    one = load_lpips(options(*weights["alex"], "alex")).name
+    other = load_lpips(options(weights["alex"][0], tmp_path / "other.pth", "alex")).name
+    assert one.split(", head")[0] == other.split(", head")[0]
+    assert one != other
+
+
+def test_without_weights_there_is_no_figure(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "gsx.core.quality.lpips"):
+        assert load_lpips(options("", "")) is None
+    assert "n/a" in caplog.text
+    assert "metrics.lpips.trunk" in caplog.text
+
+
+@pytest.mark.parametrize(("trunk", "head", "missing"), [("trunk.pth", "", "head"), ("", "head.pth", "trunk")])
+def test_one_file_without_the_other_is_refused(trunk: str, head: str, missing: str) -> None:
+    with pytest.raises(InputError, match=rf"metrics\.lpips\.{missing} is missing"):
+        load_lpips(options(trunk, head))
+
+
+def test_missing_file_is_named_with_its_option(weights: dict, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"metrics\.lpips\.trunk=.*absent\.pth"):
+        load_lpips(options(tmp_path / "absent.pth", weights["alex"][1], "alex"))
+    with pytest.raises(InputError, match=r"metrics\.lpips\.head=.*absent\.pth"):
+        load_lpips(options(weights["alex"][0], tmp_path / "absent.pth", "alex"))
+
+
+@pytest.mark.parametrize("content", [[torch.zeros(3)], torch.zeros(3), {"weight": torch.zeros(3)}, Path("a")])
+def test_file_without_the_state_dict_is_refused(content: object, weights: dict, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "wrong.pth")
+    for trunk, head in [(tmp_path / "wrong.pth", weights["alex"][1]), (weights["alex"][0], tmp_path / "wrong.pth")]:
+        with pytest.raises(InputError, match=r"metrics\.lpips"):
+            load_lpips(options(trunk, head, "alex"))
+
+
+def test_text_file_is_refused(weights: dict, tmp_path: Path) -> None:
+    (tmp_path / "page.pth").write_text("<html>not found</html>")
+    with pytest.raises(InputError, match=r"page\.pth cannot be read as weights"):
+        load_lpips(options(tmp_path / "page.pth", weights["alex"][1], "alex"))
+
+
+def test_files_of_another_network_are_refused(weights: dict) -> None:
+    for trunk, head in [(weights["alex"][0], weights["vgg"][1]), (weights["vgg"][0], weights["alex"][1])]:
+        for net in LAYERS:
+            with pytest.raises(InputError, match=f"do not fit net '{net}'"):
+                load_lpips(options(trunk, head, net))
+
+
+def test_unknown_net_or_range_is_refused(weights: dict) -> None:
+    with pytest.raises(InputError, match="net 'squeeze'"):
+        load_lpips(options(*weights["alex"], "squeeze"))
+    with pytest.raises(InputError, match="input_range 'bytes'"):
+        load_lpips(options(*weights["alex"], "alex", "bytes"))

@@ -1,0 +1,162 @@
+"""Models of half of the training views each: what they are shown, what they show; the run goes on untouched."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import published_options, small_scene, spread
+from tiny import tiny_run
+from torch import Tensor
+
+from gsx.backbones.gs3d import GS3D
+from gsx.cli import plugins
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import Scene
+from gsx.core.errors import InputError
+from gsx.core.plugins import load_plugins
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.halves import held_out_renders
+from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.trainer import take_step
+from gsx.experiments.runs.session import execute, open_run
+
+TRAINING = TrainingOptions(
+    ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=9, checkpoints_kept=1, test_points=0
+)
+
+
+class Told:
+    """A photograph of one grey that tells when it is looked at."""
+
+    def __init__(self, number: int, seen: list[int]) -> None:
+        self.number, self.seen = number, seen
+
+    def image(self, camera: Camera) -> Tensor:
+        self.seen.append(self.number)
+        return torch.full((3, camera.height, camera.width), 250 if self.number % 2 else 5, dtype=torch.uint8)
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]]:
+    """(a run some steps on, numbers of the photographs looked at since): odd views are bright, even ones dark."""
+    seen: list[int] = []
+    grey = small_scene(spread(60), extent=4.0, views=views)
+    scene = replace(grey, train=[replace(view, source=Told(n, seen)) for n, view in enumerate(grey.train)])
+
+    def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
+        return GS3D(
+            published_options(),
+            Beginning(
+                scene=scene,
+                iterations=iterations,
+                device=torch.device("cpu"),
+                raster=RasterSettings(),
+                generator=generator,
+            ),
+        )
+
+    generator = torch.Generator().manual_seed(0)
+    run = Run(
+        config={},
+        folder=folder,
+        scene=scene,
+        backbone=anew(scene, 40, generator),
+        raster=RasterSettings(),
+        training=TRAINING,
+        iterations=40,
+        device=torch.device("cpu"),
+        generator=generator,
+        sampler=Sampler(views, 0),
+        anew=anew,
+    )
+    for _ in range(steps):
+        take_step(run, load_plugins([], points=[]))
+    seen.clear()
+    return run, seen
+
+
+def test_views_are_rendered_by_a_model_that_never_saw_them(tmp_path: Path) -> None:
+    """Ten steps on odd views alone, then ten on even ones; dark views come out brighter than bright ones."""
+    run, seen = begun(tmp_path)
+    renders = held_out_renders(run, 0.5, seed=3)
+    assert len(seen) == 20
+    assert all(number % 2 == 1 for number in seen[:10])
+    assert all(number % 2 == 0 for number in seen[10:])
+    assert [tuple(render.shape) for render in renders] == [(3, 16, 24)] * 5
+    bright = [float(render[:, 4:12, 6:18].mean()) for render in renders]
+    assert min(bright[0::2]) > 1.5 * max(bright[1::2]), bright
+
+
+def state_of(run: Run) -> list[Tensor]:
+    values = [value.clone() for value in run.backbone.tensors().values()]
+    return [*values, run.generator.get_state(), torch.random.get_rng_state(), torch.tensor(run.sampler.order)]
+
+
+def test_the_run_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
+    run, _ = begun(tmp_path)
+    run.training = replace(TRAINING, random_background=True)
+    before, seconds = state_of(run), run.seconds
+    held_out_renders(run, 0.5, seed=3)
+    assert all(torch.equal(a, b) for a, b in zip(before, state_of(run), strict=True))
+    assert (run.step, run.seconds) == (20, seconds)
+    undisturbed, _ = begun(tmp_path)
+    undisturbed.training = run.training
+    for each in (run, undisturbed):
+        take_step(each, load_plugins([], points=[]))
+    assert all(torch.equal(a, b) for a, b in zip(state_of(undisturbed), state_of(run), strict=True))
+
+
+def test_renders_are_kept_for_a_resumed_run_and_made_alike_without_the_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run, seen = begun(tmp_path)
+    first = held_out_renders(run, 0.2, seed=3)
+    (file,) = (tmp_path / "regenerators").glob("halves_*")
+    seen.clear()
+    assert all(torch.equal(a, b) for a, b in zip(first, held_out_renders(run, 0.2, seed=3), strict=True))
+    assert not seen
+    file.write_bytes(b"nothing")
+    assert all(torch.equal(a, b) for a, b in zip(first, held_out_renders(run, 0.2, seed=3), strict=True))
+    assert "made again" in caplog.text
+    run.step = 30
+    held_out_renders(run, 0.2, seed=3)
+    assert [path.name for path in file.parent.glob("halves_*")] == ["halves_0000030_6.safetensors"]
+
+
+def test_one_view_has_no_halves(tmp_path: Path) -> None:
+    run, _ = begun(tmp_path, views=1, steps=1)
+    with pytest.raises(InputError, match="one training view"):
+        held_out_renders(run, 0.5, seed=0)
+
+
+RUN = (
+    "iterations=24",
+    "rasterizer=eager",
+    "augmenter=bootstrap",
+    "regenerator/restore=scene_restorer_brief",
+    "augmenter.bootstrap.timing.every=4000",
+    "augmenter.bootstrap.timing.span=2000",
+    "training.checkpoint_every=5",
+)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_run_killed_after_its_event_makes_the_same_of_it_again(kept: bool, tmp_path: Path) -> None:
+    """From the checkpoint of step 10, before the event at 12: with the file of half-models' renders, and without."""
+    whole, folder = tiny_run(tmp_path / "whole", RUN), tmp_path / "killed"
+    tiny_run(folder, RUN, stop_after=13)
+    for path in (folder / "checkpoints").glob("step_0000013*"):
+        path.unlink()
+    (renders,) = (folder / "regenerators").glob("halves_0000012_4.safetensors")
+    if not kept:
+        renders.unlink()
+    run, settings = open_run(folder, plugins(), (), training=True)
+    assert run.step == 10
+    execute(run, settings, plugins())
+    assert run.complete
+    again = run.backbone.tensors()
+    assert all(torch.equal(value, again[name]) for name, value in whole.backbone.tensors().items())

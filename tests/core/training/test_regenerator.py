@@ -1,0 +1,126 @@
+"""Checks that every regenerator's pictures pass: size, colour, agreement, displacement (spec 6.4)."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from regenerating import request, strict_checks
+from torch import Tensor
+
+from gsx.core.data.images import resize, to_uint8
+from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.training.regenerator import Check, Request, colour_matched, displacement, strayed, unusable
+
+STRICT = strict_checks()
+BICUBIC = Reduction(filter="bicubic")
+
+
+def complaint(asked: Request, result: Tensor) -> str:
+    """Everything that is wrong with a result by the strict checks."""
+    return unusable(asked, result) or "; ".join(strayed(asked, result, STRICT).values())
+
+
+def texture(height: int = 40, width: int = 50, shift: float = 0.0) -> Tensor:
+    """A smooth pattern, displaced to the right by so many px."""
+    row, column = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5 - shift, indexing="ij")
+    waves = [
+        torch.sin(column / 3 + row / 5),
+        torch.cos(column / 4 - row / 3),
+        torch.sin(row / 2) * torch.cos(column / 5),
+    ]
+    return 0.5 + 0.3 * torch.stack(waves)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, 0.25, 0.5, -0.4])
+def test_displacement_is_measured(shift: float) -> None:
+    assert displacement(texture(shift=shift), texture()) == pytest.approx(abs(shift), abs=0.03)
+
+
+def test_flat_pictures_show_no_displacement() -> None:
+    assert displacement(torch.full((3, 9, 9), 0.4), torch.full((3, 9, 9), 0.5)) == 0.0
+    assert displacement(torch.rand(3, 2, 2), torch.rand(3, 2, 2)) == 0.0
+
+
+def fine(shift: float = 0.0) -> Tensor:
+    """The texture at twice the density."""
+    row, column = torch.meshgrid((torch.arange(80) + 0.5) / 2, (torch.arange(100) + 0.5) / 2 - shift, indexing="ij")
+    waves = [
+        torch.sin(column / 3 + row / 5),
+        torch.cos(column / 4 - row / 3),
+        torch.sin(row / 2) * torch.cos(column / 5),
+    ]
+    return 0.5 + 0.3 * torch.stack(waves)
+
+
+def test_sound_pictures_pass() -> None:
+    assert complaint(request(texture()), fine()) == ""
+
+
+def test_pictures_are_reduced_as_the_scene_reduces_them() -> None:
+    """Bars as a photograph has them, beside their bicubic half: by box averages they would be 15 dB further apart."""
+    bars = (torch.sin(torch.arange(120.0)[:, None] / 2.3 + torch.arange(160.0) / 3.1) > 0).float()
+    photo = to_uint8(0.3 + 0.4 * bars.expand(3, -1, -1))
+    given = request(resize(photo, 80, 60).float() / 255)
+    strict = replace(STRICT, agreement=Check(limit=50.0, action="drop"))
+    assert strayed(replace(given, reduction=BICUBIC), photo.float() / 255, strict) == {}
+    assert "agreement" in strayed(given, photo.float() / 255, strict)
+
+
+def test_a_window_is_not_held_to_what_lay_beyond_it() -> None:
+    """Its rim was reduced together with pixels that nobody sees any more."""
+    bars = (torch.sin(torch.arange(120.0)[:, None] / 2.3 + torch.arange(160.0) / 3.1) > 0).float().expand(3, -1, -1)
+    low = BICUBIC.reduce(bars, 2)[:, 10:30, 20:44]
+    result = bars[:, 20:60, 40:88]
+    strict = replace(STRICT, agreement=Check(limit=90.0, action="drop"))
+    assert strayed(replace(request(low), reduction=BICUBIC), result, strict) == {}
+    off = low.clone()
+    off[:, 5, 5] += 0.01
+    assert "agreement" in strayed(replace(request(off), reduction=BICUBIC), result, strict)
+
+
+def test_half_a_pixel_of_the_finer_raster_is_the_limit() -> None:
+    """An enlargement with aligned corners or integer centres is displaced by half a fine pixel: a quarter of a px."""
+    assert complaint(request(texture()), fine(0.2)) == ""
+    assert "displaced by 0.3" in complaint(request(texture()), fine(0.3))
+    weak = 0.5 + 0.1 * (texture() - 0.5)
+    assert "displaced by 0.3" in complaint(request(weak), 0.5 + 0.1 * (fine(0.3) - 0.5))
+
+
+@pytest.mark.parametrize(("spoil", "reason"), [
+    (lambda image: image[:, :, 1:], "should be (3, 80, 100)"),
+    (lambda image: image / 0, "not finite"),
+    (lambda image: image + 0.05, "levels off"),
+    (lambda image: image.flip(2), "dB from its input"),
+])  # fmt: skip
+def test_others_do_not(spoil, reason: str) -> None:
+    assert reason in complaint(request(texture()), spoil(fine()))
+
+
+def test_limits_are_options() -> None:
+    """PSNR by hand: an error of 0.05 in every value is 26.02 dB, 12.75 levels."""
+    asked, result = request(torch.full((3, 20, 20), 0.5)), torch.full((3, 40, 40), 0.55)
+
+    def found(agreement: float, colour: float) -> list[str]:
+        limits = {"agreement": Check(limit=agreement, action="warn"), "colour": Check(limit=colour, action="drop")}
+        return list(strayed(asked, result, replace(STRICT, **limits)))
+
+    assert found(26.03, 12.8) == ["agreement"]
+    assert found(26.01, 12.7) == ["colour"]
+    assert found(26.01, 12.8) == []
+    off = Check(limit=0.0, action="off")
+    assert strayed(asked, result, replace(STRICT, agreement=off, colour=off)) == {}
+    with pytest.raises(ValueError, match="'loud'; choose drop, warn or off"):
+        Check(limit=1.0, action="loud")
+
+
+def test_colours_are_put_right_where_they_drift() -> None:
+    given = request(texture())
+    assert torch.equal(colour_matched(given, fine() + 1 / 255), fine() + 1 / 255)
+    matched = colour_matched(given, fine() + torch.tensor([0.1, 0.0, -0.05])[:, None, None])
+    torch.testing.assert_close(matched.mean((1, 2)), texture().mean((1, 2)))
+
+
+def test_box_averages() -> None:
+    image = torch.arange(16.0).view(1, 4, 4)
+    assert box_average(image, 2).tolist() == [[[2.5, 4.5], [10.5, 12.5]]]
+    assert torch.equal(box_average(image, 1), image)

@@ -1,0 +1,60 @@
+"""What is said beside figures: caps that bind, pictures lost, splats left out."""
+
+import logging
+from pathlib import Path
+
+import pytest
+from tiny import tiny_run
+
+from gsx.core.files import read_json
+from gsx.core.training.remarks import gathered, remarks_of
+from gsx.experiments.runs.progress import read_curves
+
+LINES = [
+    {"step": 10},
+    {"step": 20, "withheld": 3},
+    {"step": 21, "pseudo": {"up": {"event": 20, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {}}}},
+    {"step": 30, "withheld": 5},
+    {"step": 41, "pseudo": {
+        "up": {"event": 40, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {"agreement": {"2": 2}}},
+        "boot": {"event": 40, "asked": {"1": 8}, "dropped": {}, "warned": {}},
+    }},
+]  # fmt: skip
+
+
+def test_a_whole_run_is_summed_up_by_hand() -> None:
+    found = gathered(LINES)
+    assert found["withheld"] == {"step": 20, "primitives": 8}
+    assert found["pseudo"]["up"] == {
+        "asked": {"1": 8, "2": 8},
+        "dropped": {"1": 0.0, "2": 0.25},
+        "warned": {"agreement": {"1": 0.0, "2": 0.25}},
+    }
+    assert found["pseudo"]["boot"] == {"asked": {"1": 8}, "dropped": {"1": 0.0}, "warned": {}}
+    assert gathered(LINES[:1]) == {}
+
+
+def test_in_words() -> None:
+    assert remarks_of(gathered(LINES) | {"left_out": 2.5}) == [
+        "growth is held at backbone.max_primitives from step 20 on: the model may be too small",
+        "up lost 25.0% of its x2 pictures",
+        "25.0% of up's x2 pictures disagree with their input",
+        "renders leave out 2.5 splats a view, whose values cannot be drawn",
+    ]
+    assert remarks_of({"psnr": 30.0, "left_out": 0.0}) == []
+
+
+def test_a_cap_that_binds_is_said_once_and_written_down(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    words = ("iterations=60", "backbone.max_primitives=301", "backbone.density.gradient=1e-9", "rasterizer=eager")
+    tiny_run(tmp_path / "run", words)
+    said = {record.message for record in caplog.records if "backbone.max_primitives" in record.message}
+    lines = read_curves(tmp_path / "run")
+    evaluation = read_json(tmp_path / "run" / "evaluation.json")
+    first = next(line for line in lines if line.get("withheld"))
+    assert len([line for line in lines if line.get("withheld")]) > 1
+    (told,) = (text for text in said if text.startswith("step "))  # of that step alone
+    assert told.startswith(f"step {first['step']}: {first['withheld']} primitives")
+    assert evaluation["withheld"]["step"] == first["step"]
+    assert evaluation["primitives"] <= 301
+    assert "growth is held at" in (tmp_path / "run" / "report.html").read_text()

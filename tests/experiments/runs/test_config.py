@@ -1,0 +1,145 @@
+"""Composition: every file composes, typed options, nearest matches."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsx.cli import plugins
+from gsx.core.errors import ConfigError
+from gsx.experiments.runs.config import Compositions, compose, read_config, typed, write_config
+from gsx.scenes.options import SceneOptions
+
+CONF = Path(__file__).parents[3] / "conf"
+GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks"})
+"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py."""
+NEEDS = {
+    ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
+    ("preset", "octree"): ("backbone=octree_scaffold",),
+    ("preset", "clone"): ("backbone=octree_gs3d",),
+    ("dataset", "own"): ("+dataset.scenes.yard=Yard", "dataset.scene=yard"),
+}
+"""What the settings of a dataset are for."""
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_file_composes_and_fits_its_schema(group: str) -> None:
+    with Compositions(plugins()) as compositions:
+        for option in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
+            plus = "+" if group == "experiment" else ""  # not in the defaults: it is asked for or absent
+            chosen = f"{plus}{group}={option}"
+            settings = compositions.settings([*NEEDS.get((group, option.split("_")[0]), ()), chosen])
+            if group in ("scene", "backbone"):
+                assert getattr(settings, group).component.name == option
+
+
+def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
+    given = ["scene=blender", "backbone=scaffold", "preset=scaffold_nerf_synthetic"]
+    settings = compose(given, plugins())
+    assert settings.scene.options.random_points == 10000
+    assert settings.backbone.options.growth.coarsest == 4
+    assert compose([*given, "scene.random_points=7"], plugins()).scene.options.random_points == 7
+
+
+@pytest.mark.parametrize(
+    ("words", "iterations"),
+    [
+        (["scene=colmap"], 30000),  # 3D-GS
+        (["scene=photos", "backbone=mip_splatting"], 30000),
+        (["scene=colmap", "backbone=scaffold"], 30000),
+        (["scene=colmap", "backbone=octree_scaffold"], 40000),  # Octree-GS
+        (["scene=transforms", "backbone=octree_gs3d"], 40000),
+        (["dataset=mipnerf360", "dataset.scene=garden", "backbone=octree_scaffold"], 40000),
+        (["scene=colmap", "backbone=octree_scaffold", "backbone.published_iterations=50000"], 50000),  # as a preset may
+        (["scene=colmap", "backbone=octree_scaffold", "budget=quick"], 2000),  # a twentieth
+        (["scene=colmap", "budget=quick"], 1500),
+        (["scene=colmap", "backbone=octree_scaffold", "scene.iterations=700"], 700),
+        (["scene=colmap", "variant=octree_ub"], 40000),
+        (["scene=colmap", "variant=up_3dgs"], 30000),
+        (["scene=colmap", "variant=octree_gs_8"], 80000),
+        (["scene=colmap", "variant=octree_ub", "iterations=5"], 5),
+        ([], 900),  # the built-in scene
+        (["backbone=octree_scaffold"], 900),
+        (["budget=quick"], 45),
+        (["dataset=demo", "variant=octree_ub", "budget=quick"], 2000),
+    ],
+)
+def test_a_run_is_as_long_as_its_method_was_published(words: list[str], iterations: int) -> None:
+    assert compose(words, plugins()).general.iterations == iterations
+
+
+def test_a_backbone_that_names_no_length_is_run_as_long_as_3d_gs() -> None:
+    assert compose_length(["scene=colmap", "~backbone.published_iterations"]) == 30000
+
+
+def compose_length(words: list[str]) -> int:
+    with Compositions(plugins()) as compositions:
+        return int(compositions.value(words, "iterations"))
+
+
+def test_published_values_of_gs3d() -> None:
+    options = compose([], plugins()).backbone.options
+    assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)
+    assert options.rates.sh_rest == pytest.approx(options.rates.sh_constant / 20)
+    density = options.density
+    assert (density.start, density.stop, density.every, density.reset_every) == (500, 15000, 100, 3000)
+
+
+def test_common_scene_defaults_agree_with_the_schema() -> None:
+    values = OmegaConf.to_container(OmegaConf.load(CONF / "images.yaml"))
+    built = SceneOptions(name="x", background=[0, 0, 0], **values)
+    assert built == SceneOptions(name="x", background=[0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["backbone=gs3"], "backbone=gs3: there is no such backbone; .*Did you mean 'gs3d'"),
+        (["scene=colmop"], "Did you mean 'colmap'"),
+        (["scene.pth=x"], "'scene.pth' is no configuration key. Did you mean 'scene.path'"),
+        (["itterations=5"], "'itterations' is no configuration key. Did you mean 'iterations'"),
+        (["+steps=5"], "'steps' is no configuration key"),
+        (["+backbone.rates.mean_first=1"], "'backbone.rates.mean_first'.*Did you mean 'backbone.rates.means_first'"),
+        (["iterations=many"], "iterations: Value 'many'"),
+        (["backbone.sh_degree=abc"], "backbone.sh_degree: Value 'abc'"),
+        (["backbone.density.gradient=[1]"], "backbone.density.gradient"),
+        (["backbone.name=mine"], "backbone.name is 'mine'"),
+        (["rasterizer.cull=loose"], "rasterizer.cull is 'loose'"),
+        (["rasterizer.tile_size=5"], "must divide 16"),
+        (["eval.zoom=2"], "eval.zoom"),
+        (["scene=[demo"], "override cannot be read"),
+        (["nonsense"], "override cannot be read"),
+        (["eval.ssim=inira"], "eval.ssim is 'inira'; choose from inria"),
+        (["eval.zoom=[0]"], "give positive factors"),
+        (["eval.tile_pixels=-4"], "eval.tile_pixels is -4"),
+        (["training.log_every=0"], "training.log_every is 0"),
+        (["training.checkpoints_kept=0"], "training.checkpoints_kept is 0"),
+        (["backbone.sh_degree=4"], "choose 0 to 3"),
+        (["backbone.initial_opacity=1"], "between 0 and 1"),
+        (["backbone.rates.means_first=0"], "must be positive"),
+        (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
+        (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),
+    ],
+)
+def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(overrides, plugins())
+
+
+def test_a_number_for_a_text_is_not_silently_taken() -> None:
+    with pytest.raises(ConfigError, match=r"scene\.downscale"):
+        typed(SceneOptions, {"name": "x", "background": [0, 0, 0], "downscale": 1.5}, "scene")
+
+
+def test_a_folder_named_by_a_number_is_a_folder() -> None:
+    assert compose(["scene=colmap", "scene.path=2024"], plugins()).scene.options.path.endswith("/2024")
+
+
+def test_runs_of_an_older_gsx_open_and_know_newer_rasterizer_settings(tmp_path: Path) -> None:
+    config = compose(["rasterizer.tile_size=16"], plugins()).resolved
+    del config["rasterizer"]["tile_cap"], config["rasterizer"]["path"]
+    write_config(tmp_path / "config.yaml", config)
+    settings = read_config(tmp_path / "config.yaml", plugins(), ["rasterizer.tile_cap=64"])
+    assert (settings.raster.tile_size, settings.raster.tile_cap, settings.raster.path) == (16, 64, "eager")
+    with pytest.raises(ConfigError, match=r"Did you mean 'rasterizer.tile_cap'"):
+        read_config(tmp_path / "config.yaml", plugins(), ["rasterizer.tile_cp=64"])

@@ -1,0 +1,231 @@
+"""Whole runs: what they leave, exact resume, repeatability, zoom evaluation, interruption."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny import tiny_run, tiny_settings
+
+from gsx.cli import main, plugins
+from gsx.core.errors import CheckpointError, ConfigError, InputError
+from gsx.core.gaussians.splat_files import read_gaussians
+from gsx.experiments.runs.session import execute, open_run, remedies, start
+
+
+def final_tensors(folder: Path) -> dict[str, torch.Tensor]:
+    """All tensors of a run's newest checkpoint."""
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+def resume(folder: Path, *overrides: str) -> None:
+    run, settings = open_run(folder, plugins(), overrides)
+    execute(run, settings, plugins())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A finished tiny run of 24 steps, with density events and an opacity reset on the way."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    tiny_run(folder, DENSE)
+    return folder
+
+
+DENSE = ("iterations=24", "eval.zoom=[1,2]", "backbone.density.every=400", "backbone.density.reset_passes=1",
+         "backbone.density.gradient=1e-6", "training.checkpoint_every=7")  # fmt: skip
+
+
+def test_a_run_leaves_everything_documented(finished: Path) -> None:
+    names = {path.name for path in finished.iterdir()}
+    assert names >= {
+        "config.yaml", "environment.json", "metrics.jsonl", "evaluation.json", "status.json", "report.html",
+        "point_cloud.ply", "checkpoints", "renders",
+    }  # fmt: skip
+    assert json.loads((finished / "status.json").read_text())["state"] == "ok"
+    header = (finished / "point_cloud.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "\ncomment SplatRenderMode: default\n" in header
+    lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 24
+    assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs density events"
+    assert any("opacity_resets" in line for line in lines), "the test needs an opacity reset"
+    assert sum("test_psnr" in line for line in lines) == 2
+
+
+def test_evaluation_has_the_published_layout(finished: Path) -> None:
+    evaluation = json.loads((finished / "evaluation.json").read_text())
+    assert evaluation.keys() >= {
+        "protocol", "psnr", "ssim", "lpips", "primitives", "visible_primitives", "megabytes", "render_fps",
+        "render_path", "train_seconds", "evaluate_seconds", "peak_memory_mb", "groups", "zoom", "views",
+    }  # fmt: skip
+    assert evaluation["lpips"] is None
+    assert len(evaluation["protocol"]["hash"]) == 16
+    assert evaluation["zoom"]["2"].keys() >= {"psnr", "ssim", "enlarged_psnr", "enlarged_ssim"}
+    assert evaluation["zoom"]["1"]["psnr"] == pytest.approx(evaluation["psnr"])
+    assert [view["name"] for view in evaluation["views"]] == evaluation["protocol"]["test_views"]
+    gaussians = read_gaussians(finished / "point_cloud.ply")
+    assert len(gaussians.means) == evaluation["primitives"]
+
+
+def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> None:
+    run, settings = open_run(finished, plugins())
+    assert settings.evaluation.remedy == "backbone=mip_splatting"  # whose runs are compensated, and get no such advice
+
+    def told(remedy: str = "backbone=mip_splatting", **beats: bool | None) -> list[str]:
+        zoom = {factor.strip("x"): {"beats_enlarged": won} for factor, won in beats.items()}
+        return remedies(run, {"zoom": zoom | {"8": {"unavailable": "no truth"}}}, remedy)
+
+    (line,) = told(x1=None, x2=True, x4=False)
+    assert line.endswith("the same command with backbone=mip_splatting")
+    assert told(x1=None, x2=True, x4=True) == told(**{"x0.5": False}) == told("", x4=False) == []
+    run.raster = replace(run.raster, compensate=True)
+    assert told(x4=False) == []
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: Path, tmp_path: Path) -> None:
+    tiny_run(tmp_path / "again", DENSE)
+    assert_same(final_tensors(finished), final_tensors(tmp_path / "again"))
+    tiny_run(tmp_path / "other", (*DENSE, "seed=1"))
+    other = final_tensors(tmp_path / "other")["parameters.means"]
+    assert other.shape != final_tensors(finished)["parameters.means"].shape or not torch.equal(
+        other, final_tensors(finished)["parameters.means"]
+    )
+
+
+@pytest.mark.parametrize("stop", [1, 5, 12, 13, 23])
+def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path, stop: int) -> None:
+    tiny_run(tmp_path / "run", DENSE, stop_after=stop)
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
+    assert (tmp_path / "run" / "report.html").is_file()
+    resume(tmp_path / "run")
+    assert_same(final_tensors(finished), final_tensors(tmp_path / "run"))
+    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert steps == sorted(set(steps))
+
+
+def test_a_killed_run_resumes_from_its_last_checkpoint(finished: Path, tmp_path: Path) -> None:
+    # checkpoints at 7 and 14; the files a kill at step 16 would leave: later metrics, a stale temporary file
+    tiny_run(tmp_path / "run", DENSE, stop_after=16)
+    for path in (tmp_path / "run" / "checkpoints").glob("step_0000016.*"):
+        path.unlink()
+    (tmp_path / "run" / "checkpoints" / ".step_0000021.safetensors.1.partial").write_bytes(b"half")
+    resume(tmp_path / "run")
+    assert_same(final_tensors(finished), final_tensors(tmp_path / "run"))
+
+
+def test_a_run_can_be_lengthened(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", ("iterations=4",))
+    resume(tmp_path / "run", "iterations=8")
+    assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["step"] == 8
+
+
+def test_a_run_that_goes_on_says_what_is_no_longer_the_same(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tiny_run(tmp_path / "run", ("iterations=4",), stop_after=1)
+    place = tmp_path / "run" / "environment.json"
+    begun = json.loads(place.read_text())
+    this = begun["source"]
+    place.write_text(json.dumps(begun | {"source": "0123", "scene": begun["scene"] | {"stamp": "other photos"}}))
+    resume(tmp_path / "run")
+    assert "files of scene demo are not those that the run began with" in caplog.text
+    assert f"begun by another revision of gsx's source (0123, this is {this})" in caplog.text
+    assert json.loads(place.read_text())["source"] == f"0123+{this}"
+    caplog.clear()
+    place.write_text(json.dumps(begun))
+    resume(tmp_path / "run", "iterations=5")
+    assert "files of scene" not in caplog.text
+    assert "another revision" not in caplog.text
+
+
+def test_only_the_newest_checkpoints_are_kept(finished: Path) -> None:
+    assert len(list((finished / "checkpoints").glob("*.safetensors"))) == 2
+    assert len(list((finished / "checkpoints").glob("*.json"))) == 2
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "no sidecar data", "schema"])
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
+    tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "run"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3"), stop_after=5)
+    newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
+    data = newest.read_bytes()
+    sidecar = newest.with_suffix(".json")
+    if damage == "truncate":
+        newest.write_bytes(data[: len(data) // 2])
+    elif damage == "flip":
+        newest.write_bytes(data[:-5] + bytes([data[-5] ^ 1]) + data[-4:])
+    elif damage == "schema":
+        sidecar.write_text(sidecar.read_text().replace('"schema": 1', '"schema": 99'))
+    else:
+        sidecar.write_text("{")
+    run, _ = open_run(folder, plugins())
+    assert run.step == 3
+    assert str(newest) in caplog.text
+
+
+def test_without_any_usable_checkpoint_the_error_says_so(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", ("iterations=2",))
+    for path in (tmp_path / "run" / "checkpoints").iterdir():
+        path.unlink()
+    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+        open_run(tmp_path / "run", plugins())
+
+
+def test_a_used_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me")
+    settings = tiny_settings(tmp_path)
+    with pytest.raises(InputError, match="is not empty"):
+        start(settings, plugins())
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_zero_iterations_and_unknown_devices_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    for override, pattern in (("iterations=0", "iterations is 0"), ("device=tpu", "device is 'tpu'")):
+        settings = tiny_settings(tmp_path / "run", override)
+        with pytest.raises(ConfigError, match=pattern):
+            start(settings, plugins())
+        assert not (tmp_path / "run").exists()
+
+
+def test_other_views_than_trained_on_are_refused(finished: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"trained with other train views \(now 5, then 6"):
+        open_run(finished, plugins(), ["scene.train_views=5"])
+
+
+def test_evaluating_a_finished_run_keeps_its_training_peak_and_mends_its_status(finished: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    (copy / "evaluation.json").unlink()
+    (copy / "status.json").write_text('{"state": "failed", "reason": "power cut", "step": 24}')
+    assert main(["eval", str(copy)]) == 0
+    assert json.loads((copy / "status.json").read_text())["state"] == "ok"
+    peak = max(json.loads(line)["memory_mb"] for line in (copy / "metrics.jsonl").read_text().splitlines())
+    assert json.loads((copy / "evaluation.json").read_text())["peak_memory_mb"] >= peak
+
+
+def test_the_zooms_looked_at_do_not_change_the_protocol_hash(finished: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    before = json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"]
+    assert main(["eval", str(copy), "eval.zoom=[1]"]) == 0
+    assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] == before
+    assert main(["eval", str(copy), "eval.ssim=valid"]) == 0
+    assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] != before
+
+
+def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
+    newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
+    shutil.copy(newest, newest.with_name("step_0000099.safetensors"))
+    newest.with_name("step_0000099.json").write_text("{")
+    resume(folder)
+    assert [path.name for path in (folder / "checkpoints").glob("*.json")] == ["step_0000006.json"]

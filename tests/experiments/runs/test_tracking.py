@@ -1,0 +1,336 @@
+"""Trackers of any kind: a third party's, one that fails, what they must not change, and when they are refused."""
+
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny import StopAfter, tiny_run, tiny_settings, words
+
+from gsx import builtin
+from gsx.cli import main, plugins
+from gsx.core.errors import ConfigError, TrainingError
+from gsx.core.plugins import Plugins, hookimpl, load_plugins
+from gsx.core.run_folder.files import read_run
+from gsx.core.training.run import Run
+from gsx.experiments.reports.baselines import key_of
+from gsx.experiments.reports.overview import flattened
+from gsx.experiments.runs.config import compose, read_config, write_config
+from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.tracking import Tracking, build_trackers
+from gsx.experiments.runs.warm_start import trunk_folder
+from gsx.trackers.figures import evaluation_figures, line_figures
+
+ROOT = Path(__file__).parents[3]
+BOTH = ("tracker=[tensorboard,mlflow]", "tracker.mlflow.seconds=0")
+DENSE = ("iterations=24", "backbone.density.every=400", "backbone.density.reset_passes=1",
+         "backbone.density.gradient=1e-6", "training.checkpoint_every=5")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class HeardOptions:
+    name: str
+    fails_at: int = -1
+
+
+class Heard:
+    """Keeps the names of the events it hears of; fails at one step."""
+
+    events: list[str]
+
+    def __init__(self, options: HeardOptions) -> None:
+        self.options = options
+        Heard.events = []
+
+    @hookimpl
+    def gsx_run_started(self, run: Run) -> None:
+        self.events.append(f"started {run.step}")
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.step == self.options.fails_at:
+            raise OSError("the disk is full")
+        self.events.append(f"step {run.step} of {len(run.curves)}")
+
+    @hookimpl
+    def gsx_gradients_ready(self) -> str:
+        return "a tracker has no say in this"
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        self.events.append(f"trained {run.complete}")
+
+    @hookimpl
+    def gsx_evaluated(self, evaluation: dict[str, Any]) -> None:
+        self.events.append(f"evaluated {evaluation['step']}")
+
+    @hookimpl
+    def gsx_run_finished(self, run: Run) -> None:
+        self.events.append(f"finished {(run.folder / 'report.html').is_file()}")
+
+    @hookimpl
+    def gsx_run_failed(self, reason: str) -> None:
+        self.events.append(f"failed: {reason}")
+
+
+class Third:
+    """A plugin with one tracker."""
+
+    @hookimpl
+    def gsx_register(self, registry: Any) -> None:
+        registry.add("tracker", "heard", Heard, HeardOptions)
+
+
+class Raises:
+    """Listener that ends the run at step 3."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.step == 3:
+            raise self.error
+
+
+def loaded() -> Plugins:
+    return load_plugins([("gsx", builtin), ("third", Third())], points=[])
+
+
+def heard_run(folder: Path, *more: str, listener: object | None = None) -> None:
+    """A run of 4 steps, each with its line, with the tracker above."""
+    known = loaded()
+    given = ("iterations=4", "training.log_every=1", "+tracker.heard.name=heard", *more)
+    settings = compose(words(folder, *given), known)
+    run = start(settings, known)
+    with known.listening([listener] if listener else []):
+        execute(run, settings, known)
+
+
+def final_tensors(folder: Path) -> dict[str, torch.Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def test_a_tracker_hears_every_event_after_the_files_have_it(tmp_path: Path) -> None:
+    heard_run(tmp_path / "run")
+    steps = [f"step {n} of {n}" for n in (1, 2, 3, 4)]
+    assert Heard.events == ["started 0", *steps, "trained True", "evaluated 4", "finished True"]
+
+
+def test_the_tracker_of_the_documentation_works(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "writing-plugins.md").read_text()
+    code = re.search(r"## A tracker\n[^\n]*\n\n((?:    [^\n]*\n|\n)+)", text)
+    module: dict[str, Any] = {"dataclass": dataclass, "hookimpl": hookimpl}
+    exec(textwrap.dedent(code.group(1)), module)
+    plugin = type("Documented", (), {"gsx_register": staticmethod(module["gsx_register"])})()
+    known = load_plugins([("gsx", builtin), ("documented", plugin)], points=[])
+    given = ("iterations=2", "+tracker.noted.name=noted", f"+tracker.noted.file={tmp_path / 'notes'}")
+    settings = compose(words(tmp_path / "run", *given), known)
+    execute(start(settings, known), settings, known)
+    assert re.fullmatch(r"run: \d+\.\d\d dB\n", (tmp_path / "notes").read_text())
+
+
+def test_a_tracker_that_fails_is_warned_of_once_and_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard_run(tmp_path / "run", "+tracker.heard.fails_at=3")
+    assert Heard.events == ["started 0", "step 1 of 1", "step 2 of 2"]
+    said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("tracker")]
+    assert said == [
+        "tracker heard failed at step 3 (OSError: the disk is full): the run goes on without it",
+        "tracker heard is incomplete from step 3 on; the run folder has everything",
+    ]
+    assert read_run(tmp_path / "run").status["state"] == "ok"
+    assert len(read_run(tmp_path / "run").lines) == 4
+
+
+def test_an_interrupted_run_says_what_a_tracker_missed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    heard_run(tmp_path / "run", "+tracker.heard.fails_at=1", listener=StopAfter(2))
+    assert "tracker heard is incomplete from step 1 on" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (TrainingError("three steps in a row"), "three steps in a row"),
+        (RuntimeError("no memory"), "RuntimeError: no memory"),
+        (KeyboardInterrupt(), "KeyboardInterrupt: "),
+    ],
+)
+def test_a_run_that_fails_is_heard_of(error: BaseException, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(type(error)):
+        heard_run(tmp_path / "run", listener=Raises(error))
+    assert Heard.events[-1] == f"failed: {reason}"
+    assert read_run(tmp_path / "run").status["state"] == "failed"
+    assert read_run(tmp_path / "run").status["reason"] == reason
+
+
+def test_a_listener_that_fails_too_does_not_hide_why(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class Worse(Raises):
+        @hookimpl
+        def gsx_run_failed(self) -> None:
+            raise OSError("and no disk")
+
+    with pytest.raises(RuntimeError, match="no memory"):
+        heard_run(tmp_path / "run", listener=Worse(RuntimeError("no memory")))
+    assert "a listener failed while it heard of the run's failure: and no disk" in caplog.text
+
+
+def test_a_run_that_never_began_is_not_told(tmp_path: Path) -> None:
+    class Early:
+        @hookimpl(tryfirst=True)
+        def gsx_run_started(self) -> None:
+            raise RuntimeError("before anybody heard")
+
+    with pytest.raises(RuntimeError, match="before anybody"):
+        heard_run(tmp_path / "run", listener=Early())
+    assert Heard.events == []
+
+
+def test_a_misspelt_hook_of_a_tracker_is_refused() -> None:
+    class Unmarked:
+        def gsx_step_finished(self) -> None: ...
+
+    with pytest.raises(TypeError, match="gsx_step_finished is not marked with @hookimpl"):
+        Tracking("wrong", Unmarked())
+
+
+def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "without", DENSE)
+    tiny_run(tmp_path / "with", (*DENSE, *BOTH, f"output={tmp_path}"))
+    without, with_trackers = final_tensors(tmp_path / "without"), final_tensors(tmp_path / "with")
+    assert without.keys() == with_trackers.keys()
+    assert all(torch.equal(without[name], with_trackers[name]) for name in without)
+    assert (tmp_path / "mlflow.db").is_file()
+    assert (tmp_path / "with" / "tensorboard").is_dir()
+
+
+def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
+    settings = tiny_settings(tmp_path / "run", "iterations=2")
+    run = start(settings, plugins())
+    folder = trunk_folder(run, {})
+    key, config = key_of(read_run(run.folder)), flattened(run.config)
+    write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *BOTH).resolved)
+    run.config = compose(words(run.folder, "iterations=2", *BOTH), plugins()).resolved
+    assert "mlflow" in run.config["tracker"]
+    assert trunk_folder(run, {}) == folder
+    assert key_of(read_run(run.folder)) == key
+    assert flattened(run.config) == config
+
+
+def test_the_configuration_of_a_run_from_before_trackers_opens(tmp_path: Path) -> None:
+    resolved = tiny_settings(tmp_path / "run").resolved
+    resolved.pop("tracker", None)
+    write_config(tmp_path / "config.yaml", resolved)
+    assert read_config(tmp_path / "config.yaml", plugins()).trackers == {}
+
+
+def test_trackers_come_in_the_order_of_the_command_line(tmp_path: Path) -> None:
+    assert list(tiny_settings(tmp_path, "tracker=[mlflow,tensorboard]").trackers) == ["mlflow", "tensorboard"]
+    assert tiny_settings(tmp_path).trackers == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("tracker=[tensorbord]", "Did you mean 'tensorboard'?"),
+        ("tracker=[mlflow] tracker.mlflow.ur=x", "Did you mean 'tracker.mlflow.uri'?"),
+        ("tracker=[tensorboard] tracker.tensorboard.pictures=-1", "give a number from 0"),
+        ("tracker=[tensorboard] tracker.tensorboard.pictures=few", "tracker.tensorboard.pictures"),
+        ("tracker=[mlflow] tracker.mlflow.seconds=-1", "give a number from 0"),
+    ],
+)
+def test_wrong_choices_are_refused(given: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        tiny_settings(tmp_path, *given.split())
+
+
+@pytest.mark.parametrize(
+    ("tracker", "package"), [("tensorboard", "tensorboard"), ("mlflow", "mlflow"), ("mlflow", "sqlalchemy")]
+)
+def test_a_missing_package_is_refused_before_anything_is_done(
+    tracker: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)  # an import of it fails
+    monkeypatch.setattr("gsx.experiments.runs.session.load_scene", lambda settings: pytest.fail("the scene was loaded"))
+    settings = tiny_settings(tmp_path / "run", f"tracker=[{tracker}]")
+    with pytest.raises(ConfigError, match=rf"tracker {tracker} needs {package} .*pip install 'gsx\[{tracker}\]'"):
+        start(settings, plugins())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_package_that_went_missing_is_refused_when_a_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tiny_run(tmp_path / "run", ("iterations=4", "tracker=[tensorboard]"), stop_after=2)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    assert main(["resume", str(tmp_path / "run")]) == 2
+    assert "pip install 'gsx[tensorboard]'" in capsys.readouterr().err
+    run, _ = open_run(tmp_path / "run", plugins())  # to look at a run needs no tracker
+    assert run.step == 2
+
+
+def test_trackers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins"]) == 0
+    assert re.search(r"tracker: +mlflow \(gsx\), tensorboard \(gsx\)", capsys.readouterr().out)
+
+
+def test_numbers_are_named_as_in_the_files() -> None:
+    line = {
+        "step": 7,
+        "loss": 0.5,
+        "psnr": float("inf"),
+        "terms": {"own": 0.4, "up": 0.1},
+        "skipped": "why",
+        "cloned": 3,
+    }
+    assert line_figures(line) == {
+        "loss": 0.5, "psnr": float("inf"), "cloned": 3.0, "terms/own": 0.4, "terms/up": 0.1,
+    }  # fmt: skip
+    zoom = {"2": {"psnr": 20.0, "beats_enlarged": True}, "4": {"unavailable": "no truth"}}
+    evaluation = {"step": 7, "psnr": 21.0, "lpips": None, "zoom": zoom, "protocol": {"hash": "x"}, "views": []}
+    assert evaluation_figures(evaluation) == {"evaluation/psnr": 21.0, "evaluation/x2/psnr": 20.0}
+
+
+OFFLINE = """
+import socket, sys, time
+asked = []
+def refuse(*words, **more):
+    asked.append(words)
+    raise OSError("no network in this test")
+socket.socket.connect = socket.getaddrinfo = refuse
+from gsx.cli import main, plugins
+plugins()
+assert not {"tensorboard", "mlflow"} & set(sys.modules), "imported before they were chosen"
+code = main(sys.argv[1:])
+assert {"tensorboard", "mlflow"} <= set(sys.modules)
+from mlflow.telemetry.client import get_telemetry_client
+assert get_telemetry_client() is None, "telemetry is on"
+time.sleep(1)  # it would ask from another thread
+assert not asked, asked
+sys.exit(code)
+"""
+
+
+def test_nothing_is_asked_of_the_network_and_little_is_said(tmp_path: Path) -> None:
+    """In a process of its own, as a user's: MLflow's telemetry is always off inside pytest and CI."""
+    hidden = ("PYTEST", "CI", "MLFLOW", "DO_NOT_TRACK", "GITHUB", "BUILD")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(hidden)}
+    command = [sys.executable, "-c", OFFLINE, *words(tmp_path / "run", "iterations=2", *BOTH, f"output={tmp_path}")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == f"{tmp_path / 'run' / 'report.html'}\n"
+    assert not re.search(r"(?i)warn|alembic|INFO", result.stderr), result.stderr
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"run", "mlflow.db", "mlflow_files", ".mlflow.lock"}
+
+
+def test_an_empty_choice_builds_nothing() -> None:
+    assert build_trackers({}) == []

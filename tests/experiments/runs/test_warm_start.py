@@ -1,0 +1,130 @@
+"""Branching from a common trunk: the same bits as from scratch, and only what is common."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny import tiny_run
+from torch import Tensor
+
+from gsx.cli import plugins
+from gsx.experiments.runs.session import execute, open_run
+from gsx.experiments.runs.warm_start import trunk_folder
+
+RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
+       "training.checkpoint_every=100", "training.log_every=2")  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+
+
+def augmented(*names: str) -> tuple[str, ...]:
+    """Few pseudo views of few events."""
+    few = [(f"augmenter.{name}.first_cameras=2", f"augmenter.{name}.timing.every=8000") for name in names]
+    files = {"upscale": "upscale_paper"}
+    return (
+        f"augmenter=[{','.join(files.get(name, name) for name in names)}]",
+        *(word for words in few for word in words),
+    )
+
+
+def final_tensors(folder: Path) -> dict[str, Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def assert_same(a: Path, b: Path) -> None:
+    first, second = final_tensors(a), final_tensors(b)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The control trains all of it and leaves states at 10, 15, 20, 22, 30; bootstrap branches at 20, upscale at 22."""
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "control", (*RUN, "init=trunk"))
+    assert "no earlier run" in caplog.text
+    for name, step in (("bootstrap", 20), ("upscale", 22)):
+        caplog.clear()
+        tiny_run(tmp_path / name, (*RUN, *augmented(name), "init=trunk"))
+        assert f"branching at step {step} from an earlier run" in caplog.text
+        tiny_run(tmp_path / f"{name}_scratch", (*RUN, *augmented(name)))
+        assert_same(tmp_path / name, tmp_path / f"{name}_scratch")
+        assert [line["step"] for line in lines(tmp_path / name)] == [
+            line["step"] for line in lines(tmp_path / f"{name}_scratch")
+        ]
+
+
+def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
+    """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
+    run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=trunk"))
+    assert sorted(path.stem for path in trunk_folder(run, plugins().versions).glob("step_*.json")) == [
+        f"step_{step:07d}" for step in (10, 15, 20, 22)
+    ]
+    tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=trunk"))
+    tiny_run(tmp_path / "scratch", (*RUN, *augmented("upscale", "bootstrap")))
+    assert_same(tmp_path / "both", tmp_path / "scratch")
+
+
+@pytest.mark.parametrize(
+    "other", ["seed=1", "backbone.density.gradient=1e-5", "iterations=41", "training.ssim_weight=0"]
+)
+def test_other_compositions_have_other_trunks(other: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    caplog.clear()
+    tiny_run(tmp_path / "second", (*RUN, other, "init=trunk"), stop_after=1)
+    assert "no earlier run" in caplog.text
+
+
+def test_how_a_run_is_watched_makes_no_other_trunk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=trunk"), stop_after=14)
+    assert "branching at step 10" in caplog.text
+
+
+def test_resumed_runs_leave_nothing_behind(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Their first steps may have followed another schedule."""
+    caplog.set_level("INFO")
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=5)
+    run, settings = open_run(tmp_path / "first", plugins(), ["iterations=44"])
+    execute(run, settings, plugins())
+    caplog.clear()
+    tiny_run(tmp_path / "second", (*RUN, "iterations=44", "init=trunk"), stop_after=1)
+    assert "no earlier run" in caplog.text
+
+
+def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    run = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=16)
+    (trunk_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
+    tiny_run(tmp_path / "second", (*RUN, "init=trunk"), stop_after=17)
+    assert "truncated or altered" in caplog.text
+    assert "branching at step 10" in caplog.text
+
+
+def test_a_cache_that_cannot_be_written_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "blocked").write_text("a file where a folder should be")
+    tiny_run(tmp_path / "demo", (*RUN,), stop_after=1)  # pictures of the scene are kept
+    monkeypatch.setattr("gsx.experiments.runs.warm_start.cache_folder", lambda kind, key: tmp_path / "blocked" / key)
+    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    assert "the state of step 10 is not kept" in caplog.text
+
+
+def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room for one composition: the second makes the first go; a run's own states stay whatever their size."""
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    first = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=trunk", "trunk_gb=0"), stop_after=12)
+    folders = [trunk_folder(run, plugins().versions) for run in (first, second)]
+    assert [folder.is_dir() for folder in folders] == [False, True]

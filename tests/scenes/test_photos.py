@@ -1,0 +1,339 @@
+"""Photos without poses: a real reconstruction of synthetic photos against its truth, and everything around it."""
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from synthetic_colmap import shipped
+
+from gsx.core.data.images import image_size, write_image
+from gsx.core.data.scene import Scene
+from gsx.core.errors import ConfigError, InputError
+from gsx.experiments.runs.config import typed
+from gsx.scenes import photos, sfm
+from gsx.scenes.photos import PhotosOptions, find_photos, load, reconstruct
+
+CAPTURES = Path(__file__).parents[3] / "shared" / "scenes"  # real ones, where a developer has them
+FRAMES = 5
+STRANGER = "stranger.png"
+
+
+def options(folder: Path, **changes: Any) -> PhotosOptions:
+    """The shipped configuration with changes."""
+    values = shipped("photos") | {"path": str(folder), "num_threads": 1} | changes
+    made = typed(PhotosOptions, values, "scene")
+    assert isinstance(made, PhotosOptions)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Photos of patches on a sphere, and one of another size without them; true camera centres by name."""
+    folder = tmp_path_factory.mktemp("capture") / "garden" / "images"
+    folder.mkdir(parents=True)
+    pycolmap.set_random_seed(0)
+    settings = pycolmap.SyntheticDatasetOptions()
+    settings.num_rigs, settings.num_frames_per_rig, settings.num_points3D = 1, FRAMES, 100
+    settings.camera_width, settings.camera_height, settings.camera_params = 640, 480, [800, 320, 240, 0]
+    settings.num_points2D_without_point3D = 0
+    truth = pycolmap.synthesize_dataset(settings)
+    pycolmap.synthesize_images(pycolmap.SyntheticImageOptions(), truth, folder)
+    write_image(folder / STRANGER, torch.rand(3, 600, 400, generator=torch.Generator().manual_seed(0)))
+    return folder.parent, {image.name: image.projection_center() for image in truth.images.values()}
+
+
+@pytest.fixture(scope="module")
+def reconstructed(capture: tuple[Path, Any], tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Scene, Path]]:
+    """The scene of the capture, and the cache that keeps its reconstruction."""
+    kept = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GSX_CACHE", str(kept))
+        patch.setattr(sfm, "LOG_SECONDS", 0.01)  # looks at the database while COLMAP writes it, as often as it can
+        yield load(options(capture[0])), kept
+
+
+# the real thing
+
+
+def test_cameras_come_out_where_they_were(reconstructed: tuple[Scene, Path], capture: tuple[Path, Any]) -> None:
+    scene, truth = reconstructed[0], capture[1]
+    found = {view.name: view.camera.centre.numpy() for view in (*scene.train, *scene.test)}
+    assert found.keys() == truth.keys()
+    names = sorted(found)
+    estimated, true = (np.array([centres[name] for name in names]) for centres in (found, truth))
+    similarity = pycolmap.estimate_sim3d(estimated, true)
+    moved = np.array([similarity * centre for centre in estimated])
+    assert np.linalg.norm(moved - true, axis=1).max() < 0.05  # of a distance of 5 from the sphere
+
+
+def test_scene_tells_what_became_of_the_photos(reconstructed: tuple[Scene, Path]) -> None:
+    scene = reconstructed[0]
+    assert scene.name == "garden"
+    assert any(note.startswith(f"Reconstructed {FRAMES} of {FRAMES + 1} photos: ") for note in scene.notes)
+    assert f"Photos that could not be placed are not used (1): {STRANGER}." in scene.notes
+    assert scene.provenance["format"] == "photos"
+    assert scene.provenance["sfm"]["max_features"] == 4096
+    assert scene.train[0].image().shape[0] == 3
+
+
+def test_reconstruction_is_found_again(
+    reconstructed: tuple[Scene, Path], capture: tuple[Path, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("must not be computed again")
+
+    scene, kept = reconstructed
+    monkeypatch.setenv("GSX_CACHE", str(kept))
+    monkeypatch.setattr(sfm, "reconstruct", refuse)
+    again = load(options(capture[0] / "images", num_threads=2, downscale=2))  # options that decide nothing
+    assert torch.equal(again.points.positions, scene.points.positions)
+    with pytest.raises(AssertionError, match="computed again"):
+        load(options(capture[0], max_features=4095))
+
+
+def test_same_seed_gives_the_same_bytes(reconstructed: tuple[Scene, Path], capture: tuple[Path, Any]) -> None:
+    folder = capture[0] / "images"
+    sizes = {name: image_size(folder / name) for name in find_photos(folder)[1]}
+    model = reconstruct(folder, sizes, options(folder, num_threads=2))
+    (first,) = (reconstructed[1] / "sfm").iterdir()
+    assert model != first
+    assert {file.name for file in model.iterdir()} == {file.name for file in first.iterdir()}
+    for file in model.iterdir():
+        assert file.read_bytes() == (first / file.name).read_bytes(), file.name
+
+
+def test_photos_without_texture_are_refused_with_the_remedy(tmp_path: Path, cache: Path) -> None:
+    for number in range(3):
+        write_image(tmp_path / f"{number}.png", torch.full((3, 64, 64), 0.5))
+    with pytest.raises(InputError, match=r"None of the 3 photos.*overlap.*max_feature_size"):
+        load(options(tmp_path))
+    assert not list((cache / "sfm").iterdir())
+
+
+@pytest.mark.slow
+def test_fifty_real_photos() -> None:
+    if not (CAPTURES / "fox").is_dir():
+        pytest.skip("the capture fox is not here")
+    scene = load(options(CAPTURES / "fox" / "images", num_threads=0))
+    assert len(scene.train) + len(scene.test) >= 45
+    assert len(scene.points) > 8000
+
+
+# finding photos
+
+
+def test_photos_are_found_in_the_folder_its_images_or_below(tmp_path: Path) -> None:
+    for name in (
+        "direct/b.JPG",
+        "direct/a.png",
+        "nested/images/c.jpeg",
+        "nested/images/d.tif",
+        "deep/l/1.png",
+        "deep/r/1.png",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_photos(tmp_path / "direct") == (tmp_path / "direct", ["a.png", "b.JPG"])
+    assert find_photos(tmp_path / "nested") == (tmp_path / "nested" / "images", ["c.jpeg", "d.tif"])
+    assert find_photos(tmp_path / "deep") == (tmp_path / "deep", ["l/1.png", "r/1.png"])
+
+
+def test_hidden_files_are_no_photos(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg", "._a.jpg"):  # the last kind is what macOS leaves on foreign disks
+        (tmp_path / name).touch()
+    assert find_photos(tmp_path)[1] == ["a.jpg", "b.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [([], "0 photos.*nothing"), (["a.heic", "b.heic"], r"0 photos.*\.heic.*JPEG"), (["a.jpg"], "1 photos.*at least 2")],
+)
+def test_too_few_photos_are_refused_with_what_was_found(tmp_path: Path, names: list[str], said: str) -> None:
+    for name in names:
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=said):
+        load(options(tmp_path))
+
+
+def test_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere"):
+        load(options(tmp_path / "nowhere"))
+
+
+def test_photos_that_cannot_be_read_are_skipped_and_named(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_image(tmp_path / name, torch.zeros(3, 8, 9))
+    (tmp_path / "broken.jpg").write_bytes(b"no image")
+    sizes, notes = photos.readable_sizes(tmp_path, find_photos(tmp_path)[1])
+    assert sizes == {"a.png": (9, 8), "b.png": (9, 8)}
+    assert notes == ["Skipped 1 photos that cannot be read: broken.jpg."]
+    (tmp_path / "b.png").write_bytes(b"")
+    with pytest.raises(InputError, match="Only 1 of the 3 photos"):
+        load(options(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"matcher": "exhaustiv"}, r"scene\.matcher.*Did you mean 'exhaustive'"),
+        ({"camera_mode": "singel"}, "Did you mean 'single'"),
+        ({"camera_model": "SIMPLE_RADAL"}, "Did you mean 'SIMPLE_RADIAL'"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "use one of"),
+    ],
+)
+def test_unknown_words_are_refused_before_anything_is_read(tmp_path: Path, change: dict[str, str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load(options(tmp_path, **change))
+
+
+# the cache
+
+
+def two_photos(folder: Path) -> dict[str, tuple[int, int]]:
+    for name in ("a.png", "b.png"):
+        write_image(folder / name, torch.zeros(3, 8, 9))
+    return {"a.png": (9, 8), "b.png": (9, 8)}
+
+
+def test_interrupted_reconstruction_leaves_nothing_behind(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(folder: Path, sizes: Any, chosen: Any, work: Path) -> None:
+        (work / "model").mkdir()
+        (work / "model" / "cameras.bin").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sfm, "reconstruct", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(tmp_path, two_photos(tmp_path), options(tmp_path))
+    assert not list((cache / "sfm").iterdir())
+
+
+class StubModel:
+    """What `sfm.reconstruct` returns, reduced to what is asked of it."""
+
+    def num_reg_images(self) -> int:
+        return 2
+
+    def write_binary(self, folder: Path) -> None:
+        (folder / "cameras.bin").write_bytes(b"mine")
+
+
+def test_another_process_that_finishes_first_wins(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def overtaken(folder: Path, sizes: Any, chosen: Any, work: Path) -> StubModel:
+        final = work.parent / work.name.partition(".partial")[0]
+        final.mkdir()
+        (final / "cameras.bin").write_bytes(b"theirs")
+        return StubModel()
+
+    monkeypatch.setattr(sfm, "reconstruct", overtaken)
+    final = reconstruct(tmp_path, two_photos(tmp_path), options(tmp_path))
+    assert (final / "cameras.bin").read_bytes() == b"theirs"
+    assert list((cache / "sfm").iterdir()) == [final]
+
+
+def test_a_replaced_photo_is_reconstructed_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: StubModel())
+    sizes = two_photos(tmp_path)
+    before = reconstruct(tmp_path, sizes, options(tmp_path))
+    assert (before / "cameras.bin").read_bytes() == b"mine"
+    assert reconstruct(tmp_path, sizes, options(tmp_path)) == before
+    os.utime(tmp_path / "b.png", ns=(0, 0))
+    assert reconstruct(tmp_path, sizes, options(tmp_path)) != before
+
+
+# the stages
+
+
+def camera_numbers(folder: Path, sizes: sfm.Sizes, camera_mode: str) -> list[int]:
+    for name, (width, height) in sizes.items():
+        write_image(folder / name, torch.zeros(3, height, width))
+    sfm.import_photos(folder / "database.db", folder, sizes, options(folder, camera_mode=camera_mode))
+    with pycolmap.Database.open(folder / "database.db") as database:
+        images = database.read_all_images()
+    assert {image.name for image in images} == set(sizes)
+    return [image.camera_id for image in sorted(images, key=lambda image: image.name)]
+
+
+SIZES = {"a.png": (40, 30), "b.png": (30, 40), "c.png": (40, 30), "d.png": (40, 30)}
+
+
+def test_photos_of_one_size_share_a_camera(tmp_path: Path) -> None:
+    first, second, *rest = camera_numbers(tmp_path, SIZES, "auto")
+    assert first != second
+    assert rest == [first, first]
+
+
+def test_every_photo_can_have_its_camera(tmp_path: Path) -> None:
+    assert len(set(camera_numbers(tmp_path, SIZES, "per_image"))) == 4
+
+
+def test_one_camera_for_photos_of_two_sizes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"30x40 \(b.png\), 40x30 \(a.png\).*camera_mode=auto"):
+        camera_numbers(tmp_path, SIZES, "single")
+
+
+@pytest.mark.parametrize(("count", "matcher"), [(2, "auto"), (9, "auto"), (3, "sequential"), (9, "sequential")])
+def test_pairs_are_counted_as_colmap_makes_them(tmp_path: Path, count: int, matcher: str) -> None:
+    chosen = options(tmp_path, matcher=matcher, overlap=3)
+    camera_numbers(tmp_path, {f"{number}.png": (8, 8) for number in range(count)}, "auto")
+    generators = {"exhaustive": pycolmap.ExhaustivePairGenerator, "sequential": pycolmap.SequentialPairGenerator}
+    kind = sfm.chosen_matcher(count, chosen)
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        pairs = generators[kind](sfm.pairing_options(kind, 3), database).all_pairs()
+    assert sfm.pair_count(count, chosen) == len({tuple(sorted(pair)) for pair in pairs})
+
+
+def test_auto_gives_up_on_every_pair_beyond_the_limit(tmp_path: Path) -> None:
+    chosen = options(tmp_path, exhaustive_limit=20)
+    assert [sfm.chosen_matcher(count, chosen) for count in (20, 21)] == ["exhaustive", "sequential"]
+    assert sfm.chosen_matcher(21, options(tmp_path, matcher="exhaustive")) == "exhaustive"
+
+
+def test_progress_is_logged_with_stage_count_and_time(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "LOG_SECONDS", 0.01)
+    with caplog.at_level(logging.INFO):
+        assert sfm.watched("matches of pairs", lambda token: time.sleep(0.1) or 42, lambda: 7, 9) == 42
+    assert any(line.startswith("sfm: matches of pairs 7/9, ") for line in caplog.messages)
+    assert caplog.messages[-1].startswith("sfm: matches of pairs done")
+
+
+def test_interruption_cancels_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sfm, "LOG_SECONDS", 0.01)
+    cancelled: list[bool] = []
+
+    def work(token: Any) -> None:
+        until = time.monotonic() + 10
+        while not token.is_cancelled and time.monotonic() < until:
+            time.sleep(0.01)
+        cancelled.append(token.is_cancelled)
+
+    def interrupt() -> int:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm.watched("features", work, interrupt, 1)
+    assert cancelled == [True]
+
+
+def test_error_of_a_stage_comes_through() -> None:
+    def fail(token: Any) -> None:
+        raise ValueError("no such thing")
+
+    with pytest.raises(ValueError, match="no such thing"):
+        sfm.watched("features", fail, lambda: 0, 1)

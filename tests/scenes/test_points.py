@@ -1,0 +1,61 @@
+"""Initial points against hand-worked bounds and files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsx.core.errors import InputError
+from gsx.core.gaussians.ply import write_ply
+from gsx.scenes.points import random_points, read_points
+
+
+def test_random_points_fill_the_box_evenly() -> None:
+    low, high = torch.tensor([-1.0, 0.0, 5.0]), torch.tensor([1.0, 0.5, 9.0])
+    cloud = random_points(20000, low, high, torch.Generator().manual_seed(3))
+    share = (cloud.positions - low) / (high - low)
+    assert cloud.positions.dtype == torch.float32
+    assert 0 <= share.min() < 0.001
+    assert 0.999 < share.max() <= 1
+    # an axis' mean has standard error 0.002, its variance is 1/12
+    assert (share.mean(0) - 0.5).abs().max() < 0.01
+    assert (share.var(0) - 1 / 12).abs().max() < 0.003
+    assert cloud.colours.unique().tolist() == [127]
+
+
+def test_random_points_depend_on_the_seed_alone() -> None:
+    corner = torch.ones(3)
+    first, again, other = (
+        random_points(5, -corner, corner, torch.Generator().manual_seed(seed)).positions for seed in (1, 1, 2)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize(("count", "high"), [(0, 1.0), (10, -1.0)])
+def test_impossible_random_points_are_refused(count: int, high: float) -> None:
+    with pytest.raises(InputError, match=r"scene\.random_points"):
+        random_points(count, -torch.ones(3), torch.full((3,), high), torch.Generator())
+
+
+def test_points_of_a_file(tmp_path: Path) -> None:
+    columns = {axis: np.array([1.0, np.nan, 3.0]) * scale for axis, scale in zip("xyz", (1, 10, 100), strict=True)}
+    colours = {name: np.array([level, 0, 255 - level], np.uint8) for level, name in enumerate(("red", "green", "blue"))}
+    write_ply(tmp_path / "a.ply", columns | colours)
+    cloud = read_points(tmp_path / "a.ply")
+    assert cloud.positions.tolist() == [[1, 10, 100], [3, 30, 300]]
+    assert cloud.colours.tolist() == [[0, 1, 2], [255, 254, 253]]
+    write_ply(tmp_path / "b.ply", columns)
+    assert read_points(tmp_path / "b.ply").colours.unique().tolist() == [127]
+    write_ply(tmp_path / "c.ply", columns | {name: np.full(3, 0.5) for name in colours})  # not of 8 bits
+    assert read_points(tmp_path / "c.ply").colours.unique().tolist() == [127]
+
+
+def test_files_without_usable_points_are_refused(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(2)})
+    with pytest.raises(InputError, match="no x, y, z but x, y"):
+        read_points(tmp_path / "a.ply")
+    write_ply(tmp_path / "b.ply", {axis: np.full(2, np.inf) for axis in "xyz"})
+    with pytest.raises(InputError, match="no point with finite coordinates"):
+        read_points(tmp_path / "b.ply")

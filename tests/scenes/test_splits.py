@@ -1,0 +1,99 @@
+"""Splits against lists worked out by hand from the published rule."""
+
+from pathlib import Path
+
+import pytest
+
+from gsx.core.errors import ConfigError, InputError
+from gsx.scenes.splits import split_names
+
+NAMES = [f"{i:02d}.jpg" for i in range(17)]
+
+
+def test_every_eighth_of_the_sorted_names_is_test() -> None:
+    shuffled = NAMES[5:] + NAMES[:5]
+    train, test = split_names(shuffled, "every:8")
+    assert [shuffled[i] for i in test] == ["00.jpg", "08.jpg", "16.jpg"]
+    assert [shuffled[i] for i in train] == [n for n in NAMES if n not in ("00.jpg", "08.jpg", "16.jpg")]
+
+
+def test_sorting_is_by_base_name_without_suffix() -> None:
+    # '-' sorts before '.', so whole file names would put a-1.png before a.png; folders do not count either
+    names = ["x/b.png", "y/a.png", "z/a-1.png"]
+    train, test = split_names(names, "every:2")
+    assert [names[i] for i in test] == ["y/a.png", "x/b.png"]
+    assert [names[i] for i in train] == ["z/a-1.png"]
+
+
+def test_none_trains_on_everything() -> None:
+    assert split_names(["b", "a"], "none") == ([1, 0], [])
+
+
+def test_counts_spread_evenly_and_never_overlap() -> None:
+    train, test = split_names(NAMES[:8], "counts:3,2")
+    assert test == [2, 6]  # the middles of two parts of four
+    assert train == [1, 4, 7]  # 0 1 3 4 5 7 in three parts of two
+    train, test = split_names(NAMES, "counts:13,4")
+    assert sorted(train + test) == list(range(17))
+
+
+def test_files_name_images_with_or_without_suffix(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("02\n00.jpg\n\n")
+    (tmp_path / "test.txt").write_text("01.jpg\n")
+    assert split_names(NAMES, "files:train.txt,test.txt", tmp_path) == ([0, 2], [1])
+    absolute = f"files:{tmp_path / 'train.txt'}, {tmp_path / 'test.txt'}"
+    assert split_names(NAMES, absolute) == ([0, 2], [1])
+
+
+def test_whole_names_win_over_stems(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("a.jpg\n")
+    (tmp_path / "test.txt").write_text("b\n")
+    assert split_names(["a.jpg", "a.jpg.png", "b.png"], "files:train.txt,test.txt", tmp_path) == ([0], [2])
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        ("00\n", None, "does not exist"),
+        ("00\n", "00.jpg\n", "'00.jpg' is listed in both"),
+        ("00\n", "99.jpg\n", "'99.jpg' in .* is no image of the scene"),
+        ("00\n", "\n", "1 training and 0 test images of 17"),
+    ],
+)
+def test_unusable_split_files_are_refused(tmp_path: Path, train: str, test: str | None, message: str) -> None:
+    (tmp_path / "train.txt").write_text(train)
+    if test is not None:
+        (tmp_path / "test.txt").write_text(test)
+    with pytest.raises(InputError, match=message):
+        split_names(NAMES, "files:train.txt,test.txt", tmp_path)
+
+
+def test_a_stem_that_fits_several_images_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("a\n")
+    (tmp_path / "test.txt").write_text("b\n")
+    with pytest.raises(InputError, match=r"'a' in .* fits several images"):
+        split_names(["a.jpg", "a.png", "b.png"], "files:train.txt,test.txt", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "rule", ["evry:8", "every", "every:0", "every:-1", "every:2.5", "none:1", "counts:5", "files:a,", ""]
+)
+def test_unreadable_rules_are_refused(rule: str) -> None:
+    with pytest.raises(ConfigError, match=r"scene\.split is"):
+        split_names(NAMES, rule)
+
+
+def test_a_typo_gets_a_suggestion() -> None:
+    with pytest.raises(ConfigError, match=r"Did you mean 'every:K'\?"):
+        split_names(NAMES, "evry:8")
+
+
+@pytest.mark.parametrize(("names", "rule"), [(NAMES, "every:1"), (NAMES[:1], "every:8"), ([], "none")])
+def test_empty_splits_are_refused(names: list[str], rule: str) -> None:
+    with pytest.raises(InputError, match="at least one"):
+        split_names(names, rule)
+
+
+def test_asking_for_more_images_than_there_are() -> None:
+    with pytest.raises(InputError, match=r"15 \+ 3 images and the scene has 17"):
+        split_names(NAMES, "counts:15,3")

@@ -1,0 +1,273 @@
+"""transforms.json scenes against cameras, lenses and dots placed by hand."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from synthetic_colmap import shipped
+
+from gsx.core.data.images import write_image
+from gsx.core.data.scene import Scene, View
+from gsx.core.errors import InputError
+from gsx.core.gaussians.ply import write_ply
+from gsx.scenes.transforms import TransformsOptions, load
+
+WIDTH, HEIGHT = 120, 90
+COMMON = {"fl_x": 110.0, "fl_y": 100.0, "cx": 63.0, "cy": 41.0, "w": 120.0, "h": 90.0}
+BENT = {"k1": 0.12, "k2": -0.05, "p1": 0.004, "p2": -0.006}
+# look along +y with z up: right is +x, up is +z, back is -y
+POSES = [[[1, 0, 0, x], [0, 0, -1, -4], [0, 1, 0, 0.5 * x], [0, 0, 0, 1]] for x in (-1.0, 0.0, 1.0)]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+
+
+def write(folder: Path, poses: list[Any] = POSES, image: torch.Tensor | None = None, **content: Any) -> None:
+    (folder / "images").mkdir(exist_ok=True)
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose} for i, pose in enumerate(poses)]
+    file = COMMON | {"frames": frames} | content
+    (folder / "transforms.json").write_text(json.dumps({k: v for k, v in file.items() if v is not None}))
+    for i in range(len(poses)):
+        write_image(folder / "images" / f"{i}.png", torch.zeros(3, HEIGHT, WIDTH) if image is None else image)
+
+
+def frame_changes(**changes: Any) -> list[dict[str, Any]]:
+    """The standard frames, the second one with changes."""
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose} for i, pose in enumerate(POSES)]
+    frames[1] |= changes
+    return frames
+
+
+def options(folder: Path, **changes: Any) -> TransformsOptions:
+    """The shipped configuration with changes."""
+    small = {"path": str(folder), "random_points": 50}
+    merged = OmegaConf.merge(OmegaConf.structured(TransformsOptions), shipped("transforms"), small, changes)
+    made = OmegaConf.to_object(merged)
+    assert isinstance(made, TransformsOptions)
+    return made
+
+
+def views(scene: Scene) -> list[View]:
+    return sorted([*scene.train, *scene.test], key=lambda view: view.name)
+
+
+def dot(x: float, y: float) -> torch.Tensor:
+    """A bell of sigma 1.5 px at (x, y), pixel centres at +0.5."""
+    columns, rows = torch.arange(WIDTH) + 0.5 - x, torch.arange(HEIGHT) + 0.5 - y
+    return torch.exp(-(columns[None] ** 2 + rows[:, None] ** 2) / 4.5).expand(3, HEIGHT, WIDTH)
+
+
+def centroid(image: torch.Tensor) -> torch.Tensor:
+    weight = image[0].double()
+    columns, rows = torch.arange(image.shape[2]) + 0.5, torch.arange(image.shape[1]) + 0.5
+    return torch.stack([(weight * columns).sum(), (weight * rows[:, None]).sum()]) / weight.sum()
+
+
+def bend(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float = 0.0) -> tuple[float, float]:
+    """Brown's lens model on the plane at depth 1, as OpenCV documents it."""
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return bent_x, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+def test_points_project_where_the_hand_says(tmp_path: Path) -> None:
+    write(tmp_path)
+    camera = views(load(options(tmp_path)))[2].camera
+    # the camera at (1, -4, 0.5) sees (2, 0, 0) 4 ahead, 1 to the right, 0.5 down
+    pixel, depth = camera.project(torch.tensor([[2.0, 0.0, 0.0]]))
+    torch.testing.assert_close(pixel, torch.tensor([[63 + 110 / 4, 41 + 100 * 0.5 / 4]]))
+    assert depth.tolist() == [4]
+
+
+@pytest.mark.parametrize("further", [{}, {"k3": 0.03}])
+@pytest.mark.parametrize("point", [(0.9, 0.0, 0.8), (-1.2, 1.0, -0.6), (0.1, -1.0, 0.0)])
+def test_a_dot_of_a_bent_lens_lands_where_the_pinhole_says(
+    tmp_path: Path, point: tuple[float, float, float], further: dict[str, float]
+) -> None:
+    ahead, right, up = point[1] + 4, point[0], point[2]  # from the middle camera at (0, -4, 0)
+    x, y = bend(right / ahead, -up / ahead, **BENT, **further)
+    write(tmp_path, image=dot(63 + 110 * x, 41 + 100 * y), camera_model="OPENCV", **BENT, **further)
+    scene = load(options(tmp_path))
+    view = views(scene)[1]
+    pixel, _ = view.camera.project(torch.tensor([point], dtype=torch.float64))
+    assert (centroid(view.image()) - pixel[0]).abs().max() < 0.02
+    assert any("undistorted" in note for note in scene.notes)
+
+
+def test_pycolmap_agrees_on_the_bent_lens(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=[110, 100, 63, 41, *BENT.values()])
+    at = lens.img_from_cam(np.array([[0.3, -0.2, 1.0]]))[0]
+    x, y = bend(0.3, -0.2, **BENT)
+    np.testing.assert_allclose(at, [63 + 110 * x, 41 + 100 * y], atol=1e-9)
+
+
+def test_reduced_photos_of_a_bent_lens(tmp_path: Path) -> None:
+    x, y = bend(0.9 / 4, -0.2, **BENT)
+    bell = dot((63 + 110 * x) / 2, (41 + 100 * y) / 2)[:, :45, :60]
+    write(tmp_path, image=bell, **BENT)
+    view = views(load(options(tmp_path)))[1]
+    pixel, _ = view.camera.project(torch.tensor([[0.9, 0.0, 0.8]], dtype=torch.float64))
+    assert view.camera.width < 62
+    assert (centroid(view.image()) - pixel[0]).abs().max() < 0.02
+
+
+def test_photos_of_another_size_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, image=torch.zeros(3, 120, 90))
+    with pytest.raises(InputError, match=r"0\.png' is 90 x 120 and the camera model says 120 x 90"):
+        load(options(tmp_path))
+
+
+def test_one_frame_may_have_its_own_camera(tmp_path: Path) -> None:
+    write(tmp_path, frames=frame_changes(fl_x=200.0, cy=50.0))
+    first, second, _ = (view.camera for view in views(load(options(tmp_path))))
+    assert (first.fx, first.fy, first.cx, first.cy) == (110, 100, 63, 41)
+    assert (second.fx, second.fy, second.cx, second.cy) == (200, 100, 63, 50)
+
+
+def test_angles_of_view_stand_in_for_focal_lengths(tmp_path: Path) -> None:
+    angles = {"camera_angle_x": 2 * math.atan(0.5), "camera_angle_y": 2 * math.atan(0.25)}
+    write(tmp_path, fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, **angles)
+    camera = views(load(options(tmp_path)))[0].camera
+    assert (camera.fx, camera.fy) == (pytest.approx(120), pytest.approx(180))
+    assert (camera.cx, camera.cy) == (60, 45)
+    write(tmp_path, fl_x=None, fl_y=None, camera_angle_x=angles["camera_angle_x"])
+    camera = views(load(options(tmp_path)))[0].camera
+    assert (camera.fx, camera.fy) == (pytest.approx(120), pytest.approx(120))
+
+
+def test_simple_pinhole_has_one_focal_length(tmp_path: Path) -> None:
+    write(tmp_path, camera_model="SIMPLE_PINHOLE")
+    camera = views(load(options(tmp_path)))[0].camera
+    assert (camera.fx, camera.fy) == (110, 110)
+
+
+def test_centred_principal_point(tmp_path: Path) -> None:
+    write(tmp_path)
+    camera = views(load(options(tmp_path, principal_point="centred")))[0].camera
+    assert (camera.cx, camera.cy) == (60, 45)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE.*scene=colmap"),
+        ({"camera_model": "PINHOL"}, r"camera_model PINHOL,.*Did you mean 'PINHOLE'\?"),
+        ({"is_fisheye": True}, "camera_model OPENCV_FISHEYE"),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "is PINHOLE and has distortion"),
+        ({"k1": 0.1, "k4": 0.2}, "has distortion k4"),
+        ({"fl_x": None}, "neither fl_x nor camera_angle_x"),
+        ({"fl_x": -5.0}, "focal lengths -5, 100"),
+        ({"fl_x": math.nan}, "fl_x nan"),
+        ({"cx": "middle"}, "cx 'middle'"),
+        ({"w": 0}, "size 0 x 90"),
+        ({"frames": frame_changes(transform_matrix=None)}, "pose that is no matrix"),
+        ({"frames": frame_changes(transform_matrix=[[math.inf] * 4] * 4)}, "finite numbers"),
+    ],
+)
+def test_cameras_that_cannot_be_used_are_refused_by_name(tmp_path: Path, content: dict[str, Any], message: str) -> None:
+    write(tmp_path, **content)
+    with pytest.raises(InputError, match=rf"Frame 'images/\d\.png' of .*transforms\.json' .*{message}"):
+        load(options(tmp_path))
+
+
+def test_missing_photos_are_named_and_skipped(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "images" / "1.png").unlink()
+    scene = load(options(tmp_path, split="none"))
+    assert [view.name for view in scene.train] == ["images/0.png", "images/2.png"]
+    assert any("Skipped 1 of the 3 images" in note and "images/1.png" in note for note in scene.notes)
+    (tmp_path / "images" / "0.png").unlink()
+    with pytest.raises(InputError, match="at least 2 images"):
+        load(options(tmp_path, split="none"))
+    (tmp_path / "images" / "2.png").unlink()
+    with pytest.raises(InputError, match=r"None of the 3 images .*images/0\.png, images/1\.png, images/2\.png"):
+        load(options(tmp_path))
+
+
+def test_the_files_own_split(tmp_path: Path) -> None:
+    lists = {"train_filenames": ["images/2.png", "images/0.png"], "test_filenames": ["./images/1.png"]}
+    write(tmp_path, **lists)
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.train] == ["images/0.png", "images/2.png"]
+    assert [view.name for view in scene.test] == ["images/1.png"]
+    assert [view.name for view in load(options(tmp_path, split="every:8")).test] == ["images/0.png"]
+    write(tmp_path, train_filenames=lists["train_filenames"], val_filenames=["images/1.png"])
+    assert [view.name for view in load(options(tmp_path)).test] == ["images/1.png"]
+
+
+def test_without_lists_every_eighth_is_held_out(tmp_path: Path) -> None:
+    write(tmp_path)
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.test] == ["images/0.png"]
+    assert any("every:8" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        (["images/0.png", "images/7.png"], ["images/1.png"], r"train_filenames of .* names 'images/7\.png'"),
+        (["images/0.png", "images/1.png"], ["images/1.png"], r"'images/1\.png' is in train_filenames and test"),
+        (["images/0.png", "images/1.png"], [], "names no image"),
+        (["images/0.png"], ["images/1.png"], "at least 2 images"),
+    ],
+)
+def test_unusable_lists_are_refused(tmp_path: Path, train: list[str], test: list[str], message: str) -> None:
+    write(tmp_path, train_filenames=train, test_filenames=test)
+    with pytest.raises(InputError, match=message):
+        load(options(tmp_path))
+
+
+def test_random_points_fill_the_cube_around_the_cameras(tmp_path: Path) -> None:
+    write(tmp_path)
+    positions = load(options(tmp_path, random_points=3000)).points.positions
+    # centres span [-1, 1] x {-4} x [-0.5, 0.5]: the cube has edge 2 around (0, -4, 0)
+    torch.testing.assert_close(positions.amin(0), torch.tensor([-1.0, -5, -1]), atol=0.01, rtol=0)
+    torch.testing.assert_close(positions.amax(0), torch.tensor([1.0, -3, 1]), atol=0.01, rtol=0)
+
+
+def test_points_come_from_the_file_it_names(tmp_path: Path) -> None:
+    write_ply(tmp_path / "sparse.ply", {axis: np.array([1.0, 2.0]) for axis in "xyz"})
+    write(tmp_path, ply_file_path="sparse.ply", applied_transform=[[0, 1, 0, 9], [1, 0, 0, 9], [0, 0, 1, 9]])
+    scene = load(options(tmp_path))
+    assert scene.points.positions.tolist() == [[1, 1, 1], [2, 2, 2]]
+    centre = views(scene)[0].camera.centre
+    torch.testing.assert_close(centre, torch.tensor([-1.0, -4, -0.5], dtype=torch.float64))
+    assert len(load(options(tmp_path, points="random")).points) == 50
+
+
+def test_cameras_in_one_place_need_points(tmp_path: Path) -> None:
+    write(tmp_path, poses=[POSES[0]] * 3)
+    with pytest.raises(InputError, match=r"scene\.points to a PLY file"):
+        load(options(tmp_path))
+
+
+def test_path_may_be_the_file(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "raw.json")
+    assert len(views(load(options(tmp_path / "raw.json")))) == 3
+    with pytest.raises(InputError, match=r"transforms\.json' does not exist"):
+        load(options(tmp_path))
+    (tmp_path / "transforms_train.json").write_text("{}")
+    with pytest.raises(InputError, match="scene=blender"):
+        load(options(tmp_path))
+
+
+def test_masks_are_mentioned(tmp_path: Path) -> None:
+    write(tmp_path, frames=frame_changes(mask_path="masks/1.png"))
+    assert any("masks of 1 images" in note for note in load(options(tmp_path)).notes)
+
+
+def test_provenance_is_json(tmp_path: Path) -> None:
+    write(tmp_path, **BENT)
+    provenance = json.loads(json.dumps(load(options(tmp_path)).provenance))
+    assert provenance["format"] == "transforms"
+    assert provenance["undistortion"]
