@@ -12,8 +12,8 @@ import gsx.augmenters.pseudo_details as pseudo_details
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import main, plugins
 from gsx.core.quality.metrics import psnr
-from gsx.core.training.material import rendered
 from gsx.core.training.regenerator import Material, Request, displacement
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train
 from gsx.experiments.runs.config import compose
@@ -73,7 +73,8 @@ def seen(run: Run) -> Seen:
     shift: dict[int, float] = {}
     cameras = [(view.source, view.camera) for view in run.scene.train[::3]]
     for factor in (1, 2, 4):
-        pairs = [(rendered(run, c.zoom(factor)), source.image(c.zoom(factor)).float() / 255) for source, c in cameras]
+        zoomed = [(source, camera.zoom(factor)) for source, camera in cameras]
+        pairs = [(render(run, camera).image, source.image(camera).float() / 255) for source, camera in zoomed]
         quality[factor] = sum(psnr(image, truth) for image, truth in pairs) / len(pairs)
         shift[factor] = sum(displacement(image, truth) for image, truth in pairs) / len(pairs)
     return Seen(quality, shift)

@@ -13,14 +13,15 @@ from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import plugins
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import read_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
-from gsx.core.training.material import coverage, rendered
 from gsx.core.training.pseudo_views import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.training.regenerator import Material
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
 from gsx.experiments.runs.config import compose
@@ -63,10 +64,17 @@ def gradients(run: Run) -> dict[str, Tensor]:
     return {name: gradient.clone() for name, gradient in run.backbone.gradients()}
 
 
+def picture(run: Run, camera: Camera) -> Tensor:
+    """What the next step sees."""
+    splats = run.backbone.draw(camera, run.step + 1).splats
+    return rasterize(splats, camera, run.raster, background=run.background).image
+
+
 def own_loss(run: Run, view: int) -> Tensor:
     camera, truth = run.scene.train[view].camera, run.scene.train[view].image()
-    image = rasterize(run.backbone.splats(camera), camera, run.raster, background=run.background).image
-    extra = run.backbone.regulariser()
+    drawn = run.backbone.draw(camera, run.step + 1)
+    image = rasterize(drawn.splats, camera, run.raster, background=run.background).image
+    extra = run.backbone.regulariser(drawn)
     loss = photometric(image, truth, 0.2)
     return loss if extra is None else loss + extra
 
@@ -89,10 +97,7 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
     run.backbone.discard()
     views = augmenter_of(run).views[picked]
     assert len(views) == 3
-    losses = [
-        pseudo_loss(rasterize(run.backbone.splats(v.camera), v.camera, run.raster, background=run.background).image, v)
-        for v in views
-    ]
+    losses = [pseudo_loss(picture(run, view.camera), view) for view in views]
     weight = taken or 1.0
     pseudo = weight * torch.stack(losses).mean()
     whole = (1 - taken) * own_loss(run, picked) + pseudo
@@ -117,7 +122,7 @@ def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
     """Of the window's render, not of the whole zoomed canvas that it is cut from (spec 1.4, 28)."""
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     view = run.scene.train[0].camera.crop(18, 13, 12, 9).zoom(2)
-    rendering = rasterize(run.backbone.splats(view), view, run.raster)
+    rendering = rasterize(run.backbone.draw(view, run.step + 1).splats, view, run.raster)
     places, depth = view.project(run.backbone.table["means"].detach())  # type: ignore[attr-defined]
     seen = rendering.screen.ids[rendering.screen.visible]
     radii = rendering.screen.radii[rendering.screen.visible].float()
@@ -188,8 +193,7 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     assert torch.equal(views[0].target.float() / 255, run.scene.train[2].image())
     pseudo = torch.zeros(())
     for view in views:
-        image = rasterize(run.backbone.splats(view.camera), view.camera, run.raster, background=run.background).image
-        pseudo = pseudo + 0.16 * (image - view.target.float() / 255).square().mean()
+        pseudo = pseudo + 0.16 * (picture(run, view.camera) - view.target.float() / 255).square().mean()
     assert step.terms["upscale"] == pytest.approx(float(pseudo.detach()), rel=1e-5)
     if background == "true":
         return
@@ -321,7 +325,7 @@ def test_restored_views_show_what_the_model_shows(tmp_path: Path) -> None:
     assert len(views) == 12
     for view in views:
         assert view.camera.size == (19, 14)
-        assert float((rendered(run, view.camera) - view.target.float() / 255).abs().max()) <= 0.5001 / 255
+        assert float((render(run, view.camera).image - view.target.float() / 255).abs().max()) <= 0.5001 / 255
 
 
 def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
@@ -365,8 +369,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     table.columns["anchors"] = spot.expand(len(table), 3).clone()
     table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)
     cameras = [own, *(augmenter_of(run).sketch(run, 44, 0, scale, 0).camera for scale in (2, 4))]
-    backbone.begin(80)
-    drawn = [table["level"][backbone.drawn(camera).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
+    drawn = [table["level"][backbone.visible(camera, 80).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
     assert drawn == [[0, 1], [0, 1, 2], [0, 1, 2, 3]]
 
 
@@ -437,7 +440,7 @@ def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
             table["opacity_logits"].data.copy_(torch.where(places[:, :1] > 16, -30.0, 0.0).view_as(kept))
             augmenter = by_options(run, least_alpha=wanted)
             sketch = augmenter.sketch(run, 44, parent, 4, 0)
-            alphas.append(coverage(run, sketch.inside.of(sketch.seen)))
+            alphas.append(float(render(run, sketch.inside.of(sketch.seen)).alpha.mean()))
             table["opacity_logits"].data.copy_(kept)
         least[wanted] = min(alphas)
     assert least[0.0] < 0.5

@@ -13,7 +13,7 @@ from small_scene import small_scene, spread
 from tiny import tiny_run
 from torch import Tensor
 
-from gsx.backbones.anchors import Anchors, Decay, automatic_voxel, voxel_nodes
+from gsx.backbones.anchors import Anchors, Decay, DrawnAnchors, automatic_voxel, voxel_nodes
 from gsx.cli import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
@@ -63,13 +63,14 @@ def stir(backbone: Anchors) -> None:
             parameter.copy_(noise * 0.3 - 2 if name == "log_scales" else parameter + 0.5 * noise)
 
 
-def render(backbone: Anchors, camera: Camera) -> Rendering:
+def render(backbone: Anchors, camera: Camera, step: int) -> tuple[DrawnAnchors, Rendering]:
     """A picture that counts, with its backward pass."""
-    rendering = rasterize(backbone.splats(camera), camera, backbone.raster, background=torch.zeros(3))
+    drawn = backbone.draw(camera, step)
+    rendering = rasterize(drawn.splats, camera, backbone.raster, background=torch.zeros(3))
     loss = photometric(rendering.image, torch.full_like(rendering.image, 0.5), 0.2)
-    extra = backbone.regulariser()
+    extra = backbone.regulariser(drawn)
     (loss if extra is None else loss + extra).backward()
-    return rendering
+    return drawn, rendering
 
 
 # -- the beginning -----------------------------------------------------------------------------------------------------
@@ -171,7 +172,7 @@ def test_learning_rates_at_the_first_middle_and_last_step(name: str) -> None:
     backbone = small_anchors(name, *options, scene=small_scene(spread(60), extent=3.0))
     steps = 30000 if name == "scaffold" else 40000
     for step in (1, steps // 2, steps, steps + 7):
-        backbone.begin(step)
+        backbone.set_rates(step)
         groups = [*backbone.table.optimiser.param_groups]
         groups += backbone.head_optimiser.param_groups if backbone.head_optimiser else []
         u = min(1.0, step / steps)
@@ -193,15 +194,13 @@ def test_impossible_rates_are_refused() -> None:
 def test_harmonics_join_every_thousand_steps() -> None:
     backbone, camera = small_anchors("octree_gs3d"), small_scene(spread(4)).train[0].camera
     for step, degree in ((1, 0), (999, 0), (1000, 1), (2999, 2), (3000, 3), (40000, 3)):
-        backbone.begin(step)
-        assert backbone.drawn(camera).sh_degree == degree
+        assert backbone.visible(camera, step).sh_degree == degree
 
 
 def test_unused_harmonics_count_their_steps() -> None:
     backbone = small_anchors("octree_gs3d")
-    backbone.begin(1)
-    render(backbone, backbone.cameras[0])
-    backbone.update()
+    render(backbone, backbone.cameras[0], 1)
+    backbone.update(1)
     assert float(backbone.table.optimiser.state[backbone.table["sh_rest"]]["step"]) == 1
     assert not backbone.table["sh_rest"].any()
 
@@ -290,20 +289,19 @@ def test_coarse_levels_are_drawn_and_finer_ones_added(name: str) -> None:
     table.columns["anchors"] = torch.zeros(len(table), 3)
     table.columns["level"] = (rows % 4).to(torch.int16)
     for step, most in ((1, 1), (40000, 3)):
-        backbone.begin(step)
         for power, wanted in ((0, 0), (1, 1), (2, 2), (3, 3), (6, 3)):
             eye = [0.0, -levels.farthest / 2**power, 0.0]
             camera = replace(look_at(eye, [0, 0, 0], fov_x=0.9, width=24, height=16), near=1e-6)
             camera = replace(camera, fx=levels.views.focal, fy=levels.views.focal)
-            found = sorted(set(table["level"][backbone.drawn(camera).rows].tolist()))
+            found = sorted(set(table["level"][backbone.visible(camera, step).rows].tolist()))
             assert found == list(range(min(wanted, most) + 1)), (step, power)
 
 
 def test_training_views_are_known_by_their_camera() -> None:
     backbone = small_anchors("scaffold", "heads.appearance=4")
-    assert [backbone.drawn(camera).view for camera in backbone.cameras] == [0, 1, 2, 3]
-    assert backbone.drawn(backbone.cameras[2].zoom(2)).view == -1
-    assert backbone.drawn(CAMERA).view == -1
+    assert [backbone.visible(camera, 1).view for camera in backbone.cameras] == [0, 1, 2, 3]
+    assert backbone.visible(backbone.cameras[2].zoom(2), 1).view == -1
+    assert backbone.visible(CAMERA, 1).view == -1
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -311,7 +309,6 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
     """No anchor in view, and for networks none with positive opacity: a finite loss with a backward pass."""
     away = look_at([0, -40, 0], [0, -80, 0], fov_x=0.9, width=24, height=16)
     backbone = small_anchors(name)
-    backbone.begin(1)
     cases = [(backbone, away)]
     if name in NEURAL:
         shut = small_anchors(name)
@@ -319,29 +316,27 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
             shut.heads.opacity[2].bias.fill_(-10.0)
         cases.append((shut, shut.cameras[0]))
     for model, camera in cases:
-        model.begin(1000)
-        rendering = render(model, camera)
-        assert len(model.last[0].splats) == 0
-        regulariser = model.regulariser()
+        drawn, rendering = render(model, camera, 1000)
+        assert len(drawn.splats) == 0
+        regulariser = model.regulariser(drawn)
         assert regulariser is None or float(regulariser.detach()) == 0
         assert all(not gradient.any() for _, gradient in model.gradients())
-        model.record(model.observe(rendering, 1000))
-        assert model.table["visits"].sum() == len(model.last[1].rows)
+        model.record(model.observe(drawn, rendering, 1000))
+        assert model.table["visits"].sum() == len(drawn.anchors.rows)
         assert model.adapt(1000) == {}
-        model.update()
+        model.update(1000)
         assert all(torch.isfinite(value).all() for value in model.tensors().values())
 
 
 def test_the_volume_term_is_the_mean_over_what_is_drawn() -> None:
     backbone = small_anchors("scaffold")
-    backbone.begin(1)
-    scales = backbone.splats(backbone.cameras[0]).scales.tolist()
+    drawn = backbone.draw(backbone.cameras[0], 1)
+    scales = drawn.splats.scales.tolist()
     assert 0 < len(scales) < 10 * len(backbone.table)
     wanted = 0.01 * sum(a * b * c for a, b, c in scales) / len(scales)
-    assert backbone.regulariser().item() == pytest.approx(wanted, rel=1e-5)
+    assert backbone.regulariser(drawn).item() == pytest.approx(wanted, rel=1e-5)
     explicit = small_anchors("octree_gs3d")
-    explicit.splats(explicit.cameras[0])
-    assert explicit.regulariser() is None
+    assert explicit.regulariser(explicit.draw(explicit.cameras[0], 1)) is None
 
 
 # -- statistics --------------------------------------------------------------------------------------------------------
@@ -353,15 +348,14 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
     scene = small_scene(spread(60) * 8)
     backbone, camera = small_anchors(name, scene=scene), scene.train[0].camera
     stir(backbone)
-    backbone.begin(1000)
     k, count = backbone.representation.offsets, len(backbone.table)
     names = ("visits", "opacity_sum", "gradient_sum", "gradient_count")
     wanted = [[0.0] * count, [0.0] * count, [0.0] * count * k, [0.0] * count * k]
     for camera in backbone.cameras[:2]:
-        rendering = render(backbone, camera)
-        decoded, drawn = backbone.last
+        drawn, rendering = render(backbone, camera, 1000)
+        decoded = drawn.decoded
         opacity_of = dict(zip(decoded.slots.tolist(), decoded.splats.log_opacities.exp().tolist(), strict=True))
-        for row in drawn.rows.tolist():
+        for row in drawn.anchors.rows.tolist():
             wanted[0][row] += 1
             wanted[1][row] += sum(opacity_of.get(row * k + j, 0.0) for j in range(k))
         screen = rendering.screen
@@ -371,7 +365,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
                 slot = int(decoded.slots[splat])
                 wanted[2][slot] += math.hypot(x * camera.width / 2, y * camera.height / 2)
                 wanted[3][slot] += 1
-        backbone.record(backbone.observe(rendering, 1000))
+        backbone.record(backbone.observe(drawn, rendering, 1000))
         backbone.discard()
     for column, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(backbone.table[column].flatten(), torch.tensor(values))
@@ -383,8 +377,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
 @pytest.mark.parametrize(("step", "counts"), [(500, False), (501, True), (14999, True), (15000, False)])
 def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: bool) -> None:
     backbone = small_anchors("scaffold")
-    backbone.begin(step)
-    backbone.record(backbone.observe(render(backbone, backbone.cameras[0]), step))
+    backbone.record(backbone.observe(*render(backbone, backbone.cameras[0], step), step))
     assert bool(backbone.table["visits"].any()) == counts
 
 
@@ -402,8 +395,7 @@ def judged(name: str, *overrides: str) -> Anchors:
     """After a step at 1600, with statistics that make some anchors grow and the first five go."""
     backbone = small_anchors(name, *overrides)
     stir(backbone)
-    backbone.begin(1600)
-    render(backbone, backbone.cameras[0])
+    render(backbone, backbone.cameras[0], 1600)
     table = backbone.table
     table["gradient_count"][:20] = 50.0
     table["gradient_sum"][:20] = 50.0 * 2.1e-4 if name != "scaffold" else 50.0
@@ -416,9 +408,8 @@ def judged(name: str, *overrides: str) -> Anchors:
 def test_a_growth_step_moves_only_the_networks(name: str) -> None:
     """Parameters made anew have no gradient; new rows have no moments; networks are untouched by the surgery."""
     backbone = judged(name)
-    backbone.update()
-    backbone.begin(1600)
-    render(backbone, backbone.cameras[0])
+    backbone.update(1600)
+    render(backbone, backbone.cameras[0], 1600)
     table, heads = backbone.table, dict(backbone.head_parameters())
     moments = {n: table.optimiser.state[table[n]]["exp_avg"].clone() for n in table.parameters}
     held = {n: p.detach().clone() for n, p in heads.items()}
@@ -429,7 +420,7 @@ def test_a_growth_step_moves_only_the_networks(name: str) -> None:
     assert len(table) == before + done["grown"] - 5
     values = {n: p.detach().clone() for n, p in table.parameters.items()}
     assert all(torch.equal(p.detach(), held[n]) for n, p in heads.items())
-    backbone.update()
+    backbone.update(1600)
     for n, parameter in table.parameters.items():
         assert torch.equal(parameter.detach(), values[n]), n
         state = table.optimiser.state[parameter]
@@ -469,7 +460,6 @@ def test_lengths_are_clamped_in_units_of_the_world_or_the_extent(quirk: str, uni
     backbone = small_anchors("scaffold", f"quirks.clamp={quirk}", scene=scene)
     with torch.no_grad():
         backbone.table["log_scales"].fill_(4.0)
-    backbone.begin(1600)
     backbone.adapt(1600)
     lengths = backbone.table["log_scales"].exp()
     torch.testing.assert_close(lengths[:, 3:], torch.full_like(lengths[:, 3:], unit * math.exp(0.05)))
@@ -479,7 +469,6 @@ def test_lengths_are_clamped_in_units_of_the_world_or_the_extent(quirk: str, uni
 def test_one_camera_has_no_extent_to_clamp_by() -> None:
     scene = small_scene(spread(60), extent=0.0, views=1)
     backbone = small_anchors("scaffold", "fidelity=sane", scene=scene)
-    backbone.begin(1600)
     assert backbone.adapt(1600) == {"grown": 0, "pruned": 0}
 
 
@@ -502,7 +491,6 @@ def test_the_cap_is_never_passed(name: str) -> None:
 ])  # fmt: skip
 def test_the_gate_opens_when_all_levels_train(quirk: str, step: int, opens: bool) -> None:
     backbone = judged("octree_scaffold", f"quirks.gate={quirk}", "levels.count=4")
-    backbone.begin(step)
     backbone.adapt(step)
     assert bool(backbone.table["bias"].any()) == opens
 
@@ -537,7 +525,7 @@ def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
         backbone.table["offsets"][7, 1, 0] = torch.inf
     before = backbone.table["anchors"].clone()
     kept = [row for row in range(len(before)) if row not in (3, 7)]
-    assert backbone.heal() == 2
+    assert backbone.heal([], 1) == 2
     assert torch.equal(backbone.table["anchors"], before[kept])
     assert {len(column) for column in backbone.table.columns.values()} == {len(kept)}
 

@@ -21,7 +21,7 @@ from gsx.backbones.clone_split import (
     small_children,
     starting_points,
 )
-from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d import GS3D, DrawnGaussians
 from gsx.backbones.levels import Levels, initial_nodes, kept
 from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians
 from gsx.cli import plugins
@@ -77,11 +77,12 @@ def levels_of(backbone: GS3D) -> Levels:
     return backbone.levels
 
 
-def render(backbone: GS3D, camera: Camera) -> Rendering:
+def render(backbone: GS3D, camera: Camera, step: int) -> tuple[DrawnGaussians, Rendering]:
     """A picture with its backward pass."""
-    rendering = rasterize(backbone.splats(camera), camera, backbone.raster, background=torch.zeros(3))
+    drawn = backbone.draw(camera, step)
+    rendering = rasterize(drawn.splats, camera, backbone.raster, background=torch.zeros(3))
     rendering.image.square().sum().backward()
-    return rendering
+    return drawn, rendering
 
 
 def stir(backbone: GS3D) -> None:
@@ -241,9 +242,8 @@ def due(*overrides: str, step: int = 1600, scene: Scene | None = None) -> GS3D:
         backbone.table["log_scales"].fill_(math.log(1e-3))
         backbone.table["log_scales"][4:] = math.log(0.1)
         backbone.table["log_scales"][2:4] = math.log(0.02)
-    backbone.begin(step)
-    render(backbone, seen_from(1.0))
-    backbone.update()
+    render(backbone, seen_from(1.0), step)
+    backbone.update(step)
     backbone.statistics.gradient.zero_()
     backbone.statistics.count.fill_(2)
     backbone.statistics.gradient[:4] = torch.tensor([4.4e-4, 4.4e-4, 4.4e-4, 6.4e-4])
@@ -353,13 +353,12 @@ def test_opacities_are_never_reset() -> None:
 def test_levels_join_as_the_camera_comes_near() -> None:
     """D = 8, plain distance: round(log2(8 / d)) for each Gaussian, at the end of training."""
     backbone = small_octree()
-    backbone.begin(40000)
     for distance in (30.0, 8.0, 4.0, 1.6):
         camera = seen_from(distance)
         means, of = backbone.table["means"].detach(), backbone.table["level"].tolist()
         reach = [math.log2(8 / math.dist(mean, (0.0, -distance, 0.0))) for mean in means.tolist()]
         wanted = [row for row, level in enumerate(of) if level <= min(2, max(0, round(reach[row])))]
-        splats = backbone.splats(camera)
+        splats = backbone.draw(camera, 40000).splats
         assert torch.equal(splats.means, means[wanted])
         assert len(splats.scales) == len(splats.colours) == len(splats.log_opacities) == len(wanted)
 
@@ -367,22 +366,20 @@ def test_levels_join_as_the_camera_comes_near() -> None:
 def test_bias_lets_a_gaussian_be_drawn_from_farther() -> None:
     """At 3 units from D = 8 the level asked for is log2(8/3) = 1.4: finer ones join with a bias of a few tenths."""
     backbone = small_octree()
-    backbone.begin(40000)
     camera = seen_from(3.0)
     means, of = backbone.table["means"].detach(), backbone.table["level"]
     reach = (8 / (means - camera.centre.float()).norm(dim=1)).log2()
     close = ((of == 2) & (reach < 1.5) & (reach > 1.0)).nonzero()[:, 0]
     assert len(close) > 0
     row = int(close[0])
-    assert row not in backbone.shown(camera).rows.tolist()  # type: ignore[union-attr]
+    assert row not in backbone.shown(camera, 40000).rows.tolist()  # type: ignore[union-attr]
     backbone.table["bias"][row] = 0.6
-    assert row in backbone.shown(camera).rows.tolist()  # type: ignore[union-attr]
+    assert row in backbone.shown(camera, 40000).rows.tolist()  # type: ignore[union-attr]
 
 
 def test_levels_that_wait_are_not_drawn() -> None:
     backbone = small_octree()
-    backbone.begin(1)
-    shown = backbone.shown(seen_from(1.0))
+    shown = backbone.shown(seen_from(1.0), 1)
     assert shown.rows is not None
     assert int(backbone.table["level"][shown.rows].max()) == levels_of(backbone).first < 2
 
@@ -391,9 +388,7 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
     """From afar level 0 alone is drawn; its rows lie anywhere in the table once levels are mixed."""
     backbone = small_octree()
     backbone.table["level"].copy_(torch.arange(len(backbone.table)) % 3)
-    backbone.begin(1)
-    rendering = render(backbone, seen_from(30.0))
-    backbone.record(backbone.observe(rendering, 1))
+    backbone.record(backbone.observe(*render(backbone, seen_from(30.0), 1), 1))
     coarse = backbone.table["level"] == 0
     assert backbone.statistics.count[coarse].sum() > 10
     assert not backbone.statistics.count[~coarse].any()
@@ -406,13 +401,12 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
 
 def test_fading_levels_are_fainter() -> None:
     backbone = small_octree("levels.mode=progressive")
-    backbone.begin(40000)
     camera = seen_from(3.0)
-    shown = backbone.shown(camera)
+    shown = backbone.shown(camera, 40000)
     assert shown.rows is not None
     assert shown.weights is not None
     assert 0 < float(shown.weights.min()) < 0.9
-    opacities = backbone.splats(camera).log_opacities.detach().exp()
+    opacities = backbone.draw(camera, 40000).splats.log_opacities.detach().exp()
     torch.testing.assert_close(
         opacities, shown.weights * backbone.table["opacity_logits"].detach()[shown.rows].sigmoid()
     )
@@ -420,11 +414,10 @@ def test_fading_levels_are_fainter() -> None:
 
 def test_the_volume_of_what_is_drawn_is_held_small() -> None:
     backbone = small_octree()
-    backbone.begin(40000)
-    splats = backbone.splats(seen_from(30.0))
-    extra = backbone.regulariser()
+    drawn = backbone.draw(seen_from(30.0), 40000)
+    extra = backbone.regulariser(drawn)
     assert extra is not None
-    assert extra.item() == pytest.approx(0.01 * float(splats.scales.detach().prod(1).mean()))
+    assert extra.item() == pytest.approx(0.01 * float(drawn.splats.scales.detach().prod(1).mean()))
     extra.backward()
     grad = backbone.table["log_scales"].grad
     assert grad is not None
@@ -459,15 +452,14 @@ def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path
 def test_a_view_as_a_standard_file_draws_the_same_picture(mode: str) -> None:
     backbone = small_octree(f"levels.mode={mode}")
     stir(backbone)
-    backbone.begin(40000)
     camera = seen_from(6.0)
-    gaussians = backbone.explicit(camera)
+    gaussians = backbone.explicit(camera, 40000)
     assert len(gaussians.means) < len(backbone.table)
     with torch.no_grad():
-        ours = rasterize(backbone.splats(camera), camera, backbone.raster).image
+        ours = rasterize(backbone.draw(camera, 40000).splats, camera, backbone.raster).image
         theirs = rasterize(splats_of(gaussians, camera.centre.float()), camera, backbone.raster).image
     assert float((ours - theirs).abs().max()) < 2e-6
-    assert len(backbone.explicit().means) == len(backbone.table)
+    assert len(backbone.explicit(None, 40000).means) == len(backbone.table)
 
 
 # -- options and runs --------------------------------------------------------------------------------------------------

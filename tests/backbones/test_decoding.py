@@ -9,7 +9,7 @@ from test_heads import SMALL, heads_of
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, baked
+from gsx.backbones.decoding import Decoded, Explicit, Neural, VisibleAnchors, baked
 from gsx.backbones.heads import Heads
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.sh import colours_of
@@ -53,9 +53,9 @@ def explicit_table(count: int = 6, dtype: torch.dtype = torch.float32, degree: i
     return Table({name: Parameter(value) for name, value in values.items()}, {"anchors": positions})
 
 
-def draw(rows: list[int], weights: list[float] | None = None, camera: Camera = CAMERA, **more: int) -> Drawn:
+def draw(rows: list[int], weights: list[float] | None = None, camera: Camera = CAMERA, **more: int) -> VisibleAnchors:
     given = torch.tensor(weights or [1.0] * len(rows))
-    return Drawn(
+    return VisibleAnchors(
         rows=torch.tensor(rows, dtype=torch.long), weights=given, camera=camera, **({"view": -1, "sh_degree": 3} | more)
     )
 
@@ -71,7 +71,7 @@ def fixed_outputs(opacities: list[list[float]]) -> Fixed:
     return Fixed(torch.tensor(opacities), shapes, torch.arange(rows * k * 3).reshape(rows, k, 3) / 100 + 0.01)
 
 
-def check_against_loop(decoded: Decoded, table: Table, heads: Fixed, drawn: Drawn) -> None:
+def check_against_loop(decoded: Decoded, table: Table, heads: Fixed, drawn: VisibleAnchors) -> None:
     """Which Gaussians there are, in which order, with which values: one anchor and offset after the other."""
     opacities, shapes, colours = (output.tolist() for output in heads.outputs)
     offsets, lengths = table["offsets"].tolist(), table["log_scales"].exp().tolist()

@@ -45,21 +45,21 @@ def trained(backbone: Backbone, scene: Scene) -> list[float]:
     losses = []
     for step in range(1, STEPS + 1):
         view = scene.train[step % len(scene.train)]
-        backbone.begin(step)
+        drawn = backbone.draw(view.camera, step)
         rendering = rasterize(
-            backbone.splats(view.camera),
+            drawn.splats,
             view.camera,
             backbone.raster,
             background=scene.background,
             absolute_gradient=backbone.absolute_gradient,
         )
         loss = photometric(rendering.image, view.image(), 0.2)
-        extra = backbone.regulariser()
+        extra = backbone.regulariser(drawn)
         loss = loss if extra is None else loss + extra
         loss.backward()
-        backbone.record(backbone.observe(rendering, step))
+        backbone.record(backbone.observe(drawn, rendering, step))
         backbone.adapt(step)
-        backbone.update()
+        backbone.update(step)
         losses.append(float(loss.detach()))
     return losses
 
@@ -117,7 +117,7 @@ def picture_after_training(name: str, scene: Scene) -> Tensor:
     backbone, camera = built(name, scene), scene.train[0].camera
     trained(backbone, scene)
     with torch.no_grad():
-        return rasterize(backbone.splats(camera), camera, backbone.raster).image
+        return rasterize(backbone.draw(camera, STEPS).splats, camera, backbone.raster).image
 
 
 @pytest.mark.parametrize("name", BACKBONES)

@@ -22,6 +22,8 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import rasterize
 
 FAR = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+STEP = 30
+"""All harmonics take part, and all levels."""
 BACKBONES = ("gs3d", "mip_splatting", "scaffold", "octree_scaffold", "octree_gs3d", "octree_gs3d, clone_split")
 
 
@@ -50,15 +52,13 @@ def pair(name: str) -> tuple[GS3D | Anchors, GS3D | Anchors, Camera]:
             parameter.copy_(near.table[key])
         far.table[place].copy_((near.table[place].double() + FAR).float())
     assert torch.equal(far.table[place].double() - FAR, near.table[place].double())
-    for backbone in (near, far):
-        backbone.begin(30)
     return near, far, near.cameras[1]
 
 
 def splats_of_both(name: str) -> tuple[Splats, Splats, GS3D | Anchors, Camera]:
     near, far, camera = pair(name)
     with torch.no_grad():
-        return near.splats(camera), far.splats(moved(camera)), near, camera
+        return near.draw(camera, STEP).splats, far.draw(moved(camera), STEP).splats, near, camera
 
 
 @pytest.mark.parametrize("name", BACKBONES)
@@ -78,14 +78,15 @@ def test_everything_but_the_place_stays(name: str) -> None:
 def double_colours(backbone: GS3D, means: Tensor, camera: Camera) -> Tensor:
     """Colours worked out in float64 throughout."""
     constant, rest = (backbone.table[name].detach().double() for name in ("sh_constant", "sh_rest"))
-    return colours_of(constant, rest, means - camera.centre, backbone.active_degree)
+    return colours_of(constant, rest, means - camera.centre, backbone.active_degree(STEP))
 
 
 def test_harmonics_and_their_gradients_are_those_of_float64() -> None:
     _, far, camera = pair("gs3d")
     assert isinstance(far, GS3D)
-    assert far.active_degree == 3
-    colours, weights = far.splats(moved(camera)).colours, torch.rand(60, 3, generator=torch.Generator().manual_seed(1))
+    assert far.active_degree(STEP) == 3
+    colours = far.draw(moved(camera), STEP).splats.colours
+    weights = torch.rand(60, 3, generator=torch.Generator().manual_seed(1))
     (gradient,) = torch.autograd.grad((colours * weights).sum(), far.table["means"])
     means = (far.table["means"].detach().double() - FAR).requires_grad_()
     truth = double_colours(far, means, camera)
@@ -100,10 +101,10 @@ def test_networks_see_the_direction_of_float64() -> None:
     assert near.heads is not None
     anchors = far.table["anchors"].double() - FAR
     with torch.no_grad():
-        shown = near.drawn(camera).rows
+        shown = near.visible(camera, STEP).rows
         heads = near.heads.double()
         truth = heads(near.table["features"].double()[shown], (anchors - camera.centre)[shown], anchors[shown, :1], -1)
-        colours = far.splats(moved(camera)).colours
+        colours = far.draw(moved(camera), STEP).splats.colours
     chosen = truth[0].flatten() > 0
     torch.testing.assert_close(colours.double(), truth[2].reshape(-1, 3)[chosen], rtol=0, atol=2e-6)
 

@@ -8,7 +8,7 @@ import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D, children
+from gsx.backbones.gs3d import GS3D, DrawnGaussians, children
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
@@ -112,9 +112,8 @@ def test_it_is_a_backbone_of_59_floats_a_primitive() -> None:
 def test_first_adam_step_moves_every_parameter_by_its_published_rate(step: int, means_rate: float) -> None:
     backbone = small_gs3d(small_scene(spread(4), extent=3.0))
     before = snapshot(backbone)
-    backbone.begin(step)
     learn(backbone, gradient=1e-12)
-    backbone.update()
+    backbone.update(step)
     rates = {"means": 3 * means_rate, "sh_constant": 0.0025, "sh_rest": 1.25e-4}
     rates |= {"opacity_logits": 0.05, "log_scales": 0.005, "quats": 0.001}
     for name, rate in rates.items():
@@ -126,11 +125,7 @@ def test_first_adam_step_moves_every_parameter_by_its_published_rate(step: int, 
 def test_sh_degree_rises_every_thousand_steps() -> None:
     backbone = small_gs3d(small_scene(spread(4)))
     steps = (1, 999, 1000, 1999, 2000, 2999, 3000, 30000)
-    degrees = []
-    for step in steps:
-        backbone.begin(step)
-        degrees.append(backbone.active_degree)
-    assert degrees == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert [backbone.active_degree(step) for step in steps] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def camera() -> Camera:
@@ -140,29 +135,29 @@ def camera() -> Camera:
 @pytest.mark.parametrize(("step", "bands"), [(999, 0), (1000, 3), (2500, 8), (3000, 15)])
 def test_only_active_bands_colour_the_splats(step: int, bands: int) -> None:
     backbone = hand_made([0.0] * 5, [0.1] * 5)
-    backbone.begin(step)
-    shown = backbone.splats(camera()).colours
+    shown = backbone.draw(camera(), step).splats.colours
     with torch.no_grad():
         backbone.table["sh_rest"][:, bands:] = 5.0
-    assert torch.equal(backbone.splats(camera()).colours, shown)
+    assert torch.equal(backbone.draw(camera(), step).splats.colours, shown)
     if bands:
         with torch.no_grad():
             backbone.table["sh_rest"][:, bands - 1] += 5.0
-        assert not torch.equal(backbone.splats(camera()).colours, shown)
+        assert not torch.equal(backbone.draw(camera(), step).splats.colours, shown)
 
 
 def test_splats_are_the_activated_parameters() -> None:
     backbone = hand_made([0.0] * 3, [0.1, 0.2, 0.4], [0.2, 0.5, 0.9])
-    splats = backbone.splats(camera())
+    drawn = backbone.draw(camera(), 1)
+    splats = drawn.splats
     torch.testing.assert_close(splats.scales[:, 0], torch.tensor([0.1, 0.2, 0.4]))
     torch.testing.assert_close(splats.log_opacities.exp(), torch.tensor([0.2, 0.5, 0.9]))
     assert torch.equal(splats.means, backbone.table["means"])
-    assert backbone.regulariser() is None
+    assert backbone.regulariser(drawn) is None
 
 
 def test_explicit_holds_raw_values_and_unit_quaternions() -> None:
     backbone = hand_made([0.0] * 3, [0.1, 0.2, 0.4])
-    explicit = backbone.explicit()
+    explicit = backbone.explicit(None, 1)
     for name in ("means", "log_scales", "opacity_logits", "sh_rest"):
         assert torch.equal(getattr(explicit, name), backbone.table[name])
     assert torch.equal(explicit.sh_constant, backbone.table["sh_constant"][:, 0])
@@ -173,21 +168,24 @@ def test_explicit_holds_raw_values_and_unit_quaternions() -> None:
 # -- statistics --------------------------------------------------------------------------------------------------------
 
 
-def seen_as(backbone: GS3D, ids: list[int], radii: list[int], gradients: list[list[float]]) -> Rendering:
-    """A rendering on 24 x 16 px with screen gradients made by hand."""
+def seen_as(
+    backbone: GS3D, ids: list[int], radii: list[int], gradients: list[list[float]]
+) -> tuple[DrawnGaussians, Rendering]:
+    """What is drawn, and a rendering on 24 x 16 px with screen gradients made by hand."""
     shift = torch.zeros(len(ids), 2, requires_grad=True)
     shift.grad = torch.tensor(gradients)
     screen = ScreenStatistics(
         ids=torch.tensor(ids), radii=torch.tensor(radii), shift=shift, probe=None, heaviest=None, size=(24, 16)
     )
-    return replace(rasterize(backbone.splats(camera()), camera(), RasterSettings()), screen=screen)
+    drawn = backbone.draw(camera(), 1)
+    return drawn, replace(rasterize(drawn.splats, camera(), RasterSettings()), screen=screen)
 
 
 def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     # half the raster is (12, 8) px: the norms are 60, 15 (unseen: radius 0) and then 20 with the opposite sign
-    backbone.record(backbone.observe(seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
-    backbone.record(backbone.observe(seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
+    backbone.record(backbone.observe(*seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
+    backbone.record(backbone.observe(*seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
     assert backbone.statistics.count.tolist() == [2, 0, 1]
     expected = torch.tensor([(math.hypot(36, 48) + math.hypot(12, 16)) / 2, 0.0, 4.0])
     torch.testing.assert_close(backbone.statistics.mean_gradient(), expected)
@@ -195,8 +193,8 @@ def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() ->
 
 def test_statistics_end_with_density_control() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
-    backbone.record(backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
-    backbone.record(backbone.observe(seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
+    backbone.record(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
+    backbone.record(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
     assert backbone.statistics.count.tolist() == [1, 0, 0]
 
 
@@ -329,8 +327,7 @@ def test_no_primitive_is_added_beyond_the_cap_and_strong_gradients_come_first(ca
 def test_reset_caps_opacities_and_forgets_their_moments_alone() -> None:
     backbone = hand_made([0.0] * 4, [0.01] * 4, [0.9, 0.011, 0.009, 0.006])
     learn(backbone)
-    backbone.begin(1)
-    backbone.update()
+    backbone.update(1)
     faint = backbone.table["opacity_logits"].detach()[2:].clone()
     others = {name: backbone.table[name] for name in NAMES if name != "opacity_logits"}
     backbone.reset_opacities()
@@ -378,14 +375,12 @@ def test_reset_comes_after_the_event_of_the_same_step() -> None:
 
 def test_an_event_costs_the_step_and_new_rows_start_without_moments() -> None:
     backbone = hand_made([0.0, 1.0, 1.0], [0.01, 0.001, 0.05])
-    backbone.begin(599)
     learn(backbone)
-    backbone.update()
+    backbone.update(599)
     learn(backbone)
-    backbone.begin(600)
     backbone.adapt(600)
     before = snapshot(backbone)
-    backbone.update()
+    backbone.update(600)
     for name in NAMES:
         assert torch.equal(backbone.table[name], before[name])
         state = backbone.table.optimiser.state[backbone.table[name]]
@@ -398,20 +393,18 @@ def test_an_event_costs_the_step_and_new_rows_start_without_moments() -> None:
 def test_an_event_without_candidates_costs_the_step_too() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2)
     learn(backbone)
-    backbone.begin(600)
     backbone.adapt(600)
     before = snapshot(backbone)
-    backbone.update()
+    backbone.update(600)
     assert all(torch.equal(backbone.table[name], before[name]) for name in NAMES)
 
 
 def test_a_reset_outside_an_event_costs_only_opacity_its_step() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2, background=1.0)
     learn(backbone)
-    backbone.begin(500)
     backbone.adapt(500)
     before = snapshot(backbone)
-    backbone.update()
+    backbone.update(500)
     moved = [name for name in NAMES if not torch.equal(backbone.table[name], before[name])]
     assert moved == [name for name in NAMES if name != "opacity_logits"]
 
@@ -434,12 +427,12 @@ def step_on(backbone: GS3D, step: int) -> dict[str, int]:
     target = torch.zeros(3, 16, 24)
     target[:, :, ::3] = 0.9
     seen = small_scene(spread(4)).train[step % 4].camera
-    backbone.begin(step)
-    picture = rasterize(backbone.splats(seen), seen, RasterSettings())
+    drawn = backbone.draw(seen, step)
+    picture = rasterize(drawn.splats, seen, RasterSettings())
     photometric(picture.image, target, 0.2).backward()
-    backbone.record(backbone.observe(picture, step))
+    backbone.record(backbone.observe(drawn, picture, step))
     done = backbone.adapt(step)
-    backbone.update()
+    backbone.update(step)
     return done
 
 

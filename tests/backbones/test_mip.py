@@ -24,17 +24,17 @@ from gsx.cli import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.evaluation.evaluator import render_tiled
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
-from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize
+from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled
 from gsx.core.training.density import Statistics
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import build, execute, export, load_scene, open_run, render_camera
+from gsx.experiments.runs.session import build, execute, export, load_scene, open_run
 
 OPTIONS = MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=29900)
 UNIT = math.sqrt(0.2)
@@ -236,7 +236,7 @@ def test_splats_are_smoothed_by_the_sizes_of_the_cameras() -> None:
     backbone = row_values([0.01, 0.1, 0.5], [0.2, 0.5, 0.9])
     cameras = [view.camera for view in small_scene(spread(1)).train]
     sizes = torch.tensor(sizes_in_loops(backbone.table["means"].detach(), cameras))
-    splats = backbone.splats(cameras[0])
+    splats = backbone.draw(cameras[0], 1).splats
     scales = backbone.table["log_scales"].detach().exp()
     expected = (scales.square() + sizes[:, None].square()).sqrt()
     torch.testing.assert_close(splats.scales.detach(), expected)
@@ -282,7 +282,7 @@ def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
 
 
 def drawn_opacities(backbone: GS3D) -> Tensor:
-    return backbone.splats(backbone.cameras[0]).log_opacities.detach().exp()
+    return backbone.draw(backbone.cameras[0], 1).splats.log_opacities.detach().exp()
 
 
 def test_a_reset_caps_what_is_drawn() -> None:
@@ -335,7 +335,7 @@ def test_size_and_opacity_tests_are_of_raw_values() -> None:
     backbone = row_values([0.0099, 0.0101, 0.01, 0.099, 0.11], [0.0051, 0.5, 0.0049, 0.5, 0.5], [1.0, 1.0, 0, 0, 0])
     assert float(backbone.table["filter"].min()) > 0.05
     assert float(drawn_opacities(backbone)[0]) < 0.005
-    assert float(backbone.splats(backbone.cameras[0]).scales.detach()[3].max()) > 0.1
+    assert float(backbone.draw(backbone.cameras[0], 1).splats.scales.detach()[3].max()) > 0.1
     assert backbone.adapt(3100) == {"cloned": 1, "split": 1, "pruned": 2}
     assert labels(backbone) == [0, 3, 0, 1, 1]
 
@@ -388,7 +388,7 @@ def test_without_any_gradient_nothing_is_chosen() -> None:
 
 def weighted_render(backbone: GS3D, camera: Camera, weights: Tensor, absolute: bool) -> ScreenStatistics:
     """Statistics after the backward pass of a weighted sum of pixels."""
-    picture = rasterize(backbone.splats(camera), camera, backbone.raster, absolute_gradient=absolute)
+    picture = rasterize(backbone.draw(camera, 1).splats, camera, backbone.raster, absolute_gradient=absolute)
     (picture.image * weights).sum().backward()
     return picture.screen
 
@@ -407,9 +407,10 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
             screen = weighted_render(backbone, small, weights * alone, absolute=False)
             by_mean = screen.shift.grad.double().abs()
             truth.index_add_(0, screen.ids, by_mean[:, 0] * 12 / 2 + by_mean[:, 1] * 8 / 2)
-        picture = rasterize(backbone.splats(small), small, backbone.raster, absolute_gradient=True)
+        drawn = backbone.draw(small, 1)
+        picture = rasterize(drawn.splats, small, backbone.raster, absolute_gradient=True)
         (picture.image * weights).sum().backward()
-        backbone.record(backbone.observe(picture, number + 1))
+        backbone.record(backbone.observe(drawn, picture, number + 1))
     assert backbone.absolute_gradient
     assert backbone.statistics.count.tolist() == [2] * 12
     torch.testing.assert_close(backbone.statistics.mean_absolute().double(), truth / 2, rtol=1e-4, atol=1e-6)
@@ -518,10 +519,11 @@ def test_the_exported_file_renders_the_same(finished: Path, tmp_path: Path) -> N
     for view in [*run.scene.test, run.scene.train[0]]:
         splats = splats_of(gaussians, view.camera.centre)
         rules = RasterSettings(dilation=0.1, compensate=True)
-        again = render_tiled(splats, view.camera, rules, run.background, 1 << 20).image
-        truth = render_camera(run, view.camera, 1 << 20)
+        again = rasterize_tiled(splats, view.camera, rules, background=run.background).image.clamp(0, 1)
+        truth = render(run, view.camera).image
         assert psnr(again, truth) > 60
-        fat = render_tiled(splats, view.camera, replace(rules, compensate=False), run.background, 1 << 20).image
+        rules = replace(rules, compensate=False)
+        fat = rasterize_tiled(splats, view.camera, rules, background=run.background).image.clamp(0, 1)
         assert psnr(fat, truth) < 40, "the test needs splats that the filter changes"
 
 
@@ -546,14 +548,14 @@ def test_training_stays_finite(name: str) -> None:
     backbone = small_gs3d(scene, iterations=300, options=mip_options(**events))
     for step in range(1, 4):
         camera = scene.train[step % 2].camera
-        backbone.begin(step)
-        picture = rasterize(backbone.splats(camera), camera, backbone.raster, absolute_gradient=True)
+        drawn = backbone.draw(camera, step)
+        picture = rasterize(drawn.splats, camera, backbone.raster, absolute_gradient=True)
         assert picture.dropped == 0
         assert torch.isfinite(picture.image).all()
         photometric(picture.image, torch.full_like(picture.image, 0.5), 0.2).backward()
         assert all(torch.isfinite(gradient).all() for _, gradient in backbone.gradients())
-        backbone.record(backbone.observe(picture, step))
+        backbone.record(backbone.observe(drawn, picture, step))
         backbone.adapt(step)
-        backbone.update()
-        assert finite(backbone.splats(camera))
+        backbone.update(step)
+        assert finite(backbone.draw(camera, step).splats)
     assert (backbone.table["filter"] > 0).all()

@@ -107,14 +107,14 @@ def test_one_view_as_a_standard_file_shows_the_same_picture(name: str, filtered:
     scene = small_scene(spread(300) * 2)
     backbone = small_anchors(name, f"filter={filtered}", scene=scene)
     stir(backbone)
-    backbone.begin(backbone.options.published_iterations)
+    last = backbone.options.published_iterations
     camera, background = scene.train[1].camera.zoom(4), torch.tensor([0.1, 0.5, 0.9])
     with torch.no_grad():
-        write_gaussians(tmp_path / "view.ply", backbone.explicit(camera))
+        write_gaussians(tmp_path / "view.ply", backbone.explicit(camera, last))
         again = splats_of(read_gaussians(tmp_path / "view.ply"), camera.centre)
         pictures = [
             rasterize(splats, camera, backbone.raster, background=background).image
-            for splats in (backbone.splats(camera), again)
+            for splats in (backbone.draw(camera, last).splats, again)
         ]
     assert pictures[0].std() > 0.05
     assert psnr(pictures[1].clamp(0, 1), pictures[0].clamp(0, 1)) > 50
@@ -122,7 +122,7 @@ def test_one_view_as_a_standard_file_shows_the_same_picture(name: str, filtered:
 
 def test_explicit_anchors_have_gaussians_without_a_camera() -> None:
     backbone = small_anchors("octree_gs3d")
-    gaussians = backbone.explicit()
+    gaussians = backbone.explicit(None, 1)
     assert len(gaussians.means) == len(backbone.table)
     assert gaussians.sh_rest.shape[1] == 15
 
@@ -130,4 +130,4 @@ def test_explicit_anchors_have_gaussians_without_a_camera() -> None:
 @pytest.mark.parametrize("name", NEURAL)
 def test_networks_have_none_and_say_what_to_do(name: str) -> None:
     with pytest.raises(InputError, match=rf"backbone {name} decodes .*`gsx export RUN FILE\.ply --view NAME`"):
-        small_anchors(name).explicit()
+        small_anchors(name).explicit(None, 1)

@@ -38,8 +38,8 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.run_folder.checkpoint import sidecars, step_of
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.material import coverage, material_of, rendered
-from gsx.core.training.pseudo_views import PseudoView, Setting, Term, load_views, save_views
+from gsx.core.training.material import material_of
+from gsx.core.training.pseudo_views import PseudoView, Setting, Term, load_views, picture_name, save_views
 from gsx.core.training.regenerator import (
     Checked,
     Checks,
@@ -48,9 +48,9 @@ from gsx.core.training.regenerator import (
     strayed,
     unusable,
 )
+from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
-from gsx.experiments.runs.pseudo_pictures import picture_name
 
 logger = logging.getLogger(__name__)
 
@@ -549,7 +549,7 @@ class PseudoDetails:
         for _ in range(MOST_TRIES if checked else 1):
             pose = own if variant == 0 else self.beside(own, scale, generator)
             window = self.placed(run, parent, pose, size, event, variant, generator)
-            if not checked or coverage(run, window.of(pose)) >= options.least_alpha:
+            if not checked or float(render(run, window.of(pose)).alpha.mean()) >= options.least_alpha:
                 break
         return pose, window
 
@@ -587,7 +587,7 @@ class PseudoDetails:
             return grid_window(width, height, size, turn)
         if kind == "error":
             view = run.scene.train[parent]
-            return worst_window((rendered(run, pose).cpu() - view.image()).abs().mean(0), size)
+            return worst_window((render(run, pose).image - view.image()).abs().mean(0), size)
         return centred_window(width, height, size)
 
     def drawn(self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]) -> list[Drawn]:
@@ -622,7 +622,7 @@ class PseudoDetails:
     def request(self, run: Run, event: int, sketch: Sketch) -> Request:
         """What the regenerator is asked for."""
         view = run.scene.train[sketch.parent]
-        image = rendered(run, sketch.seen).cpu() if sketch.outer is None else sketch.outer.cut(view.image())
+        image = render(run, sketch.seen).image if sketch.outer is None else sketch.outer.cut(view.image())
         return Request(
             image=image,
             scale=sketch.scale,
@@ -687,7 +687,7 @@ class PseudoDetails:
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
         photo = self.options.base_source == "photo"
-        picture = view.image() if photo else rendered(run, view.camera).cpu()
+        picture = view.image() if photo else render(run, view.camera).image
         reduction = run.scene.reduction if photo else Reduction()  # Mipmap-GS: bilinear, which is the mean of four
         target = to_uint8(reduction.reduce(Window(0, 0, *covered.size).cut(picture), factor))
         return PseudoView(
@@ -711,11 +711,8 @@ class PseudoDetails:
         options, trust = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
-            run.backbone.begin(max(1, run.step))
-            with torch.no_grad():
-                splats = run.backbone.splats(sketch.camera)
             photographs = [view.camera for view in run.scene.train]
-            trust = trust * weights(splats, sketch.camera, photographs, run.raster).cpu()
+            trust = trust * weights(splats_for(run, sketch.camera), sketch.camera, photographs, run.raster).cpu()
         if options.gate > 0 and request.photo and sketch.scale > 1:
             agreed = agreeing(result, request.image, sketch.scale, request.reduction, options.gate)
             trust = trust * window.cut(agreed[None])[0]

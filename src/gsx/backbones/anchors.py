@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.decoding import Decoded, Drawn, Explicit, Neural, Representation, lengths
+from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
 from gsx.backbones.growth import (
     GrowthOptions,
     Quirks,
@@ -51,10 +51,10 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.neighbours import mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, drawable, touches
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Beginning, Gaussians, Observation
+from gsx.core.training.backbone import Beginning, Observation
 from gsx.core.training.density import (
     ADAM_EPSILON,
     Table,
@@ -220,6 +220,19 @@ def voxel_nodes(points: Float[Tensor, "P 3"], voxel: float) -> tuple[Float[Tenso
     return (cells.double() * voxel).float(), inverse
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnAnchors:
+    """Gaussians of a camera, and the anchors that they come from."""
+
+    decoded: Decoded
+    anchors: VisibleAnchors
+
+    @property
+    def splats(self) -> Splats:
+        """The Gaussians."""
+        return self.decoded.splats
+
+
 class Anchors:
     """N anchors at fixed places, k Gaussians each."""
 
@@ -251,8 +264,6 @@ class Anchors:
         self.cameras = [view.camera for view in scene.train]
         self.views = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = beginning.schedule(options.published_iterations)
-        self.step = 0
-        self.last: tuple[Decoded, Drawn] | None = None
         self.levels: Levels | None = None
         self.voxel = options.voxel
         self.table = self.initial_table(scene.points)
@@ -300,9 +311,8 @@ class Anchors:
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
-    def begin(self, step: int) -> None:
-        """Learning rates of this step (spec 2.7)."""
-        self.step = step
+    def set_rates(self, step: int) -> None:
+        """Learning rates of a step (spec 2.7)."""
         steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         for name in self.table.parameters:
             unit = self.extent if name == "offsets" else 1.0
@@ -310,49 +320,47 @@ class Anchors:
         for group in self.head_optimiser.param_groups if self.head_optimiser else ():
             group["lr"] = getattr(self.head_rates, group["name"]).at(step, steps)
 
-    def splats(self, camera: Camera) -> Splats:
+    def draw(self, camera: Camera, step: int) -> DrawnAnchors:
         """The Gaussians of the anchors that the camera sees at its distance."""
-        taking_part = self.drawn(camera)
-        decoded = self.representation.decode(self.table, taking_part, self.filters_of(taking_part.rows))
-        self.last = (decoded, taking_part)
-        return decoded.splats
+        anchors = self.visible(camera, step)
+        decoded = self.representation.decode(self.table, anchors, self.filters_of(anchors.rows))
+        return DrawnAnchors(decoded=decoded, anchors=anchors)
 
-    def drawn(self, camera: Camera) -> Drawn:
+    def visible(self, camera: Camera, step: int) -> VisibleAnchors:
         """Anchors of the levels that the camera draws, of which those in view (spec 3.5, 2.5)."""
         anchors = self.table["anchors"]
         weights = torch.ones_like(anchors[:, 0])
         rows = torch.arange(len(anchors), device=anchors.device)
         if self.levels is not None:
-            mask, weights = drawn(self.levels, anchors, self.table["level"], self.table["bias"], camera, self.highest())
+            mask, weights = drawn(
+                self.levels, anchors, self.table["level"], self.table["bias"], camera, self.levels.highest(step)
+            )
             rows = rows[mask]
         reach = lengths(self.table["log_scales"].detach()[rows, :3])
         seen = touches(anchors[rows], reach, self.representation.quats(self.table).detach()[rows], camera, self.raster)
         rows = rows[seen]
         degree, every = self.sh
-        degree = min(degree, self.step // max(1, self.schedule.step(every)))
-        return Drawn(rows=rows, weights=weights[rows], camera=camera, view=self.views.get(camera, -1), sh_degree=degree)
+        degree = min(degree, step // max(1, self.schedule.step(every)))
+        return VisibleAnchors(
+            rows=rows, weights=weights[rows], camera=camera, view=self.views.get(camera, -1), sh_degree=degree
+        )
 
-    def highest(self) -> int:
-        """Highest level that takes part at this step (spec 3.6)."""
-        assert self.levels is not None
-        return self.levels.highest(self.step)
-
-    def regulariser(self) -> Float[Tensor, ""] | None:
+    def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:
         """Mean volume of the Gaussians drawn; 0 for none (spec 1.3)."""
-        if self.last is None or not self.options.volume_weight:
+        if not self.options.volume_weight:
             return None
-        volumes = self.last[0].splats.scales.prod(1)
+        volumes = drawn.splats.scales.prod(1)
         return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
+    def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
         growth = self.options.growth
-        if self.last is None or not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
+        if not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
             return {}
-        decoded, taking_part = self.last
+        decoded = drawn.decoded
         seen = sightings(rendering.screen, decoded.slots, weight)
         return {
-            "rows": taking_part.rows,
+            "rows": drawn.anchors.rows,
             "opacities": decoded.opacities,
             "slots": seen["rows"],
             "gradients": seen["gradient"].to(decoded.opacities),
@@ -367,17 +375,18 @@ class Anchors:
     def adapt(self, step: int) -> dict[str, int]:
         """Grow and prune when due (spec 2.6)."""
         if self.growth_due(step):
-            done = self.adapt_now()
+            done = self.adapt_now(step)
             self.refresh_filter()
             return done
         return {}
 
-    def update(self) -> None:
+    def update(self, step: int) -> None:
         """One Adam step of anchors and heads. Unused SH bands take part with zero gradients, as in 3D-GS."""
         moved = self.table.parameters.values()
         if any(parameter.grad is not None for parameter in moved):
             for parameter in moved:
                 parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        self.set_rates(step)
         self.table.optimiser.step()
         if "quats" in self.table.parameters:
             make_identity_where_zero(self.table["quats"])
@@ -402,22 +411,23 @@ class Anchors:
         return () if self.heads is None else self.heads.colour.parameters()
 
     @torch.no_grad()
-    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+    def heal(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove anchors with a value that is not finite, or with a Gaussian that a camera cannot draw."""
         kept = finite_rows(self.table)
         for camera in cameras:
-            kept &= self.usable_for(camera)
+            kept &= self.usable_for(camera, step)
         if bool(kept.all()) or not bool(kept.any()):
             return 0
         keep_rows(self.table, kept)
         return int((~kept).sum())
 
-    def usable_for(self, camera: Camera) -> Bool[Tensor, "N"]:
+    def usable_for(self, camera: Camera, step: int) -> Bool[Tensor, "N"]:
         """Anchors that the camera draws or has no business with: False for Gaussians or volumes out of range.
 
         Where none of those in view can be drawn the networks are to blame, and no anchor.
         """
-        decoded, everyone = self.decoded(camera), torch.ones(len(self.table), dtype=torch.bool, device=self.device)
+        decoded = self.draw(camera, step).decoded
+        everyone = torch.ones(len(self.table), dtype=torch.bool, device=self.device)
         splats = decoded.splats
         lost = ~(drawable(splats, camera, self.raster) & torch.isfinite(splats.scales.prod(1)))
         owners = decoded.slots // self.representation.offsets
@@ -425,8 +435,7 @@ class Anchors:
         return usable if bool(usable[owners].any()) else everyone
 
     def discard(self) -> None:
-        """Forget the gradients and the picture they came from."""
-        self.last = None
+        """Forget the gradients."""
         self.table.optimiser.zero_grad(set_to_none=True)
         if self.head_optimiser is not None:
             self.head_optimiser.zero_grad(set_to_none=True)
@@ -439,25 +448,25 @@ class Anchors:
         start, stop = self.schedule.step(growth.start), self.schedule.step(growth.stop)
         return start < step < stop and step % self.schedule.interval(growth.every) == 0
 
-    def adapt_now(self) -> dict[str, int]:
+    def adapt_now(self, step: int) -> dict[str, int]:
         """Grow, forget what was judged, prune, clamp: the order of the reference (spec 2.9, 2.10)."""
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
         enough, _ = eligible(self.table, visits / 2)
-        grown, without_room = self.grow(visits / 2)
+        grown, without_room = self.grow(visits / 2, step)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
         unit = math.log(self.extent) if self.quirks.clamp == "extent" and self.extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
         return {"grown": grown, "pruned": pruned} | ({"withheld": without_room} if without_room else {})
 
-    def grow(self, least: float) -> tuple[int, int]:
+    def grow(self, least: float, step: int) -> tuple[int, int]:
         """By depth without levels, by level with them; (anchors that grew, anchors that found no room)."""
         shared, most = (self.table, self.representation, self.options.growth), self.options.max_primitives
         if self.levels is None:
             stop = self.quirks.early_stop == "yes"
             return grow_by_depth(*shared, self.voxel, least, stop, self.generator, most)
-        gate = self.quirks.gate == "open" or self.highest() == self.levels.count - 1
+        gate = self.quirks.gate == "open" or self.levels.highest(step) == self.levels.count - 1
         return grow_by_level(*shared, self.levels, least, self.quirks, gate, most)
 
     def refresh_filter(self) -> None:
@@ -473,28 +482,28 @@ class Anchors:
         stored += [self.table[name] for name in ("level", "bias", "filter") if name in self.table.columns]
         return len(self.table), sum(value.numel() * value.element_size() for value in stored)
 
-    def explicit(self, camera: Camera | None = None) -> Gaussians:
+    def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         """The Gaussians drawn for a camera; without one those of all anchors, of explicit representations only."""
         if camera is None and self.heads is not None:
             raise InputError(
                 f"backbone {self.options.name} decodes its Gaussians for one camera at a time, so there are none that "
                 "hold for all: export those of a view, `gsx export RUN FILE.ply --view NAME`"
             )
-        return self.representation.explicit(self.decoded(camera), self.table)
+        with torch.no_grad():
+            decoded = self.everything() if camera is None else self.draw(camera, step).decoded
+        return self.representation.explicit(decoded, self.table)
 
-    @torch.no_grad()
-    def decoded(self, camera: Camera | None) -> Decoded:
-        """What a camera draws, or all anchors of all levels as seen from anywhere."""
+    def everything(self) -> Decoded:
+        """All anchors of all levels, as seen from anywhere."""
         rows = torch.arange(len(self.table), device=self.device)
-        everything = Drawn(
+        anchors = VisibleAnchors(
             rows=rows,
             weights=torch.ones_like(self.table["anchors"][:, 0]),
             camera=self.cameras[0],
             view=-1,
             sh_degree=self.sh[0],
         )
-        taking_part = everything if camera is None else self.drawn(camera)
-        return self.representation.decode(self.table, taking_part, self.filters_of(taking_part.rows))
+        return self.representation.decode(self.table, anchors, self.filters_of(rows))
 
     def filters_of(self, rows: Int[Tensor, "A"]) -> Float[Tensor, "A"] | None:
         """Sizes of the 3D filter, None without one."""

@@ -13,10 +13,9 @@ from gsx.backbones.levels import Levels
 from gsx.backbones.mip import logit_of_log, smoothed
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Float, Int
-from gsx.core.training.backbone import Gaussians
 from gsx.core.training.density import Table
 
 LARGEST_LOG_SCALE = 30.0
@@ -28,7 +27,7 @@ INERT_LOGIT = math.log(0.1 / 0.9)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Drawn:
+class VisibleAnchors:
     """Anchors that take part in a picture."""
 
     rows: Int[Tensor, "A"]
@@ -64,7 +63,7 @@ class Representation(Protocol):
         """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
         ...
 
-    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """The Gaussians of the anchors drawn, differentiable."""
         ...
 
@@ -126,7 +125,7 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (spec 2.4)."""
         rows, k = drawn.rows, self.offsets
         anchors = table["anchors"][rows]
@@ -201,7 +200,7 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: Table, drawn: Drawn, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = drawn.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}

@@ -43,10 +43,10 @@ from gsx.core.gaussians.neighbours import mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splat_files import columns_of
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, drawable, take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Beginning, Gaussians, Observation
+from gsx.core.training.backbone import Beginning, Observation
 from gsx.core.training.density import (
     Statistics,
     Table,
@@ -179,7 +179,7 @@ def without_normals(columns: dict[str, Tensor]) -> dict[str, Tensor]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shown:
-    """What a camera draws of N Gaussians."""
+    """Parameters of what a camera draws of N Gaussians."""
 
     values: dict[str, Tensor]
     """Parameters and columns, M rows."""
@@ -187,6 +187,15 @@ class Shown:
     """Rows of the table; None: all of them."""
     weights: Float[Tensor, "M"] | None = None
     """Factors of the opacities; None: 1."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnGaussians:
+    """Splats of a camera, and the rows of the table that they come from."""
+
+    splats: Splats
+    rows: Int[Tensor, "M"] | None
+    """None: all of them."""
 
 
 class GS3D:
@@ -201,12 +210,9 @@ class GS3D:
         self.white = bool((scene.background == 1).all())
         self.generator = beginning.generator
         self.schedule = beginning.schedule(options.published_iterations)
-        self.active_degree = 0
         self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
         self.absolute_gradient = options.density.absolute
         self.cameras = [view.camera for view in scene.train]
-        self.step = 0
-        self.last: tuple[Shown, Float[Tensor, "M 3"]] | None = None
         self.levels = self.derived_levels(scene.points)
         self.standard_file = self.levels is None
         self.table = self.initial_table(scene.points, beginning.device)
@@ -236,49 +242,39 @@ class GS3D:
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
-    def begin(self, step: int) -> None:
-        """Learning rates and SH degree of this step (spec 6 and 1.3)."""
-        self.step, rates = step, self.options.rates
-        steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
-        self.table.set_rate("means", self.extent * log_linear(step, steps, rates.means_first, rates.means_last))
-        for name in ("sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats"):
-            self.table.set_rate(name, getattr(rates, name))
-        self.active_degree = min(self.options.sh_degree, step // max(1, self.schedule.step(self.options.sh_every)))
+    def active_degree(self, step: int) -> int:
+        """SH degree at a step (spec 1.3)."""
+        return min(self.options.sh_degree, step // max(1, self.schedule.step(self.options.sh_every)))
 
-    def splats(self, camera: Camera) -> Splats:
+    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
         """The Gaussians that the camera draws, with their colours as seen from there."""
-        shown = self.shown(camera)
+        shown = self.shown(camera, step)
         values = shown.values
         offsets = offsets_from(values["means"], camera.centre)
         scales, log_opacities = self.extents(shown)
-        self.last = (shown, scales)
-        return Splats(
+        splats = Splats(
             means=values["means"],
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(values["sh_constant"], values["sh_rest"], offsets, self.active_degree),
+            colours=colours_of(values["sh_constant"], values["sh_rest"], offsets, self.active_degree(step)),
         )
+        return DrawnGaussians(splats=splats, rows=shown.rows)
 
     def everything(self) -> Shown:
         """All Gaussians."""
         return Shown(values={**self.table.parameters, **self.table.columns})
 
-    def shown(self, camera: Camera) -> Shown:
+    def shown(self, camera: Camera, step: int) -> Shown:
         """All Gaussians, or those of the levels that the camera draws (spec 3.5)."""
         if self.levels is None:
             return self.everything()
         means, level, bias = (self.table[name] for name in ("means", "level", "bias"))
-        mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.highest())
+        mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
         rows = mask.nonzero()[:, 0]
         values = {name: take_rows(parameter, rows) for name, parameter in self.table.parameters.items()}
         values |= {name: column[rows] for name, column in self.table.columns.items()}
         return Shown(values=values, rows=rows, weights=weights[rows])
-
-    def highest(self) -> int:
-        """Highest level that takes part at this step (spec 3.6)."""
-        assert self.levels is not None
-        return self.levels.highest(self.step)
 
     def extents(self, shown: Shown) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
         """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
@@ -290,19 +286,19 @@ class GS3D:
             return scales, log_opacities
         return smoothed(scales, log_opacities, shown.values["filter"])
 
-    def regulariser(self) -> Float[Tensor, ""] | None:
+    def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
         """3D-GS has none (spec 5); across levels the mean volume of what was drawn, 0 for nothing (spec 4B)."""
         control = self.options.level_density
-        if control is None or self.last is None or not control.volume_weight:
+        if control is None or not control.volume_weight:
             return None
-        volumes = self.last[1].prod(1)
+        volumes = drawn.splats.scales.prod(1)
         return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
-    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
+    def observe(self, drawn: DrawnGaussians, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Screen gradients, which count until density control ends (spec 7, cadence)."""
         if step >= self.schedule.step(self.options.density.stop):
             return {}
-        return sightings(rendering.screen, self.last[0].rows if self.last else None, weight)
+        return sightings(rendering.screen, drawn.rows, weight)
 
     def record(self, seen: Observation) -> None:
         """Add screen gradients to the statistics."""
@@ -321,11 +317,20 @@ class GS3D:
             done["opacity_resets"] = 1
         return done
 
-    def update(self) -> None:
+    def set_rates(self, step: int) -> None:
+        """Learning rates of a step (spec 6)."""
+        rates = self.options.rates
+        steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
+        self.table.set_rate("means", self.extent * log_linear(step, steps, rates.means_first, rates.means_last))
+        for name in ("sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats"):
+            self.table.set_rate(name, getattr(rates, name))
+
+    def update(self, step: int) -> None:
         """One Adam step. Unused SH bands take part with zero gradients, as in the published code (spec 1.3)."""
         rest = self.table["sh_rest"]
         if rest.grad is None and self.table["sh_constant"].grad is not None:
             rest.grad = torch.zeros_like(rest)
+        self.set_rates(step)
         self.table.optimiser.step()
         make_identity_where_zero(self.table["quats"])
         self.discard()
@@ -343,28 +348,27 @@ class GS3D:
         return ()
 
     @torch.no_grad()
-    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+    def heal(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove rows with a value that is not finite, or without a splat for a camera, with their statistics."""
         sound = finite_rows(self.table)
         for camera in cameras:
-            sound &= self.usable_for(camera)
+            sound &= self.usable_for(camera, step)
         if bool(sound.all()) or not bool(sound.any()):
             return 0
         keep_rows(self.table, sound)
         self.statistics = self.statistics.rows(sound)
         return int((~sound).sum())
 
-    def usable_for(self, camera: Camera) -> Bool[Tensor, "N"]:
+    def usable_for(self, camera: Camera, step: int) -> Bool[Tensor, "N"]:
         """Rows that the camera draws or has no business with: False for splats or volumes that are out of range."""
-        splats, rows = self.splats(camera), self.shown(camera).rows
-        good = drawable(splats, camera, self.raster) & torch.isfinite(splats.scales.prod(1))
-        return (
-            good if rows is None else torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, rows, good)
-        )
+        drawn = self.draw(camera, step)
+        good = drawable(drawn.splats, camera, self.raster) & torch.isfinite(drawn.splats.scales.prod(1))
+        if drawn.rows is None:
+            return good
+        return torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, drawn.rows, good)
 
     def discard(self) -> None:
-        """Forget the gradients and the picture they came from."""
-        self.last = None
+        """Forget the gradients."""
         self.table.optimiser.zero_grad(set_to_none=True)
 
     # -- density control ---------------------------------------------------------------------------------------
@@ -420,7 +424,7 @@ class GS3D:
             control,
             threshold=density.gradient,
             large=density.split_extent * self.extent,
-            splitting=quirks.gate == "open" or self.highest() == levels.count - 1,
+            splitting=quirks.gate == "open" or levels.highest(step) == levels.count - 1,
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
         children_made = small_children(raw, split, levels, control.shrink, self.generator)
@@ -504,12 +508,12 @@ class GS3D:
         stored += [self.table[name] for name in ("level", "bias") if name in self.table.columns]
         return len(self.table), sum(value.numel() * value.element_size() for value in stored)
 
-    def explicit(self, camera: Camera | None = None) -> Gaussians:
-        """The parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9).
+    def explicit(self, camera: Camera | None, step: int) -> Gaussians:
+        """What `gaussians` makes of what the camera draws; without a camera of all levels."""
+        return self.gaussians(self.everything() if camera is None else self.shown(camera, step))
 
-        With levels those that the camera draws; without a camera those of all levels.
-        """
-        shown = self.everything() if camera is None else self.shown(camera)
+    def gaussians(self, shown: Shown) -> Gaussians:
+        """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9)."""
         raw = {name: shown.values[name].detach() for name in self.table.parameters}
         if self.options.filter == "mip" or shown.weights is not None:
             scales, log_opacities = self.extents(shown)
@@ -520,7 +524,7 @@ class GS3D:
 
     def file(self) -> dict[str, Tensor]:
         """The standard 62 properties (spec 8.3); levels stand where normals would be (spec 5.1)."""
-        columns = columns_of(self.explicit())
+        columns = columns_of(self.gaussians(self.everything()))
         if self.levels is None:
             return columns
         info = torch.zeros_like(columns["nx"])

@@ -14,10 +14,10 @@ from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import read_json, write_json
 from gsx.core.locks import lock
+from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
+from gsx.core.run_folder.run_key import flattened
 from gsx.core.training.run import Run
-from gsx.experiments.reports.overview import flattened
-from gsx.experiments.runs.tracking import require
 from gsx.trackers.figures import evaluation_figures, line_figures
 
 logger = logging.getLogger(__name__)

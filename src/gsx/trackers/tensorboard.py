@@ -6,9 +6,9 @@ from typing import Any
 
 from gsx.core.data.images import read_image
 from gsx.core.files import read_json
+from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
-from gsx.experiments.runs.tracking import require
 from gsx.trackers.figures import evaluation_figures, line_figures
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
-from gsx.core.training.backbone import Gaussians
+from gsx.core.gaussians.splats import Gaussians
 
 PROPERTIES = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]

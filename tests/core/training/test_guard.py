@@ -9,7 +9,8 @@ import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d import GS3D, DrawnGaussians
+from gsx.core.data.camera import Camera
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.rasterizer import RasterSettings
@@ -24,11 +25,11 @@ class Poisoned(GS3D):
     poison: dict[int, str] = {}  # noqa: RUF012
     now = 0
 
-    def begin(self, step: int) -> None:
-        super().begin(step)
+    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
         self.now = step
+        return super().draw(camera, step)
 
-    def regulariser(self) -> Tensor | None:
+    def regulariser(self, drawn: DrawnGaussians) -> Tensor | None:
         kind = self.poison.get(self.now)
         if kind is None:
             return None

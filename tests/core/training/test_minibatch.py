@@ -29,7 +29,6 @@ def fresh(folder: Path, *words: str) -> Run:
     """A run at step 0 whose next views are 4, 1, 5."""
     run = start(tiny_settings(folder, *PLAIN, *words), plugins())
     run.sampler.order = [0, 5, 1, 4]
-    run.backbone.begin(1)
     return run
 
 
@@ -37,8 +36,9 @@ def alone(run: Run, view: int, background: Tensor | None = None) -> tuple[Tensor
     """(loss, render) of one view by itself, after its backward pass."""
     camera, truth = run.scene.train[view].camera, run.scene.train[view].image()
     colour = run.background if background is None else background
-    rendering = rasterize(run.backbone.splats(camera), camera, run.raster, background=colour)
-    loss, extra = photometric(rendering.image, truth, 0.2), run.backbone.regulariser()
+    drawn = run.backbone.draw(camera, 1)
+    rendering = rasterize(drawn.splats, camera, run.raster, background=colour)
+    loss, extra = photometric(rendering.image, truth, 0.2), run.backbone.regulariser(drawn)
     loss = loss if extra is None else loss + extra
     loss.backward()
     return loss.detach(), rendering
@@ -128,7 +128,8 @@ def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Pa
     second, two = alone(run, 1)[0], gradients(run)
     augmenter = Still((1,))
     pseudo = augmenter.view_of(run, 1)
-    image = rasterize(run.backbone.splats(pseudo.camera), pseudo.camera, run.raster, background=run.background).image
+    splats = run.backbone.draw(pseudo.camera, 1).splats
+    image = rasterize(splats, pseudo.camera, run.raster, background=run.background).image
     value = 0.5 * pseudo_loss(image, pseudo)
     value.backward()
     added = gradients(run)

@@ -17,13 +17,13 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import image_size, linear_from_display, read_image
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.window import Window
-from gsx.core.evaluation import evaluator as evaluate
-from gsx.core.evaluation.evaluator import EvalOptions, Evaluator, render_view
-from gsx.core.gaussians.splats import Splats
+from gsx.core.evaluation import evaluator
+from gsx.core.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
-from gsx.core.rasterizer import RasterSettings, Rendering
-from gsx.core.training.backbone import Gaussians
+from gsx.core.rasterizer import RasterSettings, Rendering, TiledRendering
+from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.reports import pictures
 from gsx.experiments.reports.pictures import (
@@ -215,9 +215,9 @@ def test_the_index_lists_exactly_the_files_there_are(run: Run) -> None:
 
 def test_whole_views_are_the_truth_and_the_measured_render(run: Run) -> None:
     for view, entry in zip(run.scene.test, read_index(run)["views"], strict=True):
-        render = quantise(render_view(run, view, 1 << 20).image)
+        shown = quantise(render(run, view.camera).image)
         assert torch.equal(stored(run, entry["files"]["truth"]), view.image())
-        assert torch.equal(stored(run, entry["files"]["render"]), render)
+        assert torch.equal(stored(run, entry["files"]["render"]), shown)
         assert (stored(run, entry["files"]["error"]) - error_map(render, view.image())).abs().max() < 0.6 / 255
         assert entry["name"] == view.name
         assert entry["size"] == [WIDTH, HEIGHT]
@@ -231,8 +231,8 @@ def test_zoomed_crops_are_crops_of_the_whole_zoomed_pictures(run: Run) -> None:
         window = Window(*entry["window"])
         whole = {
             "truth": finer.image(),
-            "render": quantise(render_view(run, finer, 1 << 20).image),
-            "enlarged": bicubic(quantise(render_view(run, view, 1 << 20).image), *finer.camera.size),
+            "render": quantise(render(run, finer.camera).image),
+            "enlarged": bicubic(quantise(render(run, view.camera).image), *finer.camera.size),
         }
         assert entry["view"] == view.name
         for kind, image in whole.items():
@@ -250,7 +250,7 @@ def test_crops_seen_from_afar_and_at_odd_zooms(tmp_path: Path) -> None:
         zoomed = view.zoom(entry["factor"])
         assert zoomed is not None
         window, pair = Window(*entry["window"]), (stored(run, entry["files"][kind]) for kind in ("truth", "enlarged"))
-        resized = bicubic(quantise(render_view(run, view, 1 << 20).image), *zoomed.camera.size)
+        resized = bicubic(quantise(render(run, view.camera).image), *zoomed.camera.size)
         for image, whole in zip(pair, (zoomed.image(), resized), strict=True):
             assert (image - window.cut(whole)).abs().max() <= 0.51 / 255
 
@@ -322,16 +322,16 @@ def test_nothing_is_rendered_or_traced_twice(tmp_path: Path, monkeypatch: pytest
     rendered: Counter[tuple[int, int]] = Counter()
     traced: Counter[tuple[int, int]] = Counter()
 
-    def counted(run: Run, view: View, pixels: int) -> Any:
-        rendered[view.camera.size] += 1
-        return render_view(run, view, pixels)
+    def counted(run: Run, camera: Camera, pixels: int) -> TiledRendering:
+        rendered[camera.size] += 1
+        return render(run, camera, pixels)
 
     def image(self: Stripes, camera: Camera) -> Tensor:
         traced[camera.size] += 1
         return plain(self, camera)
 
     plain = Stripes.image
-    monkeypatch.setattr(evaluate, "render_view", counted)
+    monkeypatch.setattr(evaluator, "render", counted)
     monkeypatch.setattr(Stripes, "image", image)
     run = make_run(tmp_path)
     Evaluator(run, OPTIONS).evaluate(Pictures(tmp_path / "renders", run.step))
@@ -352,15 +352,15 @@ def test_figures_are_those_of_each_picture_by_itself(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     evaluation = Evaluator(run, OPTIONS).evaluate()
     views = run.scene.test
-    small = {view: quantise(render_view(run, view, 1 << 20).image) for view in views}
+    small = {view: quantise(render(run, view.camera).image) for view in views}
     for factor in (1, 2, 4):
         expected = []
         for view in views:
             finer = view.zoom(factor)
             assert finer is not None
-            render = quantise(render_view(run, finer, 1 << 20).image)
+            shown = quantise(render(run, finer.camera).image)
             enlarged = quantise(bicubic(small[view], *finer.camera.size))
-            expected.append([f(i, finer.image()) for i in (render, enlarged) for f in (psnr, inria)])
+            expected.append([f(i, finer.image()) for i in (shown, enlarged) for f in (psnr, inria)])
         entry = evaluation["zoom"][str(factor)]
         means = [sum(column) / len(views) for column in zip(*expected, strict=True)]
         told = [entry[key] for key in ("psnr", "ssim", "enlarged_psnr", "enlarged_ssim")]

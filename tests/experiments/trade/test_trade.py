@@ -14,10 +14,9 @@ from torch.nn.functional import logsigmoid
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splat_files import write_gaussians
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.training.backbone import Gaussians
 from gsx.experiments.reports.charts import Axis, Dot, scatter
 from gsx.experiments.trade.knobs import (
     KNOBS,

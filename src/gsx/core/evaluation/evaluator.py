@@ -17,16 +17,14 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
 from gsx.core.data.images import to_uint8
 from gsx.core.data.scene import View
-from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.lpips import LpipsOptions, load_lpips
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
-from gsx.core.rasterizer import RasterSettings, rasterize_pieces
 from gsx.core.rasterizer.prepare import path_of
 from gsx.core.shapes import Float
 from gsx.core.training.remarks import gathered
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
 LEAST_TILE_PIXELS = 16 * 16
@@ -52,32 +50,6 @@ class EvalOptions:
             raise ValueError(f"eval.zoom is {list(self.zoom)}; give positive factors, for example [1,2,4]")
         if self.tile_pixels < LEAST_TILE_PIXELS:
             raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
-
-
-@dataclass(frozen=True, eq=False)
-class Tiled:
-    """A picture rendered piece by piece."""
-
-    image: Float[Tensor, "3 H W"]
-    visible: int
-    """Splats with a radius on the whole raster."""
-    dropped: int
-    """Splats left out because a value of theirs cannot be drawn."""
-
-
-def render_tiled(
-    splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"], pixels: int
-) -> Tiled:
-    """Render in pieces of at most `pixels`, so that memory does not grow with the picture; clamped to [0, 1]."""
-    mosaic = rasterize_pieces(splats, camera, raster, background=background, pixels=pixels)
-    return Tiled(mosaic.image.clamp_(0, 1), int(mosaic.visible.sum()), mosaic.dropped)
-
-
-@torch.no_grad()
-def render_view(run: Run, view: View, pixels: int) -> Tiled:
-    """The run's model from a view's camera."""
-    run.backbone.begin(max(1, run.step))
-    return render_tiled(run.backbone.splats(view.camera), view.camera, run.raster, run.background, pixels)
 
 
 def render_seconds(times: Sequence[float]) -> float:
@@ -187,7 +159,7 @@ class Evaluator:
     def view(self, view: View) -> dict[str, Any]:
         """Figures of one view at the training resolution."""
         begun = time.perf_counter()
-        tiled = render_view(self.run, view, self.options.tile_pixels)
+        tiled = render(self.run, view.camera, self.options.tile_pixels)
         self.times.append(time.perf_counter() - begun)
         image, truth = self.measured(tiled.image), view.image()
         self.kept[view] = to_uint8(image) if self.options.quantise else image
@@ -197,7 +169,7 @@ class Evaluator:
             "psnr": psnr(image, truth),
             "ssim": ssim(image, truth, self.options.ssim),
             "lpips": None if self.lpips is None else self.lpips.distance(image, truth),
-            "visible": tiled.visible,
+            "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
 
@@ -211,12 +183,12 @@ class Evaluator:
         finer = view.zoom(factor)
         if finer is None:
             return None
-        whole, render = self.whole(view), render_view(self.run, finer, self.options.tile_pixels).image
+        whole, image = self.whole(view), render(self.run, finer.camera, self.options.tile_pixels).image
         return Zoomed(
             view=finer,
             factor=factor,
             truth=finer.image(),
-            render=self.measured(render),
+            render=self.measured(image),
             enlarged=self.measured(bicubic(whole, *finer.camera.size)),
         )
 
@@ -303,4 +275,4 @@ def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
     """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
     stride = max(1, len(run.scene.test) // count)
     views = run.scene.test[::stride][:count]
-    return statistics.fmean(psnr(render_view(run, v, options.tile_pixels).image, v.image()) for v in views)
+    return statistics.fmean(psnr(render(run, v.camera, options.tile_pixels).image, v.image()) for v in views)

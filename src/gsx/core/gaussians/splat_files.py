@@ -11,9 +11,8 @@ from gsx.core.data.camera import offsets_from
 from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply, write_ply
 from gsx.core.gaussians.sh import colours_of
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import Gaussians
 
 SUFFIXES = (".ply",)
 """Of the files that are written."""

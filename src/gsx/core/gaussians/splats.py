@@ -1,4 +1,4 @@
-"""What a backbone hands to the rasterizer for one camera."""
+"""Gaussians: as the rasterizer draws them, and as a standard file holds them."""
 
 from dataclasses import dataclass
 
@@ -24,3 +24,15 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gaussians:
+    """Explicit Gaussians in the raw parameters of a standard splat file."""
+
+    means: Float[Tensor, "N 3"]
+    log_scales: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    opacity_logits: Float[Tensor, "N"]
+    sh_constant: Float[Tensor, "N 3"]
+    sh_rest: Float[Tensor, "N B 3"]

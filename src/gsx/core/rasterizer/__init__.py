@@ -1,21 +1,21 @@
 """The one rasterizer every backbone renders through: project, pair with tiles, sort, composite. Needs only torch."""
 
 from gsx.core.rasterizer.batch import rasterize_batch
-from gsx.core.rasterizer.pieces import Mosaic, rasterize_pieces
 from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.tiled import TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import screen_radii, touches
 
 __all__ = [
-    "Mosaic",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
+    "TiledRendering",
     "drawable",
     "rasterize",
     "rasterize_batch",
-    "rasterize_pieces",
+    "rasterize_tiled",
     "screen_radii",
     "take_rows",
     "touches",

@@ -150,3 +150,16 @@ def locked(stream: IO[str], folder: Path) -> bool:
             f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
             "training the same run: choose another place, output=FOLDER"
         ) from error
+
+
+def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys and values, without those that say where a run ran."""
+    out: dict[str, Any] = {}
+    for key, value in node.items():
+        if f"{prefix}{key}" in (*WHERE, "length"):
+            continue
+        if isinstance(value, dict):
+            out |= flattened(value, f"{prefix}{key}.")
+        else:
+            out[f"{prefix}{key}"] = value
+    return out

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.shapes import Float
 from gsx.core.training.schedule import Schedule
@@ -38,24 +38,24 @@ class Beginning:
         )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Gaussians:
-    """Explicit Gaussians in the raw parameters of a standard splat file."""
+class Drawn(Protocol):
+    """What a backbone draws for one camera; each backbone adds what it needs to learn from the render."""
 
-    means: Float[Tensor, "N 3"]
-    log_scales: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    opacity_logits: Float[Tensor, "N"]
-    sh_constant: Float[Tensor, "N 3"]
-    sh_rest: Float[Tensor, "N B 3"]
+    @property
+    def splats(self) -> Splats:
+        """Explicit Gaussians, differentiable."""
+        ...
+
+
+D = TypeVar("D", bound=Drawn)
 
 
 @runtime_checkable
-class Backbone(Protocol):
-    """A scene representation that trains itself and hands out splats.
+class Backbone(Protocol[D]):
+    """A scene representation that trains itself and draws itself as splats.
 
-    A step calls, in this order: `begin`; for each view `splats`, `regulariser`, (backward), `observe`; for each
-    observation `record`; `adapt`, `update`. Gradients of the views add up in between.
+    A step calls, in this order: for each view `draw`, `regulariser`, (backward), `observe`; for each observation
+    `record`; `adapt`, `update`. Gradients of the views add up in between. Steps count from 1.
     """
 
     @property
@@ -68,20 +68,16 @@ class Backbone(Protocol):
         """Whether `observe` wants absolute gradients in training renders."""
         ...
 
-    def begin(self, step: int) -> None:
-        """Set learning rates and whatever else depends on the step (1-based)."""
+    def draw(self, camera: Camera, step: int) -> D:
+        """The splats of this camera, as the model stands at this step."""
         ...
 
-    def splats(self, camera: Camera) -> Splats:
-        """Explicit Gaussians for this camera, differentiable."""
+    def regulariser(self, drawn: D) -> Float[Tensor, ""] | None:
+        """A term to add to the loss of a view, or None."""
         ...
 
-    def regulariser(self) -> Float[Tensor, ""] | None:
-        """A term to add to the loss for the splats handed out last, or None."""
-        ...
-
-    def observe(self, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """What density control learns from the render of the splats handed out last, after its backward pass.
+    def observe(self, drawn: D, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
+        """What density control learns from a render of what was drawn, after its backward pass.
 
         `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
         photograph (`density.Statistics`).
@@ -96,8 +92,8 @@ class Backbone(Protocol):
         """Change the number of primitives; returns what was done, for the log, empty when nothing."""
         ...
 
-    def update(self) -> None:
-        """Let the optimiser move the parameters, and clear their gradients."""
+    def update(self, step: int) -> None:
+        """Let the optimiser move the parameters, by the learning rates of this step, and clear their gradients."""
         ...
 
     def parameters(self) -> Iterable[tuple[str, Parameter]]:
@@ -108,7 +104,7 @@ class Backbone(Protocol):
         """Name and gradient of every parameter that has one."""
         ...
 
-    def heal(self, cameras: Sequence[Camera] = ()) -> int:
+    def heal(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove primitives with values that are not finite, or that one of the cameras cannot draw; returns how many.
 
         Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
@@ -128,8 +124,8 @@ class Backbone(Protocol):
         """(primitives, bytes of the parameters needed to render)."""
         ...
 
-    def explicit(self, camera: Camera | None = None) -> Gaussians:
-        """Explicit Gaussians of a standard splat file: those a camera draws, or those that hold for all cameras.
+    def explicit(self, camera: Camera | None, step: int) -> Gaussians:
+        """Explicit Gaussians of a standard splat file: those a camera draws, or (None) those that hold for all.
 
         Raises:
             GsxError: no camera is given, and there is no camera-independent form.

@@ -15,20 +15,18 @@ from torch import Tensor
 
 from gsx.core.data.images import to_uint8
 from gsx.core.errors import InputError
-from gsx.core.evaluation.evaluator import render_view
 from gsx.core.files import replace_file
 from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.guard import Guard
+from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import take_step
 
 logger = logging.getLogger(__name__)
 
 HALVES = 2
-TILE_PIXELS = 1 << 20
-"""Pictures are rendered in pieces of this many pixels."""
 
 
 def held_out_renders(run: Run, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
@@ -60,7 +58,7 @@ def made(run: Run, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
     for half in range(HALVES):
         model = trained(without(run, half, steps, seed))
         numbers = range(half, len(views), HALVES)
-        shown |= {n: to_uint8(render_view(model, views[n], TILE_PIXELS).image.cpu()) for n in numbers}
+        shown |= {n: to_uint8(render(model, views[n].camera).image) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 

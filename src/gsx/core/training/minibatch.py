@@ -7,6 +7,7 @@ in the mean loss (`density.Statistics`), so that published thresholds hold for a
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -30,7 +31,7 @@ def views_of_step(run: Run) -> Iterator[list[int]]:
 
 
 @contextmanager
-def added_up(backbone: Backbone) -> Iterator[None]:
+def added_up(backbone: Backbone[Any]) -> Iterator[None]:
     """A view begins without gradients, because its terms may forget some, and ends with the sums of all so far."""
     before = dict(backbone.gradients())
     for _, parameter in backbone.parameters():

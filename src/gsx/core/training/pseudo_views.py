@@ -123,6 +123,12 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool =
     return difference.mean() + view.coarse_weight * size(off).mean()
 
 
+def picture_name(augmenter: str, view: PseudoView) -> str:
+    """File of what a pseudo view was made from, the result, and their difference, side by side."""
+    known = view.provenance
+    return f"{augmenter}_{known['event']:07d}_{view.parent}_x{known['scale']}_{known['kind']}.png"
+
+
 # -- files -------------------------------------------------------------------------------------------------------------
 
 

@@ -92,14 +92,14 @@ class Run:
     """The composed configuration, resolved, JSON-serialisable."""
     folder: Path
     scene: Scene
-    backbone: Backbone
+    backbone: Backbone[Any]
     raster: RasterSettings
     training: TrainingOptions
     iterations: int
     device: torch.device
     generator: torch.Generator
     sampler: Sampler
-    anew: Callable[[Scene, int, torch.Generator], Backbone] | None = None
+    anew: Callable[[Scene, int, torch.Generator], Backbone[Any]] | None = None
     """A backbone of the same options at step 0, for a scene, so many steps and a generator; None: the run is only
     looked at."""
     augmenters: Sequence[Augmenter] = ()
@@ -120,6 +120,11 @@ class Run:
     def complete(self) -> bool:
         """All iterations are done."""
         return self.step >= self.iterations
+
+    @property
+    def model_step(self) -> int:
+        """The step by whose rules the model is drawn between steps: the last one done; before the first that one."""
+        return max(1, self.step)
 
     @property
     def background(self) -> Float[Tensor, "3"]:

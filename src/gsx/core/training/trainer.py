@@ -16,7 +16,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import Observation
+from gsx.core.training.backbone import Drawn, Observation
 from gsx.core.training.minibatch import added_up, merged, views_of_step
 from gsx.core.training.pseudo_views import PseudoView, Telling, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
@@ -45,7 +45,7 @@ def take_step(run: Run, plugins: Plugins) -> Step:
         for seen in step.seen:
             run.backbone.record(seen)
         step.changes.update(run.backbone.adapt(step.number))
-        run.backbone.update()
+        run.backbone.update(step.number)
     run.step = step.number
     synchronise(run.device)
     return step if not reason else replace(step, skipped=reason)
@@ -61,7 +61,7 @@ def veto(run: Run, step: Step, plugins: Plugins) -> str:
 
 def healed(run: Run, step: Step) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
-    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken])
+    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken], step.number)
     if removed:
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
@@ -76,7 +76,6 @@ def backward(run: Run) -> Step:
         picked = run.ranks.share(batch)
         terms = [terms_of(run, number, view) for view in picked]
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
-        run.backbone.begin(number)
         steps = [of_view(run, number, *each) for each in zip(picked, terms, colours, strict=True)]
         step = steps[0] if len(batch) == 1 else merged(run, steps)
         return replace(step, pseudo=asked_for(run, number))
@@ -112,16 +111,16 @@ def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: add_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.taken for term in terms)
-    splats = run.backbone.splats(view.camera)
+    drawn = run.backbone.draw(view.camera, number)
     rendering = rasterize(
-        splats,
+        drawn.splats,
         view.camera,
         run.raster,
         background=colour,
         absolute_gradient=run.backbone.absolute_gradient,
     )
     loss = photometric(rendering.image, target, run.training.ssim_weight)
-    extra = run.backbone.regulariser()
+    extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra
     loss = loss if own == 1 else own * loss
@@ -133,7 +132,7 @@ def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour
             loss = loss + value
     loss.backward()
     served = sum(weight for _, here in divided for _, weight in here)
-    seen.append(observation(run, rendering, number, own + served))
+    seen.append(observation(run, drawn, rendering, number, own + served))
     return Step(
         number=number,
         view=view,
@@ -166,8 +165,9 @@ def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> floa
     """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
     total = 0.0
     for view, weight in term.parts:
+        drawn = run.backbone.draw(view.camera, number)
         rendering = rasterize(
-            run.backbone.splats(view.camera),
+            drawn.splats,
             view.camera,
             run.raster,
             background=run.background,
@@ -177,14 +177,14 @@ def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> floa
         loss.backward()
         total += float(loss.detach())
         if term.observed and math.isfinite(total) and finite_shift(rendering):
-            seen.append(observation(run, rendering, number, weight))
+            seen.append(observation(run, drawn, rendering, number, weight))
     if not term.shared:
         for parameter in run.backbone.shared():
             parameter.grad = None
     return total
 
 
-def observation(run: Run, rendering: Rendering, number: int, weight: float) -> Observation:
+def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weight: float) -> Observation:
     """What density control learns from a render of that weight in the loss of its view; of weight 0 nothing.
 
     The step's loss is the mean over the batch: the weight is divided by it, and the gradients of the screen means are,
@@ -196,7 +196,7 @@ def observation(run: Run, rendering: Rendering, number: int, weight: float) -> O
     for moved in (rendering.screen.shift, rendering.screen.probe):
         if views > 1 and moved is not None and moved.grad is not None:
             moved.grad /= views
-    return run.backbone.observe(rendering, number, weight / views)
+    return run.backbone.observe(drawn, rendering, number, weight / views)
 
 
 def finite_shift(rendering: Rendering) -> bool:

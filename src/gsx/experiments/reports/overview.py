@@ -16,7 +16,7 @@ from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.run_folder.files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
-from gsx.core.run_folder.run_key import WHERE
+from gsx.core.run_folder.run_key import flattened
 from gsx.experiments.reports.baselines import control_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
@@ -181,19 +181,6 @@ def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
     """Keys whose values are not the same in all configurations, in their order."""
     keys = dict.fromkeys(key for config in configs for key in config)
     return [key for key in keys if len({repr(config.get(key)) for config in configs}) > 1]
-
-
-def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys and values, without those that say where a run ran."""
-    out: dict[str, Any] = {}
-    for key, value in node.items():
-        if f"{prefix}{key}" in (*WHERE, "length"):
-            continue
-        if isinstance(value, dict):
-            out |= flattened(value, f"{prefix}{key}.")
-        else:
-            out[f"{prefix}{key}"] = value
-    return out
 
 
 def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:

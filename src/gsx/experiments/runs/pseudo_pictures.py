@@ -4,12 +4,11 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from gsx.core.data.images import write_image
-from gsx.core.evaluation.evaluator import EvalOptions, render_tiled
+from gsx.core.evaluation.evaluator import EvalOptions
 from gsx.core.files import write_json
-from gsx.core.training.pseudo_views import PseudoView, load_views
+from gsx.core.training.pseudo_views import PseudoView, load_views, picture_name
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -34,12 +33,6 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
         write_json(folder / "index.json", {"views": entries})
 
 
-def picture_name(augmenter: str, view: PseudoView) -> str:
-    """File of what a pseudo view was made from, the result, and their difference, side by side."""
-    known = view.provenance
-    return f"{augmenter}_{known['event']:07d}_{view.parent}_x{known['scale']}_{known['kind']}.png"
-
-
 def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list[PseudoView]:
     """One view for each picture that there is."""
     complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
@@ -47,12 +40,9 @@ def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list
     return [view for name, view in by_name.items() if (folder / name).is_file()]
 
 
-@torch.no_grad()
 def shown(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
     """Render one of them; returns its entry in the index."""
-    run.backbone.begin(max(1, run.step))
-    splats = run.backbone.splats(view.camera)
-    after = render_tiled(splats, view.camera, run.raster, run.background, options.tile_pixels).image.cpu()
+    after = render(run, view.camera, options.tile_pixels).image
     made = picture_name(augmenter, view)
     name = made.replace(".png", "_after.png")
     write_image(run.folder / "pseudo" / name, after)

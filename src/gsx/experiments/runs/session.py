@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from gsx import __version__
 from gsx.core.cache import cache_root, source_revision
@@ -24,13 +23,13 @@ from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.device import device_name
 from gsx.core.errors import CheckpointError, ConfigError, Disagreement, InputError, TrainingError, nearest
-from gsx.core.evaluation.evaluator import Evaluator, render_tiled
+from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.files import write_json
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.quality.lpips import load_lpips
 from gsx.core.quality.metrics import psnr
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.rasterizer.prepare import decide, path_of, warm
 from gsx.core.run_folder import checkpoint
 from gsx.core.run_folder.files import RunFiles, read_run
@@ -43,13 +42,13 @@ from gsx.core.run_folder.run_key import (
     scene_stamp,
     trained_on,
 )
-from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, Beginning
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.guard import Agreement, Guard
 from gsx.core.training.pseudo_views import Augmenter, Setting
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.remarks import CapNotice, remarks_of
+from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, Step
 from gsx.core.training.trainer import train
 from gsx.experiments.reports.pictures import Pictures, file_names
@@ -610,8 +609,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
     if camera is None:
         write_columns(path, run.backbone.file(), comments)
     else:
-        run.backbone.begin(max(1, run.step))
-        write_gaussians(path, run.backbone.explicit(camera), comments)
+        write_gaussians(path, run.backbone.explicit(camera, run.model_step), comments)
 
 
 def render_mode(raster: RasterSettings) -> str:
@@ -643,22 +641,15 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     """Write every test view at `zoom` times the training resolution as PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     for view, name in zip(run.scene.test, file_names([view.name for view in run.scene.test]), strict=True):
-        picture = render_camera(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels)
-        write_image(folder / f"{name}.png", picture)
-
-
-def render_camera(run: Run, camera: Camera, pixels: int) -> Float[Tensor, "3 H W"]:
-    """The run's model from any camera."""
-    run.backbone.begin(max(1, run.step))
-    with torch.no_grad():
-        return render_tiled(run.backbone.splats(camera), camera, run.raster, run.background, pixels).image
+        picture = render(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels)
+        write_image(folder / f"{name}.png", picture.image)
 
 
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
     """Animate a closed path around the scene."""
     pixels = settings.evaluation.tile_pixels
     cameras = (camera.zoom(zoom) for camera in orbit_cameras(run.scene, frames))
-    write_animation(path, (render_camera(run, camera, pixels) for camera in cameras), fps)
+    write_animation(path, (render(run, camera, pixels).image for camera in cameras), fps)
 
 
 def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View]) -> str:
@@ -667,6 +658,6 @@ def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View
     figures = []
     for view in views[:5]:
         splats = splats_of(gaussians, view.camera.centre)
-        again = render_tiled(splats, view.camera, run.raster, run.background.cpu(), pixels).image
-        figures.append(psnr(again, render_camera(run, view.camera, pixels)))
+        again = rasterize_tiled(splats, view.camera, run.raster, background=run.background.cpu(), pixels=pixels)
+        figures.append(psnr(again.image.clamp(0, 1), render(run, view.camera, pixels).image))
     return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical)"

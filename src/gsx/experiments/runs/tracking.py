@@ -5,14 +5,13 @@ begins, and raises ConfigError; whatever its events raise is warned of once, and
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib import import_module
 from typing import Any
 
 import pluggy
 
-from gsx.core.errors import ConfigError, TrainingError, first_line
+from gsx.core.errors import TrainingError, first_line
 from gsx.core.plugins import GROUP, Hooks, Plugins, hookimpl, refuse_unmarked
 from gsx.core.training.run import Run, Step
 from gsx.experiments.runs.config import Chosen
@@ -27,16 +26,6 @@ def build_trackers(trackers: Mapping[str, Chosen]) -> "list[Tracking]":
         ConfigError: a tracker lacks a package or cannot work with its options.
     """
     return [Tracking(name, chosen.component.factory(chosen.options)) for name, chosen in trackers.items()]
-
-
-def require(tracker: str, packages: Sequence[str], extra: str) -> None:
-    """Raise ConfigError if a package cannot be imported; `extra`: what pip is to install."""
-    for package in packages:
-        try:
-            import_module(package)
-        except ImportError as error:
-            remedy = f"pip install '{extra}'"
-            raise ConfigError(f"tracker {tracker} needs {package} ({first_line(error)}): {remedy}") from error
 
 
 class Tracking:

@@ -9,10 +9,9 @@ from typing import Any
 from gsx.core.cache import source_revision
 from gsx.core.files import read_json
 from gsx.core.run_folder.files import RunFiles, is_number, part, read_run, state_of
-from gsx.core.run_folder.run_key import NAMES, OPERATING, WATCHING, WHERE, asked_for, other_revision, without
+from gsx.core.run_folder.run_key import NAMES, OPERATING, WATCHING, WHERE, asked_for, flattened, other_revision, without
 from gsx.core.training.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
-from gsx.experiments.reports.overview import flattened
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published

@@ -18,6 +18,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
+from gsx.core.training.render import splats_for
 from gsx.experiments.runs.config import compose
 from gsx.experiments.runs.session import choose_device, load_scene, open_run
 
@@ -80,10 +81,8 @@ def open_subject(target: Path | None, overrides: Sequence[str], views: int, plug
 def subject_of_run(folder: Path, overrides: Sequence[str], views: int, plugins: Plugins) -> Subject:
     """The model of a run, seen by its test views."""
     run, settings = open_run(folder, plugins, overrides)
-    run.backbone.begin(max(1, run.step))
     chosen, note = choose_views(run.scene, views)
-    with torch.no_grad():
-        shots = [Shot(name=v.name, camera=v.camera, splats=detached(run.backbone.splats(v.camera))) for v in chosen]
+    shots = [Shot(name=v.name, camera=v.camera, splats=detached(splats_for(run, v.camera))) for v in chosen]
     return Subject(
         name=f"run {folder} at step {run.step:,}",
         notes=(note,),

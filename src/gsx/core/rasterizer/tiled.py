@@ -57,7 +57,7 @@ def windows(width: int, height: int, pixels: int, unit: int) -> Iterator[Window]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Mosaic:
+class TiledRendering:
     """A picture gathered from pieces; its tensors are on the CPU and have no gradient."""
 
     image: Float[Tensor, "C H W"]
@@ -74,10 +74,10 @@ class Mosaic:
     """Windows rendered."""
 
     @staticmethod
-    def empty(splats: Splats, camera: Camera, depth: bool) -> "Mosaic":
+    def empty(splats: Splats, camera: Camera, depth: bool) -> "TiledRendering":
         """Room for the picture."""
         raster, like = (camera.height, camera.width), splats.colours.new_empty(0, device="cpu")
-        return Mosaic(
+        return TiledRendering(
             image=like.new_empty(splats.colours.shape[1], *raster),
             alpha=like.new_empty(raster),
             depth=like.new_empty(raster) if depth else None,
@@ -120,7 +120,7 @@ def renderings(
 
 
 @torch.no_grad()
-def rasterize_pieces(
+def rasterize_tiled(
     splats: Splats,
     camera: Camera,
     settings: RasterSettings,
@@ -128,7 +128,7 @@ def rasterize_pieces(
     background: Float[Tensor, "C"] | None = None,
     depth: bool = False,
     pixels: int = 1 << 20,
-) -> Mosaic:
+) -> TiledRendering:
     """What `rasterize` draws without gradients, bit for bit, in windows of at most `pixels` px (but at least a tile).
 
     Beyond the result, memory grows with `pixels` and with the pairs of one window, not with the raster. Windows that
@@ -139,9 +139,9 @@ def rasterize_pieces(
     """
     if pixels < 1:
         raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {1 << 20}")
-    mosaic, count, dropped = Mosaic.empty(splats, camera, depth), 0, 0
+    tiled, count, dropped = TiledRendering.empty(splats, camera, depth), 0, 0
     for window in windows(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
         for place, part in renderings(splats, camera, settings, window, background, depth):
-            mosaic.put(place, part)
+            tiled.put(place, part)
             count, dropped = count + 1, part.dropped
-    return replace(mosaic, pieces=count, dropped=dropped)
+    return replace(tiled, pieces=count, dropped=dropped)

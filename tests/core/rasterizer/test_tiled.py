@@ -5,10 +5,10 @@ import torch
 from raster_scenes import changed, front_camera, leaves, random_splats, run_script
 
 from gsx.core.errors import InputError
-from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_pieces
+from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.compiled import available
-from gsx.core.rasterizer.pieces import Window, windows
 from gsx.core.rasterizer.reference import render_reference
+from gsx.core.rasterizer.tiled import Window, windows
 
 
 @pytest.mark.parametrize("cull", ["published", "tight"])
@@ -16,7 +16,7 @@ from gsx.core.rasterizer.reference import render_reference
 def test_pieces_are_the_whole_bit_for_bit(pixels: int, cull: str) -> None:
     splats, rules, colour = random_splats(), RasterSettings(cull=cull), torch.tensor([0.2, 0.5, 0.9])
     whole = rasterize(splats, front_camera(), rules, background=colour, depth=True)
-    mosaic = rasterize_pieces(splats, front_camera(), rules, background=colour, depth=True, pixels=pixels)
+    mosaic = rasterize_tiled(splats, front_camera(), rules, background=colour, depth=True, pixels=pixels)
     assert torch.equal(mosaic.image, whole.image)
     assert torch.equal(mosaic.alpha, whole.alpha)
     assert torch.equal(mosaic.depth, whole.depth)
@@ -29,7 +29,7 @@ def test_pieces_of_the_compiled_path_are_the_whole_without_gradients() -> None:
     rules = RasterSettings(path="compiled", unrolled=2)
     with torch.no_grad():
         whole = rasterize(random_splats(), front_camera(), rules).image
-    mosaic = rasterize_pieces(random_splats(), front_camera(), rules, pixels=500)
+    mosaic = rasterize_tiled(random_splats(), front_camera(), rules, pixels=500)
     assert mosaic.pieces > 1
     assert torch.equal(mosaic.image, whole)
 
@@ -37,7 +37,7 @@ def test_pieces_of_the_compiled_path_are_the_whole_without_gradients() -> None:
 def test_pieces_of_a_crop_and_of_large_tiles_are_the_whole_too() -> None:
     camera, rules = front_camera(200, 150).crop(-13, 21, 180, 140), RasterSettings(cull="tight", tile_size=24)
     whole = rasterize(random_splats(), camera, rules).image
-    assert torch.equal(rasterize_pieces(random_splats(), camera, rules, pixels=4000).image, whole)
+    assert torch.equal(rasterize_tiled(random_splats(), camera, rules, pixels=4000).image, whole)
 
 
 def test_pieces_with_too_many_pairs_are_halved_until_they_fit() -> None:
@@ -46,23 +46,23 @@ def test_pieces_with_too_many_pairs_are_halved_until_they_fit() -> None:
     rules = RasterSettings(max_pairs=whole.pairs // 4)
     with pytest.raises(InputError, match="max_pairs"):
         rasterize(splats, front_camera(), rules)
-    mosaic = rasterize_pieces(splats, front_camera(), rules)
+    mosaic = rasterize_tiled(splats, front_camera(), rules)
     assert mosaic.pieces >= 4
     assert torch.equal(mosaic.image, whole.image)
 
 
 def test_a_tile_with_too_many_pairs_is_refused() -> None:
     with pytest.raises(InputError, match=r"16x16 px needs \d+ splat-tile pairs, more than rasterizer.max_pairs=3"):
-        rasterize_pieces(random_splats(), front_camera(), RasterSettings(max_pairs=3))
+        rasterize_tiled(random_splats(), front_camera(), RasterSettings(max_pairs=3))
     with pytest.raises(InputError, match="pieces of 0 px"):
-        rasterize_pieces(random_splats(), front_camera(), RasterSettings(), pixels=0)
+        rasterize_tiled(random_splats(), front_camera(), RasterSettings(), pixels=0)
 
 
 def test_non_finite_splats_are_counted_once_and_nothing_learns() -> None:
     splats = leaves(random_splats())
     with torch.no_grad():
         splats.means[3] = torch.nan
-    mosaic = rasterize_pieces(splats, front_camera(), RasterSettings(), pixels=500)
+    mosaic = rasterize_tiled(splats, front_camera(), RasterSettings(), pixels=500)
     assert mosaic.dropped == 1
     assert not mosaic.image.requires_grad
 
@@ -93,8 +93,8 @@ def test_a_window_of_a_64_fold_zoom_is_that_of_the_zoomed_render_and_of_the_trut
     splats, rules = random_splats(80), RasterSettings(cull="tight")
     zoomed = front_camera(20, 15).zoom(64)  # 1280 x 960
     window = (610, 400, 64, 48)
-    part = rasterize_pieces(splats, zoomed.crop(*window), rules, pixels=1000)
-    whole = rasterize_pieces(splats, zoomed, rules, pixels=1 << 18)
+    part = rasterize_tiled(splats, zoomed.crop(*window), rules, pixels=1000)
+    whole = rasterize_tiled(splats, zoomed, rules, pixels=1 << 18)
     assert torch.equal(part.image, whole.image[:, 400:448, 610:674])
     truth = render_reference(changed(splats, dtype=torch.float64), zoomed.crop(*window), rules)[0]
     assert truth.std() > 0.05
@@ -104,10 +104,10 @@ def test_a_window_of_a_64_fold_zoom_is_that_of_the_zoomed_render_and_of_the_trut
 LARGE = """
 import json, resource, sys, torch
 from raster_scenes import front_camera, random_splats
-from gsx.core.rasterizer import RasterSettings, rasterize_pieces
+from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
 splats, before = random_splats(300, size=0.02), peak()
-mosaic = rasterize_pieces(splats, front_camera(7680, 4320), RasterSettings(), pixels=1 << 19)
+mosaic = rasterize_tiled(splats, front_camera(7680, 4320), RasterSettings(), pixels=1 << 19)
 finite = all(bool(torch.isfinite(row).all()) for row in mosaic.image.flatten(0, 1).split(1000))
 print(json.dumps({"before": before, "peak": peak(), "size": list(mosaic.image.shape), "finite": finite,
     "covered": float(mosaic.alpha.mean()), "pieces": mosaic.pieces}))
