@@ -12,7 +12,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import to_uint8
 from gsx.core.data.reduction import as_blocks, box_average
 from gsx.core.data.scene import View
-from gsx.core.training.pseudo_views import Setting
+from gsx.core.training.augmenter import Setting
 from gsx.core.training.regenerator import Checks, Material, Request
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import typed

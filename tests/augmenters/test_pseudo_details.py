@@ -19,7 +19,8 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
-from gsx.core.training.pseudo_views import Augmenter, PseudoView, Term, load_views, pseudo_loss, save_views
+from gsx.core.training.augmenter import Augmenter
+from gsx.core.training.pseudo_views import PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.training.regenerator import Material
 from gsx.core.training.render import render
 from gsx.core.training.run import Run

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsx.core.data.images import to_uint8
+from gsx.core.training.augmenter import Setting
 from gsx.core.training.material import material_of
-from gsx.core.training.pseudo_views import PseudoView, Setting, Term
+from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Request
 from gsx.core.training.run import Run
 

@@ -38,8 +38,9 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.run_folder.checkpoint import sidecars, step_of
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
+from gsx.core.training.augmenter import Setting
 from gsx.core.training.material import material_of
-from gsx.core.training.pseudo_views import PseudoView, Setting, Term, load_views, picture_name, save_views
+from gsx.core.training.pseudo_views import PseudoView, Term, load_views, picture_name, save_views
 from gsx.core.training.regenerator import (
     Checked,
     Checks,

@@ -9,7 +9,7 @@ from tiny import tiny_settings
 from gsx.augmenters.pseudo_details import PseudoOptions
 from gsx.cli import plugins
 from gsx.core.run_folder.run_key import composition_key
-from gsx.core.training.pseudo_views import Foretold
+from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import Compositions, Settings
 from gsx.experiments.runs.session import start

@@ -1,23 +1,18 @@
 """Pseudo details: pictures that nobody took, which training uses as truth for a while (spec 1.1-1.3)."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.data.reduction import Reduction
-from gsx.core.data.scene import Scene
 from gsx.core.files import replace_file
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.regenerator import Regenerator
-
-if TYPE_CHECKING:
-    from gsx.core.training.run import Run
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,57 +51,6 @@ class Term:
     """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
     squared: bool = False
     """Differences are (render - target)^2 instead of the paper's |render - target|."""
-
-
-@runtime_checkable
-class Augmenter(Protocol):
-    """Makes pseudo views from training views, and says when they count."""
-
-    def term(self, run: "Run", step: int, view: int) -> Term | None:
-        """What this step adds for the training view that was picked; None outside the active windows.
-
-        The first call of a window makes its pseudo views, from the model as it is then.
-        """
-        ...
-
-    def begins(self) -> int:
-        """Steps that a run has in common with one without this augmenter."""
-        ...
-
-    def plan(self) -> dict[str, Any]:
-        """The rescaled schedule in absolute steps, for the log and the report."""
-        ...
-
-
-@runtime_checkable
-class Telling(Protocol):
-    """An augmenter that tells what became of the pictures it asked for; metrics.jsonl and evaluations count them."""
-
-    def told(self, step: int) -> dict[str, Any]:
-        """At the first step that asks for new pictures their `event`, and by scale how many were `asked` for, how many
-        `dropped`, and `warned` of by check; else empty. JSON-serialisable."""
-        ...
-
-
-@runtime_checkable
-class Foretold(Protocol):
-    """Options of an augmenter that tell, before there is a scene, where it begins; plans over many runs ask."""
-
-    def begins(self, iterations: int) -> int:
-        """What `Augmenter.begins` will say in a run of that length."""
-        ...
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Setting:
-    """What an augmenter is built from."""
-
-    name: str
-    scene: Scene
-    iterations: int
-    seed: int
-    regenerator: Callable[[str], Regenerator]
-    """The regenerator of a role, `upscale` or `restore`."""
 
 
 def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:

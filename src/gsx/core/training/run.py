@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.distributed import Ranks
-from gsx.core.training.pseudo_views import Augmenter
+from gsx.core.training.pseudo_views import Term
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +82,26 @@ class Sampler:
         """The order of that number."""
         generator = torch.Generator().manual_seed(derived_seed("views", self.seed, number))
         return torch.randperm(self.count, generator=generator).tolist()
+
+
+@runtime_checkable
+class Augmenter(Protocol):
+    """Makes pseudo views from training views, and says when they count."""
+
+    def term(self, run: "Run", step: int, view: int) -> Term | None:
+        """What this step adds for the training view that was picked; None outside the active windows.
+
+        The first call of a window makes its pseudo views, from the model as it is then.
+        """
+        ...
+
+    def begins(self) -> int:
+        """Steps that a run has in common with one without this augmenter."""
+        ...
+
+    def plan(self) -> dict[str, Any]:
+        """The rescaled schedule in absolute steps, for the log and the report."""
+        ...
 
 
 @dataclass(eq=False, kw_only=True)

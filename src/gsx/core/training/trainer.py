@@ -16,9 +16,10 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
+from gsx.core.training.augmenter import Telling
 from gsx.core.training.backbone import Drawn, Observation
 from gsx.core.training.minibatch import added_up, merged, views_of_step
-from gsx.core.training.pseudo_views import PseudoView, Telling, Term, pseudo_loss
+from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)

@@ -42,10 +42,10 @@ from gsx.core.run_folder.run_key import (
     scene_stamp,
     trained_on,
 )
+from gsx.core.training.augmenter import Augmenter, Setting
 from gsx.core.training.backbone import Backbone, Beginning
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.guard import Agreement, Guard
-from gsx.core.training.pseudo_views import Augmenter, Setting
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.remarks import CapNotice, remarks_of
 from gsx.core.training.render import render
