@@ -12,8 +12,8 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import to_uint8
 from gsx.core.data.reduction import as_blocks, box_average
 from gsx.core.data.scene import View
-from gsx.core.training.augmenter import Setting
-from gsx.core.training.regenerator import Checks, Material, Request
+from gsx.core.training.augmenter import AugmenterContext
+from gsx.core.training.regenerator import Checks, RegeneratorContext, Request
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import typed
 
@@ -66,7 +66,7 @@ class Made:
     def __init__(self, enlarge: Callable[[Request], Tensor]) -> None:
         self.enlarge = enlarge
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         return {}
 
     def regenerate(self, requests: Sequence[Request]) -> list[Tensor]:
@@ -84,5 +84,5 @@ def through_an_autoencoder(request: Request) -> Tensor:
 def noisy(options: PseudoOptions, name: str, run: Run) -> PseudoDetails:
     """An augmenter by these options on the scene of a run, redrawn through an autoencoder."""
     made = Made(through_an_autoencoder)
-    setting = Setting(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=lambda role: made)
-    return PseudoDetails(options, setting)
+    context = AugmenterContext(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=lambda role: made)
+    return PseudoDetails(options, context)

@@ -11,7 +11,7 @@ from gsx.backbones.gs3d import GS3D, GS3DOptions
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.backbone import Beginning
+from gsx.core.training.backbone import BackboneContext
 from gsx.experiments.runs.config import typed
 
 
@@ -51,14 +51,14 @@ def published_options(**density: float) -> GS3DOptions:
 
 def small_gs3d(scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None) -> GS3D:
     """The backbone at step 0."""
-    beginning = Beginning(
+    context = BackboneContext(
         scene=scene,
         iterations=iterations,
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
     )
-    return GS3D(options or published_options(), beginning)
+    return GS3D(options or published_options(), context)
 
 
 def spread(count: int, seed: int = 0) -> Tensor:

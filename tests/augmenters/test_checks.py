@@ -27,7 +27,7 @@ LATENT = ("regenerator/upscale=sd_x2_latent", "regenerator/restore=sdxl_turbo")
 def by_hand(run: Run, enlarge: Callable[[Request], Tensor], **changes: Any) -> PseudoDetails:
     """The run's first augmenter with a regenerator made of a function."""
     old, made = augmenter_of(run), Made(enlarge)
-    return PseudoDetails(replace(old.options, **changes), replace(old.setting, regenerator=lambda role: made))
+    return PseudoDetails(replace(old.options, **changes), replace(old.context, regenerator=lambda role: made))
 
 
 # -- every regenerator by what it can do -------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import gsx.augmenters.pseudo_details as pseudo_details
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.cli import main, plugins
 from gsx.core.quality.metrics import psnr
-from gsx.core.training.regenerator import Material, Request, displacement
+from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train
@@ -49,7 +49,7 @@ class Displaced:
     def __init__(self, pixels: float) -> None:
         self.pixels = pixels
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         return {}
 
     def regenerate(self, requests: list[Request]) -> list[Tensor]:
@@ -86,8 +86,8 @@ def trained(folder: Path, pixels: float | None) -> Seen:
     if pixels is not None:
         (augmenter,) = run.augmenters
         assert isinstance(augmenter, PseudoDetails)
-        setting = replace(augmenter.setting, regenerator=lambda role: Displaced(pixels))
-        run = replace(run, augmenters=[PseudoDetails(augmenter.options, setting)])
+        context = replace(augmenter.context, regenerator=lambda role: Displaced(pixels))
+        run = replace(run, augmenters=[PseudoDetails(augmenter.options, context)])
     train(run, plugins())
     return seen(run)
 

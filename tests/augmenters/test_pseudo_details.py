@@ -21,7 +21,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.augmenter import Augmenter
 from gsx.core.training.pseudo_views import PseudoView, Term, load_views, pseudo_loss, save_views
-from gsx.core.training.regenerator import Material
+from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
@@ -55,7 +55,7 @@ def augmenter_of(run: Run, number: int = 0) -> PseudoDetails:
 def by_options(run: Run, **changes: Any) -> PseudoDetails:
     """The run's first augmenter with other options."""
     old = augmenter_of(run)
-    return PseudoDetails(replace(old.options, **changes), old.setting)
+    return PseudoDetails(replace(old.options, **changes), old.context)
 
 
 # -- the loss ----------------------------------------------------------------------------------------------------------
@@ -470,7 +470,7 @@ class Spoiling:
     def __init__(self, every: int, spoil: Any) -> None:
         self.every, self.spoil, self.calls = every, spoil, 0
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         return {}
 
     def regenerate(self, requests: Any) -> list[Tensor]:
@@ -493,7 +493,7 @@ SPOILT = {
 
 def with_regenerator(run: Run, regenerator: Any) -> PseudoDetails:
     old = augmenter_of(run)
-    return PseudoDetails(old.options, replace(old.setting, regenerator=lambda role: regenerator))
+    return PseudoDetails(old.options, replace(old.context, regenerator=lambda role: regenerator))
 
 
 @pytest.mark.parametrize("reason", SPOILT)
@@ -529,7 +529,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
     for samples in (1, 16):
         old = augmenter_of(run)
         options = replace(old.options, samples=samples, seeds="per_view")
-        noisy = PseudoDetails(options, replace(old.setting, regenerator=lambda role: Noisy(10**9, None)))
+        noisy = PseudoDetails(options, replace(old.context, regenerator=lambda role: Noisy(10**9, None)))
         noisy.term(run, 45, 0)
         pairs = [(a.target.float(), b.target.float()) for a, b in zip(plain.views[0], noisy.views[0], strict=True)]
         errors.append(float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean()))

@@ -21,7 +21,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, touches
-from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.experiments.runs.config import Settings, compose
 from gsx.experiments.runs.session import execute, open_run
 
@@ -44,14 +44,14 @@ def small_anchors(
 ) -> Anchors:
     """A backbone of conf/backbone at step 0 of its published run, with overrides below `backbone`."""
     chosen = settings_of(name, *overrides).backbone
-    beginning = Beginning(
+    context = BackboneContext(
         scene=scene or small_scene(spread(60)),
         iterations=iterations or chosen.options.published_iterations,
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
     )
-    return chosen.component.factory(chosen.options, beginning)
+    return chosen.component.factory(chosen.options, context)
 
 
 def stir(backbone: Anchors) -> None:

@@ -31,7 +31,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.gaussians.splat_files import splats_of, write_columns
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import within_room
 from gsx.experiments.runs.config import compose, read_config, write_config
 from gsx.experiments.runs.session import execute, open_run
@@ -59,14 +59,14 @@ def deep_scene(colours: Tensor | None = None, background: float = 0.0) -> Scene:
 def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 40000) -> GS3D:
     """Three levels of free Gaussians at step 0 of the published run; D is 8."""
     options = options_of("levels.count=3", "levels.base_layer=3", "levels.visible_threshold=0", *overrides)
-    beginning = Beginning(
+    context = BackboneContext(
         scene=scene or deep_scene(),
         iterations=iterations,
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
     )
-    backbone = GS3D(free_gaussians(options), beginning)
+    backbone = GS3D(free_gaussians(options), context)
     assert backbone.levels is not None
     backbone.levels = replace(backbone.levels, farthest=8.0)
     return backbone

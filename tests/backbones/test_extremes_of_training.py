@@ -12,7 +12,7 @@ from gsx.core.data.camera import look_at
 from gsx.core.data.scene import Scene, View
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
-from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.experiments.runs.config import compose
 from gsx.experiments.runs.session import in_units, measured, warned_of_units
 
@@ -30,14 +30,14 @@ STEPS = 30
 
 def built(name: str, scene: Scene) -> Backbone:
     settings = compose([f"backbone={name.split(',')[0]}", *BACKBONES[name]], plugins())
-    beginning = Beginning(
+    context = BackboneContext(
         scene=scene,
         iterations=STEPS,
         device=torch.device("cpu"),
         raster=settings.raster,
         generator=torch.Generator().manual_seed(0),
     )
-    return settings.backbone.component.factory(settings.backbone.options, beginning)
+    return settings.backbone.component.factory(settings.backbone.options, context)
 
 
 def trained(backbone: Backbone, scene: Scene) -> list[float]:

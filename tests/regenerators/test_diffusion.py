@@ -21,7 +21,7 @@ from gsx.cli import main, plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.training.regenerator import Material, Request, displacement
+from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
 from gsx.experiments.runs.config import compose
 from gsx.experiments.runs.session import open_run
 from gsx.regenerators.diffusion.ladder import Ladder
@@ -107,7 +107,7 @@ class Shown:
         return 1.0
 
 
-def material(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> Material:
+def context_for(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> RegeneratorContext:
     """Training views that show pairs' photographs, and models that show their renders."""
     scene = small_scene(spread(4), views=len(pairs or [1, 2]))
     views = scene.train
@@ -120,7 +120,7 @@ def material(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> 
             for view, camera, (_, photo) in zip(views, cameras, pairs, strict=True)
         ]
         renders = {id(view.camera): render for view, (render, _) in zip(views, pairs, strict=True)}
-    return Material(
+    return RegeneratorContext(
         views=views,
         render=lambda camera: renders[id(camera)],
         held_out=lambda share: [render for render, _ in pairs or []],
@@ -134,7 +134,7 @@ def material(folder: Path, pairs: list[tuple[Tensor, Tensor]] | None = None) -> 
 def ready(name: str, folder: Path, *more: str, model: Path) -> Diffusion:
     """A regenerator with its model in memory."""
     out = Diffusion(RECIPES[name], options_of(name, *more, model=model))
-    out.prepare(material(folder))
+    out.prepare(context_for(folder))
     return out
 
 
@@ -311,7 +311,7 @@ def test_the_ladder_reaches_every_scale_by_the_model_for_it(models: dict[str, Pa
         compose([*words, f"regenerator.upscale.x4.model={models['sd_x4']}"], plugins()).regenerators["upscale"].options
     )
     whole.check(views, [1, 2, 4, 8], False)
-    whole.prepare(material(tmp_path))
+    whole.prepare(context_for(tmp_path))
     image = noise(9, 13)
     two, eight, one, four = whole.regenerate([request(image, scale) for scale in (2, 8, 1, 4)])
     assert torch.equal(one, image)
@@ -394,7 +394,7 @@ def test_any_pipeline_is_called_as_its_options_say(models: dict[str, Path], tmp_
     ]
     general = any_pipeline(compose(words, plugins()).regenerators["upscale"].options)
     general.check(small_scene(spread(4)).train, [4], True)
-    general.prepare(material(tmp_path))
+    general.prepare(context_for(tmp_path))
     asked = [request(noise(20, 30), 4)]
     named = ready("sd_x4", tmp_path, model=models["sd_x4"])
     assert torch.equal(general.regenerate(asked)[0], named.regenerate(asked)[0])
@@ -414,7 +414,7 @@ def test_a_pipeline_of_ones_own_is_opened_from_its_file(models: dict[str, Path],
     words.append(f"regenerator.restore.custom={file}")
     general = any_pipeline(compose(words, plugins()).regenerators["restore"].options)
     general.check(small_scene(spread(4)).train, [1], True)
-    general.prepare(material(tmp_path))
+    general.prepare(context_for(tmp_path))
     (result,) = general.regenerate([request(noise(9, 13), 1)])
     assert float((result - noise(9, 13).mean(0)).abs().max()) <= 0.51 / 255
 
@@ -592,14 +592,14 @@ def test_tuning_lowers_the_error_on_views_it_has_not_seen(
     and both restore alike."""
     options = options_of("sdxl_turbo", *TUNING, f"regenerator.restore.dtype={dtype}", model=models["useful"])
     first = Diffusion(SDXL_TURBO, options)
-    figures = first.prepare(material(tmp_path / "first", pairs))
+    figures = first.prepare(context_for(tmp_path / "first", pairs))
     assert figures["error_tuned"] < 0.5 * figures["error_raw"]
     assert figures["error_tuned"] < 0.5 * figures["error_of_renders"]
     facts = json.loads((tmp_path / "first" / "sdxl_turbo" / "adapter.json").read_text())
     assert facts["used"]
     assert facts["views"] == [f"view{n}" for n in range(8)]
     second = Diffusion(SDXL_TURBO, options)
-    assert second.prepare(material(tmp_path / "second", pairs)) == figures
+    assert second.prepare(context_for(tmp_path / "second", pairs)) == figures
     fresh = worn(tiny_models.pictures(2, 33, 41, torch.Generator().manual_seed(2)))
     for number, (render, photo) in enumerate(fresh):
         asked = request(render, 1, seed=number)
@@ -619,7 +619,7 @@ def test_an_adapter_that_does_harm_is_not_used(
     """Learnt at a rate that ruins it, or ends in no number; restored pictures are those of the model as it was."""
     ruined = [*TUNING, f"regenerator.restore.tuning.rate={rate}", "regenerator.restore.tuning.steps=4"]
     tuned = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *ruined, model=models["useful"]))
-    figures = tuned.prepare(material(tmp_path, pairs))
+    figures = tuned.prepare(context_for(tmp_path, pairs))
     assert not figures["error_tuned"] <= figures["error_raw"]
     assert all(isinstance(value, float) for value in figures.values())
     assert "the model stays as it is" in caplog.text
@@ -635,7 +635,7 @@ def test_an_adapter_that_beats_the_model_but_not_the_renders_is_not_used(
     photos = tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1))
     pairs = [((photo - 0.04).clamp(0, 1), photo) for photo in photos]
     tuned = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *TUNING, model=models["useful"]))
-    figures = tuned.prepare(material(tmp_path, pairs))
+    figures = tuned.prepare(context_for(tmp_path, pairs))
     assert figures["error_of_renders"] < figures["error_tuned"] < figures["error_raw"]
     facts = json.loads((tmp_path / "sdxl_turbo" / "adapter.json").read_text())
     assert (facts["used"], facts["best"]) == (False, "renders")
@@ -663,7 +663,7 @@ def test_tuning_learns_and_measures_on_held_out_renders(models: dict[str, Path],
     """A run whose own renders are the photographs is not measured on these."""
     pairs = worn(tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1)))
     few = [*TUNING, "regenerator.restore.tuning.steps=2", "regenerator.restore.tuning.halves=0.4"]
-    given, asked = material(tmp_path, pairs), list[float]()
+    given, asked = context_for(tmp_path, pairs), list[float]()
     photos = {id(view.camera): view.image() for view in given.views}
 
     def held_out(share: float) -> list[Tensor]:
@@ -683,10 +683,10 @@ def test_a_damaged_adapter_is_named(
 ) -> None:
     """Not learnt again behind the user's back: the run had another one."""
     options = options_of("sdxl_turbo", *TUNING, model=models["useful"])
-    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path, pairs))
+    Diffusion(SDXL_TURBO, options).prepare(context_for(tmp_path, pairs))
     (tmp_path / "sdxl_turbo" / "adapter.safetensors").write_bytes(b"nothing")
     with pytest.raises(TrainingError, match="is damaged"):
-        Diffusion(SDXL_TURBO, options).prepare(material(tmp_path, pairs))
+        Diffusion(SDXL_TURBO, options).prepare(context_for(tmp_path, pairs))
 
 
 def test_an_adapter_of_another_model_is_not_merged(
@@ -694,13 +694,13 @@ def test_an_adapter_of_another_model_is_not_merged(
 ) -> None:
     """A run goes on with what it was begun with."""
     few = [*TUNING, "regenerator.restore.tuning.steps=2"]
-    Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *few, model=models["useful"])).prepare(material(tmp_path, pairs))
+    Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *few, model=models["useful"])).prepare(context_for(tmp_path, pairs))
     for other in (
         options_of("sdxl_turbo", *few, model=models["still"]),
         options_of("sdxl_turbo", *few, "regenerator.restore.tuning.rank=2", model=models["useful"]),
     ):
         with pytest.raises(TrainingError, match="go on with those that the run was begun with"):
-            Diffusion(SDXL_TURBO, other).prepare(material(tmp_path, pairs))
+            Diffusion(SDXL_TURBO, other).prepare(context_for(tmp_path, pairs))
 
 
 def test_a_damaged_adapter_in_the_cache_is_learnt_again(
@@ -709,15 +709,15 @@ def test_a_damaged_adapter_in_the_cache_is_learnt_again(
     """And a cache that cannot be written costs nothing but the sharing."""
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
     options = options_of("sdxl_turbo", *TUNING, "regenerator.restore.tuning.steps=2", model=models["useful"])
-    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "first", pairs))
+    Diffusion(SDXL_TURBO, options).prepare(context_for(tmp_path / "first", pairs))
     (kept,) = (tmp_path / "cache" / "lora").glob("*/adapter.safetensors")
     content = kept.read_bytes()
     kept.write_bytes(b"nothing")
-    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "second", pairs))
+    Diffusion(SDXL_TURBO, options).prepare(context_for(tmp_path / "second", pairs))
     assert (tmp_path / "second" / "sdxl_turbo" / "adapter.safetensors").read_bytes() == content == kept.read_bytes()
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "file"))
-    Diffusion(SDXL_TURBO, options).prepare(material(tmp_path / "third", pairs))
+    Diffusion(SDXL_TURBO, options).prepare(context_for(tmp_path / "third", pairs))
     assert (tmp_path / "third" / "sdxl_turbo" / "adapter.safetensors").read_bytes() == content
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsx.core.data.images import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.training.regenerator import Material, Regenerator
+from gsx.core.training.regenerator import Regenerator, RegeneratorContext
 from gsx.regenerators.pairs import held_out_pairs, with_own
 from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer
 
@@ -30,10 +30,10 @@ def blurred(image: Tensor) -> Tensor:
     return 0.95 * torch.nn.functional.conv2d(padded, kernel, groups=3)[0]
 
 
-def material(folder: Path, spoil=blurred, count: int = 8) -> Material:
+def context_for(folder: Path, spoil=blurred, count: int = 8) -> RegeneratorContext:
     views = [View(f"photo{i}", camera(), Photo(stripes(i))) for i in range(count)]
     renders = {view.camera: spoil(view.image()) for view in views}
-    return Material(
+    return RegeneratorContext(
         views=views,
         render=lambda seen: renders[seen],
         held_out=lambda share: list(renders.values()),
@@ -47,7 +47,7 @@ def material(folder: Path, spoil=blurred, count: int = 8) -> Material:
 @pytest.fixture(scope="module")
 def learnt(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneRestorer, dict[str, float]]:
     restorer = SceneRestorer(options())
-    return restorer, restorer.prepare(material(tmp_path_factory.mktemp("run")))
+    return restorer, restorer.prepare(context_for(tmp_path_factory.mktemp("run")))
 
 
 def restored(restorer: SceneRestorer, image: Tensor, number: int = 0, strength: float = 0.06) -> Tensor:
@@ -90,20 +90,20 @@ def test_strength_is_a_share_of_the_correction(learnt: tuple[SceneRestorer, dict
 def test_one_that_helps_nobody_changes_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Renders that are the photographs already: whatever is learnt can only do harm."""
     restorer = SceneRestorer(options(steps=3))
-    figures = restorer.prepare(material(tmp_path, spoil=lambda image: image))
+    figures = restorer.prepare(context_for(tmp_path, spoil=lambda image: image))
     assert figures["error_of_renders_0"] == 0
     assert "changes nothing" in caplog.text
     image = stripes(3).float() / 255
     assert torch.equal(restored(restorer, image), image)
 
 
-def at_step(given: Material, step: int) -> Material:
+def at_step(given: RegeneratorContext, step: int) -> RegeneratorContext:
     return replace(given, step=step)
 
 
 def test_a_resumed_run_learns_on_from_the_event_before(tmp_path: Path) -> None:
     """Also when it is resumed at the event itself, whose file is there already."""
-    whole, given = SceneRestorer(options(steps=10)), material(tmp_path / "run")
+    whole, given = SceneRestorer(options(steps=10)), context_for(tmp_path / "run")
     for step in (40, 42, 44):
         whole.prepare(at_step(given, step))
     resumed = SceneRestorer(options(steps=10))
@@ -116,7 +116,7 @@ def test_a_resumed_run_learns_on_from_the_event_before(tmp_path: Path) -> None:
 
 def test_it_learns_again_when_the_run_has_become_much_longer(tmp_path: Path) -> None:
     """From 40 by half more each time: at 40, 60 and 90, also for a run that was resumed in between."""
-    whole, given = SceneRestorer(options(steps=20, again=1.5)), material(tmp_path / "run")
+    whole, given = SceneRestorer(options(steps=20, again=1.5)), context_for(tmp_path / "run")
     learnt = [bool(whole.prepare(at_step(given, step))) for step in range(40, 100, 10)]
     assert learnt == [True, False, True, False, False, True]
     resumed = SceneRestorer(options(steps=20, again=1.5))
@@ -128,7 +128,7 @@ def test_it_learns_again_when_the_run_has_become_much_longer(tmp_path: Path) -> 
 
 def test_it_learns_from_renders_by_models_that_were_not_fitted_to_the_photographs(tmp_path: Path) -> None:
     """The run's own renders of its training views show nothing to mend; those of half-models do."""
-    given, asked = material(tmp_path), list[float]()
+    given, asked = context_for(tmp_path), list[float]()
     photos = {view.camera: view.image() for view in given.views}
 
     def held_out(share: float) -> list[Tensor]:
@@ -146,7 +146,7 @@ def test_it_learns_from_renders_by_models_that_were_not_fitted_to_the_photograph
 
 def test_one_in_seven_renders_is_the_runs_own(tmp_path: Path) -> None:
     """And of the views that the network learns from alone."""
-    given = material(tmp_path, count=14)
+    given = context_for(tmp_path, count=14)
     numbers = {view.camera: number for number, view in enumerate(given.views)}
     own = replace(given, render=lambda seen: torch.full((3, 48, 48), float(numbers[seen])))
     pairs = held_out_pairs(own, 0.3)
@@ -161,15 +161,15 @@ def test_seeds_share_no_network(tmp_path: Path) -> None:
     begun = []
     for seed in (0, 1):
         restorer = SceneRestorer(options())
-        networks, _ = restorer.recalled(replace(material(tmp_path), seed=seed), [])
+        networks, _ = restorer.recalled(replace(context_for(tmp_path), seed=seed), [])
         begun += [network.down[0][0].weight.detach() for network in networks]  # type: ignore[index]
     assert not any(torch.equal(a, b) for n, a in enumerate(begun) for b in begun[:n])
 
 
 def test_networks_of_another_size_are_refused(tmp_path: Path) -> None:
-    SceneRestorer(options(steps=1)).prepare(at_step(material(tmp_path), 40))
+    SceneRestorer(options(steps=1)).prepare(at_step(context_for(tmp_path), 40))
     with pytest.raises(InputError, match="networks of another size"):
-        SceneRestorer(options(steps=1, channels=4)).prepare(at_step(material(tmp_path), 42))
+        SceneRestorer(options(steps=1, channels=4)).prepare(at_step(context_for(tmp_path), 42))
 
 
 def test_it_begins_by_changing_nothing_and_never_changes_much() -> None:
@@ -183,9 +183,9 @@ def test_it_begins_by_changing_nothing_and_never_changes_much() -> None:
 
 def test_it_needs_views_for_both_halves(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 4 training views, there are 3"):
-        SceneRestorer(options()).check(material(tmp_path, count=3).views, [1], True)
+        SceneRestorer(options()).check(context_for(tmp_path, count=3).views, [1], True)
     with pytest.raises(ConfigError, match="cannot enlarge x2"):
-        SceneRestorer(options()).check(material(tmp_path).views, [2], True)
+        SceneRestorer(options()).check(context_for(tmp_path).views, [2], True)
 
 
 def test_classical_ones() -> None:

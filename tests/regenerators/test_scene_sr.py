@@ -12,16 +12,16 @@ from gsx.core.data.images import resize, to_uint8
 from gsx.core.data.reduction import Reduction, box_average
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.training.regenerator import Material, Regenerator, strayed, unusable
+from gsx.core.training.regenerator import Regenerator, RegeneratorContext, strayed, unusable
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 
 CPU = torch.device("cpu")
 BOX, BICUBIC = Reduction(), Reduction(filter="bicubic")
 
 
-def material(folder: Path, count: int = 6) -> Material:
+def context_for(folder: Path, count: int = 6) -> RegeneratorContext:
     views = [View(f"photo{i}", camera(), Photo(stripes(i))) for i in range(count)]
-    return Material(
+    return RegeneratorContext(
         views=views,
         render=lambda seen: torch.zeros(3, seen.height, seen.width),
         held_out=lambda share: [],
@@ -56,7 +56,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> SceneSR:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GSX_CACHE", str(tmp_path_factory.mktemp("cache")))
         regenerator = SceneSR(options())
-        regenerator.prepare(material(tmp_path_factory.mktemp("run"), 12))
+        regenerator.prepare(context_for(tmp_path_factory.mktemp("run"), 12))
     return regenerator
 
 
@@ -94,7 +94,7 @@ def test_it_learns_and_enlarges_by_the_scenes_own_reduction(tmp_path: Path) -> N
     assert (low.shape, truth.shape) == ((8, 3, 16, 16), (8, 3, 32, 32))
     torch.testing.assert_close(low, box_average(truth, 2))  # of a slope every symmetric filter leaves the middle
     regenerator = SceneSR(options(steps=30))
-    regenerator.prepare(replace(material(tmp_path), reduction=BICUBIC))
+    regenerator.prepare(replace(context_for(tmp_path), reduction=BICUBIC))
     for scale in (2, 4):
         given = replace(request(stripes(7, 12).float() / 255, scale), reduction=BICUBIC)
         (result,) = regenerator.regenerate([given])
@@ -111,26 +111,26 @@ def test_before_learning_it_is_the_bicubic_enlargement() -> None:
 
 def test_what_was_learnt_is_found_again(tmp_path: Path) -> None:
     first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
-    assert "loss" in first.prepare(material(tmp_path))
-    assert again.prepare(material(tmp_path)) == {"learnt_before": 1.0}
+    assert "loss" in first.prepare(context_for(tmp_path))
+    assert again.prepare(context_for(tmp_path)) == {"learnt_before": 1.0}
     given = request(stripes(3, 12).float() / 255)
     assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
-    assert first.prepare(material(tmp_path)) == {}
+    assert first.prepare(context_for(tmp_path)) == {}
 
 
 def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, again = SceneSR(options(steps=5)), SceneSR(options(steps=5))
-    first.prepare(material(tmp_path))
-    photos = [view.image() for view in material(tmp_path).views]
+    first.prepare(context_for(tmp_path))
+    photos = [view.image() for view in context_for(tmp_path).views]
     kept_at(options(steps=5), photos, BOX, 0, CPU).write_bytes(b"no network")
-    assert "loss" in again.prepare(material(tmp_path))
+    assert "loss" in again.prepare(context_for(tmp_path))
     assert "learnt again" in caplog.text
     given = request(stripes(3, 12).float() / 255)
     assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
 
 
 def test_other_photographs_are_another_scene(tmp_path: Path) -> None:
-    photos = [view.image() for view in material(tmp_path).views]
+    photos = [view.image() for view in context_for(tmp_path).views]
     assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(), photos[:-1], BOX, 0, CPU)
     assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(), photos, BICUBIC, 0, CPU)
     assert kept_at(options(), photos, BOX, 0, CPU) != kept_at(options(steps=7), photos, BOX, 0, CPU)
@@ -139,9 +139,9 @@ def test_other_photographs_are_another_scene(tmp_path: Path) -> None:
 
 def test_the_time_is_limited_and_its_result_not_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     hurried = options(steps=100_000, seconds=0.2)
-    SceneSR(hurried).prepare(material(tmp_path))
+    SceneSR(hurried).prepare(context_for(tmp_path))
     assert "regenerator.upscale.seconds" in caplog.text
-    assert not kept_at(hurried, [view.image() for view in material(tmp_path).views], BOX, 0, CPU).exists()
+    assert not kept_at(hurried, [view.image() for view in context_for(tmp_path).views], BOX, 0, CPU).exists()
 
 
 def test_crops_are_of_every_orientation_and_place() -> None:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsx.core.data.images import to_uint8
-from gsx.core.training.augmenter import Setting
-from gsx.core.training.material import material_of
+from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Request
+from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.run import Run
 
 
@@ -20,12 +20,12 @@ class SteadyOptions:
 
 
 class SteadyZoom:
-    def __init__(self, options: SteadyOptions, setting: Setting) -> None:
-        self.options, self.setting = options, setting
+    def __init__(self, options: SteadyOptions, context: AugmenterContext) -> None:
+        self.options, self.context = options, context
         self.views: dict[int, PseudoView] = {}
 
     def begins(self) -> int:
-        return round(self.options.start * self.setting.iterations)
+        return round(self.options.start * self.context.iterations)
 
     def plan(self) -> dict[str, Any]:
         return {"from": self.begins()}
@@ -34,19 +34,19 @@ class SteadyZoom:
         if step <= self.begins():
             return None
         if not self.views:
-            self.setting.regenerator("upscale").prepare(material_of(run, self.setting.seed))
+            self.context.regenerator("upscale").prepare(regenerator_context(run, self.context.seed))
         if view not in self.views:
             self.views[view] = self.zoomed(view)
         parts = [(self.views[view], self.options.weight)]
-        return Term(name=self.setting.name, parts=parts, taken=0.0, observed=False, shared=True)
+        return Term(name=self.context.name, parts=parts, taken=0.0, observed=False, shared=True)
 
     def zoomed(self, number: int) -> PseudoView:
         """The middle half of a photograph, redrawn; it depends on nothing else, so a resumed run makes it again."""
-        view = self.setting.scene.train[number]
+        view = self.context.scene.train[number]
         camera = view.camera.narrow(0.5)
         request = Request(
             image=view.source.image(camera).float() / 255, scale=2, camera=camera, view=view, number=number,
-            photo=True, seed=self.setting.seed, strength=0.0, strongest=0.0, prompt="", step=0,
+            photo=True, seed=self.context.seed, strength=0.0, strongest=0.0, prompt="", step=0,
         )  # fmt: skip
-        (picture,) = self.setting.regenerator("upscale").regenerate([request])
+        (picture,) = self.context.regenerator("upscale").regenerate([request])
         return PseudoView(camera=camera.zoom(2), target=to_uint8(picture), parent=number)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class Sharpened:
     def __init__(self, options: SharpOptions) -> None:
         self.options = options
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         return {}  # nothing to learn from the scene
 
     def regenerate(self, requests: Sequence[Request]) -> list[Tensor]:

@@ -38,8 +38,7 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.run_folder.checkpoint import sidecars, step_of
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.augmenter import Setting
-from gsx.core.training.material import material_of
+from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term, load_views, picture_name, save_views
 from gsx.core.training.regenerator import (
     Checked,
@@ -49,6 +48,7 @@ from gsx.core.training.regenerator import (
     strayed,
     unusable,
 )
+from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
@@ -249,12 +249,12 @@ class Drawn:
 class PseudoDetails:
     """Pseudo views of one kind and their share in the loss."""
 
-    def __init__(self, options: PseudoOptions, setting: Setting) -> None:
-        self.options, self.setting = options, setting
+    def __init__(self, options: PseudoOptions, context: AugmenterContext) -> None:
+        self.options, self.context = options, context
         self.schedule = Schedule(
-            iterations=setting.iterations,
+            iterations=context.iterations,
             published_iterations=options.timing.published_iterations,
-            views=len(setting.scene.train),
+            views=len(context.scene.train),
         )
         self.events, self.span = events_of(options.timing, self.schedule), span_of(options.timing, self.schedule)
         self.refuse_impossible()
@@ -268,8 +268,8 @@ class PseudoDetails:
         Raises:
             ConfigError, InputError: windows would be too small, or the regenerator cannot do what it will be asked for.
         """
-        options, name = self.options, self.setting.name
-        for view in self.setting.scene.train:
+        options, name = self.options, self.context.name
+        for view in self.context.scene.train:
             if options.coarser and min(view.camera.size) < LEAST_WINDOW * max(options.coarser):
                 raise ConfigError(
                     f"augmenter.{name}.coarser: '{view.name}' reduced by {max(options.coarser)} is less than "
@@ -282,17 +282,17 @@ class PseudoDetails:
                         f"augmenter.{name}: at scale {scale} and narrow {options.narrow:g} windows of '{view.name}' "
                         f"are {width} x {height} px; {LEAST_WINDOW} px are the least: lower scales or raise narrow"
                     )
-        regenerator = self.setting.regenerator(options.role)
+        regenerator = self.context.regenerator(options.role)
         if isinstance(regenerator, Checked):
-            regenerator.check(self.setting.scene.train, options.scales, options.variants > 0)
+            regenerator.check(self.context.scene.train, options.scales, options.variants > 0)
         if not self.events:
-            logger.warning("augmenter %s has no event in a run of %d steps", name, self.setting.iterations)
+            logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
 
     # -- what the trainer asks -------------------------------------------------------------------------------------
 
     def begins(self) -> int:
         """The first event."""
-        return self.options.begins(self.setting.iterations)
+        return self.options.begins(self.context.iterations)
 
     def plan(self) -> dict[str, Any]:
         """Events and windows in steps of this run."""
@@ -329,7 +329,7 @@ class PseudoDetails:
         frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and inside < 0.5)
         whole = run.scene.train[views[0].parent].camera
         return Term(
-            name=self.setting.name,
+            name=self.context.name,
             parts=[(view, each / count * (area_share(view, whole) if options.per_pixel else 1.0)) for view in views],
             taken=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
@@ -378,11 +378,11 @@ class PseudoDetails:
 
     def path(self, run: Run, event: int) -> Path:
         """Where the pseudo views of an event are kept while a checkpoint may need them."""
-        return run.folder / "pseudo" / f"{self.setting.name}_{event:07d}.safetensors"
+        return run.folder / "pseudo" / f"{self.context.name}_{event:07d}.safetensors"
 
     def files(self, run: Run) -> list[Path]:
         """Those that there are, oldest first."""
-        return sorted((run.folder / "pseudo").glob(f"{self.setting.name}_{'[0-9]' * 7}.safetensors"))
+        return sorted((run.folder / "pseudo").glob(f"{self.context.name}_{'[0-9]' * 7}.safetensors"))
 
     def forget(self, run: Run, event: int) -> None:
         """Remove the files of events in whose windows no checkpoint lies, but for that of the current one."""
@@ -404,8 +404,8 @@ class PseudoDetails:
         path = self.path(run, event)
         latest = [path] if path.is_file() else self.files(run)[-1:]
         try:
-            if latest and (found := load_views(latest[0]))[1]["iterations"] != self.setting.iterations:
-                logger.info("%s rests until its next event: the run has become longer", self.setting.name)
+            if latest and (found := load_views(latest[0]))[1]["iterations"] != self.context.iterations:
+                logger.info("%s rests until its next event: the run has become longer", self.context.name)
                 return [], {}
             return found if latest == [path] else load_views(path)
         except (OSError, ValueError) as error:
@@ -420,11 +420,11 @@ class PseudoDetails:
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
-        regenerator = self.setting.regenerator(self.options.role)
-        learnt = regenerator.prepare(material_of(run, self.setting.seed))
+        regenerator = self.context.regenerator(self.options.role)
+        learnt = regenerator.prepare(regenerator_context(run, self.context.seed))
         if learnt:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
-            logger.info("%s, regenerator at step %d: %s", self.setting.name, event, told)
+            logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)
         sketches = list(self.sketches(run, event, parents))
         drawn = self.all_drawn(run, event, sketches)
         views = [one.view for one in drawn if one.view is not None]
@@ -435,7 +435,7 @@ class PseudoDetails:
         ]
         facts: dict[str, Any] = {
             "event": event,
-            "iterations": self.setting.iterations,
+            "iterations": self.context.iterations,
             "made": len(views),
             "learnt": learnt,
             **self.judged(event, drawn),
@@ -445,11 +445,11 @@ class PseudoDetails:
         if kept:
             share = sum(kept) / len(kept)
             facts["consistent"] = share
-            logger.info("%s: %.1f%% consistent pixels", self.setting.name, 100 * share)
+            logger.info("%s: %.1f%% consistent pixels", self.context.name, 100 * share)
         if trusted:
             masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
             facts["masked"] = masked
-            logger.info("%s: %.1f%% of the pixels do not count", self.setting.name, 100 * masked)
+            logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * masked)
         return views, facts
 
     def all_drawn(self, run: Run, event: int, sketches: Sequence[Sketch]) -> list[Drawn]:
@@ -458,7 +458,7 @@ class PseudoDetails:
         shown = sorted({sketch.parent for sketch in sketches})[:SHOWN]
         for first in range(0, len(sketches), BATCH):
             drawn += self.drawn(run, event, sketches[first : first + BATCH], shown)
-            logger.info("%s at step %d: %d of %d pictures", self.setting.name, event, len(drawn), len(sketches))
+            logger.info("%s at step %d: %d of %d pictures", self.context.name, event, len(drawn), len(sketches))
         return drawn
 
     def judged(self, event: int, drawn: Sequence[Drawn]) -> dict[str, Any]:
@@ -467,7 +467,7 @@ class PseudoDetails:
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
-        name = self.setting.name
+        name = self.context.name
         asked, dropped = by_scale(drawn), by_scale([one for one in drawn if one.view is None])
         warned: dict[str, dict[str, int]] = {}
         for scale, count in dropped.items():
@@ -506,7 +506,7 @@ class PseudoDetails:
         """One camera; variant 0 is the training camera's own."""
         options, own = self.options, run.scene.train[parent].camera
         generator = torch.Generator().manual_seed(
-            derived_seed(self.setting.seed, self.setting.name, event, parent, scale, variant)
+            derived_seed(self.context.seed, self.context.name, event, parent, scale, variant)
         )
         zoom = scale if options.zoom == "intrinsics" else 1
         size = window_size(own.width, own.height, options.narrow, zoom)
@@ -531,7 +531,7 @@ class PseudoDetails:
             camera=result,
             seed=options.seed
             if options.seeds == "fixed"
-            else derived_seed(self.setting.seed, "noise", event, parent, scale, variant),
+            else derived_seed(self.context.seed, "noise", event, parent, scale, variant),
         )
 
     def looking(
@@ -560,7 +560,7 @@ class PseudoDetails:
         turn = options.rotation_noise
         if options.relative_noise:
             turn *= min(1.0, 2 * options.narrow / scale)
-        unit = self.setting.scene.extent if options.translation_unit == "extent" else 1.0
+        unit = self.context.scene.extent if options.translation_unit == "extent" else 1.0
         return moved(
             camera,
             noise((3, 3), options.noise, turn, generator),
@@ -593,7 +593,7 @@ class PseudoDetails:
 
     def drawn(self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]) -> list[Drawn]:
         """What becomes of each sketch; pictures of the training views `shown` are kept to be looked at."""
-        regenerator = self.setting.regenerator(self.options.role)
+        regenerator = self.context.regenerator(self.options.role)
         requests = [self.request(run, event, sketch) for sketch in sketches]
         samples = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
         out: list[Drawn] = []
@@ -643,7 +643,7 @@ class PseudoDetails:
     def remedy(self) -> str:
         """What else helps where a regenerator strays too far."""
         enlarging = max(self.options.scales) > 1 and self.options.project == "none"
-        return f", or augmenter.{self.setting.name}.project=exact" if enlarging else ""
+        return f", or augmenter.{self.context.name}.project=exact" if enlarging else ""
 
     def view(
         self, run: Run, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]
@@ -725,7 +725,7 @@ class PseudoDetails:
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
-        write_image(folder / picture_name(self.setting.name, view), torch.cat([given, result, difference], 2))
+        write_image(folder / picture_name(self.context.name, view), torch.cat([given, result, difference], 2))
 
 
 def again(request: Request, number: int) -> Request:

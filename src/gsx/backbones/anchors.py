@@ -54,7 +54,7 @@ from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, drawable, touches
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Beginning, Observation
+from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
     ADAM_EPSILON,
     Table,
@@ -194,17 +194,17 @@ class ExplicitOptions(AnchorOptions):
     reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})
 
 
-def neural_anchors(options: NeuralOptions, beginning: Beginning) -> "Anchors":
+def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
     """The backbones scaffold and octree_scaffold."""
-    heads = Heads(options.heads, options.offsets, len(beginning.scene.train), beginning.generator)
-    return Anchors(options, beginning, Neural(heads.to(beginning.device)), heads, options.head_rates)
+    heads = Heads(options.heads, options.offsets, len(context.scene.train), context.generator)
+    return Anchors(options, context, Neural(heads.to(context.device)), heads, options.head_rates)
 
 
-def explicit_anchors(options: ExplicitOptions, beginning: Beginning) -> "Anchors":
+def explicit_anchors(options: ExplicitOptions, context: BackboneContext) -> "Anchors":
     """The backbone octree_gs3d as reported: anchors of one Gaussian."""
     logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
     representation = Explicit(options.sh_degree, logit)
-    return Anchors(options, beginning, representation, None, None, (options.sh_degree, options.sh_every))
+    return Anchors(options, context, representation, None, None, (options.sh_degree, options.sh_every))
 
 
 def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:
@@ -242,13 +242,13 @@ class Anchors:
     def __init__(
         self,
         options: NeuralOptions | ExplicitOptions,
-        beginning: Beginning,
+        context: BackboneContext,
         representation: Representation,
         heads: Heads | None,
         head_rates: HeadRates | None,
         sh: tuple[int, int] = (0, 1),
     ) -> None:
-        scene = beginning.scene
+        scene = context.scene
         if len(scene.points) == 0:
             raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
         self.options, self.representation, self.heads, self.head_rates, self.sh = (
@@ -259,11 +259,11 @@ class Anchors:
             sh,
         )
         self.quirks = options.switches()
-        self.extent, self.generator, self.device = scene.extent, beginning.generator, beginning.device
-        self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
+        self.extent, self.generator, self.device = scene.extent, context.generator, context.device
+        self.raster = filtered_rules(context.raster, options.filter, options.mip)
         self.cameras = [view.camera for view in scene.train]
         self.views = {camera: number for number, camera in enumerate(self.cameras)}
-        self.schedule = beginning.schedule(options.published_iterations)
+        self.schedule = context.schedule(options.published_iterations)
         self.levels: Levels | None = None
         self.voxel = options.voxel
         self.table = self.initial_table(scene.points)

@@ -46,7 +46,7 @@ from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, drawable, take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Beginning, Observation
+from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
     Statistics,
     Table,
@@ -201,22 +201,22 @@ class DrawnGaussians:
 class GS3D:
     """Explicit Gaussians, N rows in every parameter; at several levels of detail if asked for (spec 4B)."""
 
-    def __init__(self, options: GS3DOptions, beginning: Beginning) -> None:
-        scene = beginning.scene
+    def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
+        scene = context.scene
         if len(scene.points) == 0:
             raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
         self.options = options
         self.extent = scene.extent
         self.white = bool((scene.background == 1).all())
-        self.generator = beginning.generator
-        self.schedule = beginning.schedule(options.published_iterations)
-        self.raster = filtered_rules(beginning.raster, options.filter, options.mip)
+        self.generator = context.generator
+        self.schedule = context.schedule(options.published_iterations)
+        self.raster = filtered_rules(context.raster, options.filter, options.mip)
         self.absolute_gradient = options.density.absolute
         self.cameras = [view.camera for view in scene.train]
         self.levels = self.derived_levels(scene.points)
         self.standard_file = self.levels is None
-        self.table = self.initial_table(scene.points, beginning.device)
-        self.statistics = Statistics.zeros(len(self.table), beginning.device, options.density.absolute)
+        self.table = self.initial_table(scene.points, context.device)
+        self.statistics = Statistics.zeros(len(self.table), context.device, options.density.absolute)
         self.refresh_filter()
 
     def derived_levels(self, points: PointCloud) -> Levels | None:

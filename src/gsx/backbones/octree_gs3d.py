@@ -6,7 +6,7 @@ from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
 from gsx.backbones.clone_split import LevelDensityOptions
 from gsx.backbones.gs3d import GS3D, Density, GS3DOptions, Rates
 from gsx.backbones.levels import faithful
-from gsx.core.training.backbone import Beginning
+from gsx.core.training.backbone import BackboneContext
 
 FORMS = ("anchors", "clone_split")
 QUIRKS = ("gate", "bias")
@@ -78,8 +78,8 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
     )
 
 
-def octree_gs3d(options: OctreeGS3DOptions, beginning: Beginning) -> Anchors | GS3D:
+def octree_gs3d(options: OctreeGS3DOptions, context: BackboneContext) -> Anchors | GS3D:
     """The backbone octree_gs3d in the form that is asked for."""
     if options.densification == "clone_split":
-        return GS3D(free_gaussians(options), beginning)
-    return explicit_anchors(options, beginning)
+        return GS3D(free_gaussians(options), context)
+    return explicit_anchors(options, context)

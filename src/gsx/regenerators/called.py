@@ -13,7 +13,7 @@ from torch import Tensor
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 
 
 @contextmanager
@@ -47,7 +47,7 @@ class Called:
         """The function can be found."""
         self.function()
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Nothing to learn."""
         return {}
 

@@ -10,7 +10,7 @@ from gsx.core.data.images import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class Resampled:
     def __init__(self, options: PlainOptions) -> None:
         self.options = options
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Nothing to learn."""
         return {}
 
@@ -47,7 +47,7 @@ class Unchanged:
     def __init__(self, options: PlainOptions) -> None:
         self.options = options
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Nothing to learn."""
         return {}
 
@@ -74,7 +74,7 @@ class Oracle:
     def __init__(self, options: PlainOptions) -> None:
         self.options = options
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Nothing to learn."""
         return {}
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.window import Window
-from gsx.core.training.regenerator import Material
+from gsx.core.training.regenerator import RegeneratorContext
 
 Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, h, w] each, display values."""
@@ -17,15 +17,15 @@ OWN_EVERY = 6
 20 %)."""
 
 
-def held_out_pairs(material: Material, share: float) -> list[Pair]:
-    """Every training view as a model shows it that was not fitted to it (`Material.held_out`)."""
-    renders = material.held_out(share)
-    return [(render, view.image()) for render, view in zip(renders, material.views, strict=True)]
+def held_out_pairs(context: RegeneratorContext, share: float) -> list[Pair]:
+    """Every training view as a model shows it that was not fitted to it (`RegeneratorContext.held_out`)."""
+    renders = context.held_out(share)
+    return [(render, view.image()) for render, view in zip(renders, context.views, strict=True)]
 
 
-def with_own(pairs: Sequence[Pair], material: Material, numbers: Sequence[int]) -> list[Pair]:
+def with_own(pairs: Sequence[Pair], context: RegeneratorContext, numbers: Sequence[int]) -> list[Pair]:
     """The pairs of training views of these numbers, and beside some of them the run's own renders."""
-    own = [(material.render(material.views[n].camera).cpu(), pairs[n][1]) for n in numbers[::OWN_EVERY]]
+    own = [(context.render(context.views[n].camera).cpu(), pairs[n][1]) for n in numbers[::OWN_EVERY]]
     return [*(pairs[number] for number in numbers), *own]
 
 

@@ -18,7 +18,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 from gsx.regenerators.scene_sr import begin, read_network
@@ -110,29 +110,29 @@ class SceneRestorer:
                 "regenerator/restore=identity"
             )
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Train each network on held-out renders of half of the views, and measure it on those of the other half.
 
         One that has become worse there goes back to what it was. One that brings renders of views it has not seen no
         closer to their photographs is not used.
         """
-        if self.prepared == material.step:  # another augmenter has asked at this event
+        if self.prepared == context.step:  # another augmenter has asked at this event
             return {}
-        earlier = self.earlier(material)
+        earlier = self.earlier(context)
         if not self.networks:
-            self.networks, self.useful = self.recalled(material, earlier)
-        self.prepared = material.step
-        if earlier and material.step < self.options.again * event_of(earlier[-1]):
+            self.networks, self.useful = self.recalled(context, earlier)
+        self.prepared = context.step
+        if earlier and context.step < self.options.again * event_of(earlier[-1]):
             return {}
         steps = self.options.later_steps if earlier else self.options.steps
-        pairs = held_out_pairs(material, self.options.halves)
+        pairs = held_out_pairs(context, self.options.halves)
         figures: dict[str, float] = {}
         for fold, network in enumerate(self.networks):
-            own = with_own(pairs, material, range(fold, len(pairs), FOLDS))
+            own = with_own(pairs, context, range(fold, len(pairs), FOLDS))
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
             renders, before = mean_square(others), mean_error(network, others)
             former = {name: value.clone() for name, value in network.state_dict().items()}
-            learn(network, own, self.options, steps, derived_seed("crops", material.seed, material.step, fold))
+            learn(network, own, self.options, steps, derived_seed("crops", context.seed, context.step, fold))
             after = mean_error(network, others)
             if after > before:
                 network.load_state_dict(former)
@@ -140,7 +140,7 @@ class SceneRestorer:
             figures |= {f"error_of_renders_{fold}": renders, f"error_restored_{fold}": min(before, after)}
         if not any(self.useful):
             logger.warning("scene_restorer brings unseen views no closer to their photographs: it changes nothing")
-        self.keep(material)
+        self.keep(context)
         return figures
 
     @torch.no_grad()
@@ -157,7 +157,7 @@ class SceneRestorer:
         image = request.image.to(next(network.parameters()).device)
         return (image + request.strength / request.strongest * network(image[None])[0]).clamp(0, 1)
 
-    def keep(self, material: Material) -> None:
+    def keep(self, context: RegeneratorContext) -> None:
         """Write both networks into the run's folder, as one file for each event at which they have learnt."""
         from safetensors.torch import save
 
@@ -166,23 +166,23 @@ class SceneRestorer:
             for fold, network in enumerate(self.networks)
             for name, value in network.state_dict().items()
         } | {"useful": torch.tensor(self.useful)}
-        material.folder.mkdir(parents=True, exist_ok=True)
-        replace_file(material.folder / f"scene_restorer_{material.step:07d}.safetensors", save(tensors))
+        context.folder.mkdir(parents=True, exist_ok=True)
+        replace_file(context.folder / f"scene_restorer_{context.step:07d}.safetensors", save(tensors))
 
-    def earlier(self, material: Material) -> list[Path]:
+    def earlier(self, context: RegeneratorContext) -> list[Path]:
         """Files of the run's events before this one, oldest first."""
-        files = sorted(material.folder.glob("scene_restorer_*.safetensors"))
-        return [path for path in files if event_of(path) < material.step]
+        files = sorted(context.folder.glob("scene_restorer_*.safetensors"))
+        return [path for path in files if event_of(path) < context.step]
 
-    def recalled(self, material: Material, earlier: Sequence[Path]) -> tuple[list[Residual], list[bool]]:
+    def recalled(self, context: RegeneratorContext, earlier: Sequence[Path]) -> tuple[list[Residual], list[bool]]:
         """(networks, whether each is of use) as the run had them after its last event before this one, or new ones.
 
         Raises:
             InputError: they were of another size.
         """
         networks = [
-            Residual(self.options.channels, generator).to(material.device)
-            for generator in (torch.Generator().manual_seed(derived_seed(material.seed, fold)) for fold in range(FOLDS))
+            Residual(self.options.channels, generator).to(context.device)
+            for generator in (torch.Generator().manual_seed(derived_seed(context.seed, fold)) for fold in range(FOLDS))
         ]
         found = read_network(earlier[-1]) if earlier else None
         for fold, network in enumerate(networks if found else ()):

@@ -26,7 +26,7 @@ from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 
 logger = logging.getLogger(__name__)
 
@@ -101,20 +101,20 @@ class SceneSR:
         if odd:
             raise ConfigError(f"regenerator scene_sr enlarges x2, x4, x8, not x{odd[0]}: change the augmenter's scales")
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Train, or take what an earlier run of the same scene and options has learnt."""
         if self.network is not None:
             return {}
-        photos = [view.image() for view in material.views]
+        photos = [view.image() for view in context.views]
         self.network = Enlarger(
-            self.options.channels, self.options.layers, torch.Generator().manual_seed(material.seed)
-        ).to(material.device)
-        path = kept_at(self.options, photos, material.reduction, material.seed, material.device)
+            self.options.channels, self.options.layers, torch.Generator().manual_seed(context.seed)
+        ).to(context.device)
+        path = kept_at(self.options, photos, context.reduction, context.seed, context.device)
         if path.is_file() and (found := read_network(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
-        loss, whole = train(self.network, photos, material.reduction, self.options, material.seed)
+        loss, whole = train(self.network, photos, context.reduction, self.options, context.seed)
         seconds = time.perf_counter() - begun
         logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
         if whole:

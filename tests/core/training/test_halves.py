@@ -16,7 +16,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.halves import held_out_renders
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import take_step
@@ -50,7 +50,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
         return GS3D(
             published_options(),
-            Beginning(
+            BackboneContext(
                 scene=scene,
                 iterations=iterations,
                 device=torch.device("cpu"),

@@ -8,11 +8,11 @@ from gsx.core.data.scene import Scene
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Augmenter
 
-__all__ = ["Augmenter", "Foretold", "Setting", "Telling"]
+__all__ = ["Augmenter", "AugmenterContext", "Foretold", "Telling"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Setting:
+class AugmenterContext:
     """What an augmenter is built from."""
 
     name: str

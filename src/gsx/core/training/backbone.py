@@ -20,7 +20,7 @@ Observation: TypeAlias = dict[str, Tensor]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Beginning:
+class BackboneContext:
     """What a backbone is built from."""
 
     scene: Scene
@@ -60,7 +60,7 @@ class Backbone(Protocol[D]):
 
     @property
     def raster(self) -> RasterSettings:
-        """The rules its splats are drawn by: those of the beginning, with filters of its own."""
+        """The rules its splats are drawn by: those of the context, with filters of its own."""
         ...
 
     @property

@@ -88,7 +88,7 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Material:
+class RegeneratorContext:
     """What a regenerator may learn from before its first call: training views only."""
 
     views: Sequence[View]
@@ -110,7 +110,7 @@ class Material:
 class Regenerator(Protocol):
     """Redraws pictures."""
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Learn from the scene, if there is anything to learn; returns figures for the log. Called at every event."""
         ...
 

@@ -42,8 +42,8 @@ from gsx.core.run_folder.run_key import (
     scene_stamp,
     trained_on,
 )
-from gsx.core.training.augmenter import Augmenter, Setting
-from gsx.core.training.backbone import Backbone, Beginning
+from gsx.core.training.augmenter import Augmenter, AugmenterContext
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.guard import Agreement, Guard
 from gsx.core.training.regenerator import Regenerator
@@ -137,8 +137,8 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
 
     def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
-        beginning = Beginning(scene=scene, iterations=iterations, device=device, raster=raster, generator=generator)
-        return settings.backbone.component.factory(settings.backbone.options, beginning)
+        context = BackboneContext(scene=scene, iterations=iterations, device=device, raster=raster, generator=generator)
+        return settings.backbone.component.factory(settings.backbone.options, context)
 
     backbone = anew(scene, general.iterations, generator)
     return Run(
@@ -172,14 +172,14 @@ def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
 
     out = []
     for name, chosen in settings.augmenters.items():
-        setting = Setting(
+        context = AugmenterContext(
             name=name,
             scene=scene,
             iterations=settings.general.iterations,
             seed=settings.general.seed,
             regenerator=regenerator,
         )
-        out.append(chosen.component.factory(chosen.options, setting))
+        out.append(chosen.component.factory(chosen.options, context))
     shares = {name: float(a.plan().get("share", 0)) for name, a in zip(settings.augmenters, out, strict=True)}
     if sum(shares.values()) >= 1:
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())

@@ -8,7 +8,7 @@ from torch import Tensor
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.diffusion.options import UpscalerOptions
 from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4
 from gsx.regenerators.diffusion.redraw import Diffusion
@@ -51,12 +51,12 @@ class Ladder:
         for factor in sorted(self.needed):
             self.models[factor].check(views, [factor], moved)
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Open them."""
         return {
             f"x{factor}_{name}": value
             for factor in sorted(self.needed)
-            for name, value in self.models[factor].prepare(material).items()
+            for name, value in self.models[factor].prepare(context).items()
         }
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:

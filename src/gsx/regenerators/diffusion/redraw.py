@@ -19,7 +19,7 @@ from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Material, Request
+from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.diffusion.models import (
     PACKAGES,
@@ -84,7 +84,7 @@ class Diffusion:
             )
         self.folder = located(self.options, self.recipe)
 
-    def prepare(self, material: Material) -> dict[str, float]:
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Open the pipeline, and tune it to the scene if it is to be; once per run.
 
         Raises:
@@ -98,20 +98,20 @@ class Diffusion:
         options = self.options
         folder = self.folder or located(options, self.recipe)
         files = fingerprint(folder, options, self.recipe)
-        dtype = number_type(options, material.device)
+        dtype = number_type(options, context.device)
         pipe = opened(folder, options, self.recipe, dtype)
         found = Tuned()
         try:
             if isinstance(options, RestorerOptions) and options.tuning.steps:
-                found = tuned(pipe, options, self.recipe, material, files)
-            place(pipe, options, material.device)
+                found = tuned(pipe, options, self.recipe, context, files)
+            place(pipe, options, context.device)
         except (RuntimeError, ValueError) as error:
             raise TrainingError(
                 f"regenerator {options.name} cannot be made ready ({type(error).__name__}: {error}): if memory is "
                 f"short, set {self.recipe.where}.offload=model or a smaller dtype"
             ) from error
         telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
-        machine = (code_stamp(), *machine_stamp(material.device), str(dtype))
+        machine = (code_stamp(), *machine_stamp(context.device), str(dtype))
         self.identity = content_key(files, found.digest, telling, machine)
         self.pipe = pipe
         logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - begun, folder)

@@ -26,7 +26,7 @@ from gsx.core.device import machine_stamp
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.shapes import Float, Int
-from gsx.core.training.regenerator import Material
+from gsx.core.training.regenerator import RegeneratorContext
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
 from gsx.regenerators.diffusion.pace import Pace
@@ -68,7 +68,7 @@ class Pairs:
     """To measure on: the middles of views that are not learnt from."""
 
 
-def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, material: Material, files: str) -> Tuned:
+def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, context: RegeneratorContext, files: str) -> Tuned:
     """Merge the adapter of this scene into a model: the run's own, one from the cache, or a new one.
 
     It must bring held-out renders closer to their photographs than the model as it was does, and than they are.
@@ -76,12 +76,12 @@ def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, material: Materia
     Raises:
         TrainingError: it cannot be learnt or read; the run keeps its checkpoint.
     """
-    own = material.folder / options.name
+    own = context.folder / options.name
     if not (own / FACTS).is_file():
-        pairs = divided(material, options.tuning)
-        shared = cache_folder(ADAPTERS, key_of(pairs, options, material, files))
+        pairs = divided(context, options.tuning)
+        shared = cache_folder(ADAPTERS, key_of(pairs, options, context, files))
         if not adopted(shared, own):
-            new_adapter(pipe.to(material.device), options, recipe, material, pairs, files, own)
+            new_adapter(pipe.to(context.device), options, recipe, context, pairs, files, own)
             share(own, shared, options.cache_gb)
     facts = read_facts(own)
     refuse_another(facts, own, options, files)
@@ -101,21 +101,21 @@ def refuse_another(facts: dict[str, Any], folder: Path, options: RestorerOptions
         )
 
 
-def key_of(pairs: Pairs, options: RestorerOptions, material: Material, files: str) -> str:
+def key_of(pairs: Pairs, options: RestorerOptions, context: RegeneratorContext, files: str) -> str:
     """Of everything that decides what is learnt."""
     digest = hashlib.sha256()
     for part in (image for pair in (*pairs.own, *pairs.others) for image in pair):
         digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
-    machine = (code_stamp(), version("peft"), *machine_stamp(material.device))
+    machine = (code_stamp(), version("peft"), *machine_stamp(context.device))
     telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
-    return content_key(files, telling, digest.hexdigest(), material.seed, machine)
+    return content_key(files, telling, digest.hexdigest(), context.seed, machine)
 
 
 def new_adapter(
     pipe: Any,
     options: RestorerOptions,
     recipe: Recipe,
-    material: Material,
+    context: RegeneratorContext,
     pairs: Pairs,
     files: str,
     folder: Path,
@@ -125,7 +125,7 @@ def new_adapter(
     figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, recipe, others)}
     begun = time.perf_counter()
     try:
-        whole = learn(pipe, options, recipe, pairs.own, material.seed)
+        whole = learn(pipe, options, recipe, pairs.own, context.seed)
     except (RuntimeError, ValueError) as error:
         raise TrainingError(
             f"regenerator {options.name} cannot be tuned ({type(error).__name__}: {error}): lower "
@@ -151,9 +151,9 @@ def new_adapter(
             "model": options.model,
             "model_sha256": files,
             "tuning": asdict(options.tuning),
-            "views": [view.name for view in material.views],
-            "step": material.step,
-            "seed": material.seed,
+            "views": [view.name for view in context.views],
+            "step": context.step,
+            "seed": context.seed,
         },
     )
 
@@ -167,14 +167,14 @@ def closest(figures: dict[str, float]) -> str:
 # -- pairs -------------------------------------------------------------------------------------------------------------
 
 
-def divided(material: Material, options: TuningOptions) -> Pairs:
+def divided(context: RegeneratorContext, options: TuningOptions) -> Pairs:
     """Held-out renders of most training views, and of others, spread evenly over the views, to measure on."""
-    pairs = held_out_pairs(material, options.halves)
+    pairs = held_out_pairs(context, options.halves)
     every = max(2, round(1 / options.held_out))
     measured = range(min(every, len(pairs)) // 2, len(pairs), every)
     learnt = [number for number in range(len(pairs)) if number not in measured]
     return Pairs(
-        own=with_own(pairs, material, learnt), others=[middle(pairs[number], options.crop) for number in measured]
+        own=with_own(pairs, context, learnt), others=[middle(pairs[number], options.crop) for number in measured]
     )
 
 

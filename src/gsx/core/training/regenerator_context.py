@@ -1,14 +1,14 @@
 """What a regenerator may learn from, taken from a run: training views, and what the model shows as it is now."""
 
 from gsx.core.training.halves import held_out_renders
-from gsx.core.training.regenerator import Material
+from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
 
-def material_of(run: Run, seed: int) -> Material:
+def regenerator_context(run: Run, seed: int) -> RegeneratorContext:
     """Everything but held-out views."""
-    return Material(
+    return RegeneratorContext(
         views=run.scene.train,
         reduction=run.scene.reduction,
         render=lambda camera: render(run, camera).image,
