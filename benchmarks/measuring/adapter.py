@@ -44,7 +44,7 @@ def count_pairs(pairs: Pairs) -> int:
 def blend_pairs(screen: ScreenSplats, pairs: Pairs, camera: Camera, settings: RasterSettings) -> Float[Tensor, "C H W"]:
     """Blended channels, differentiable in means, factors, log-opacities and channels of the screen splats."""
     grid = TileGrid.of(camera, settings.tile_size)
-    inputs = (screen.means, screen.factors, screen.log_opacities, screen.channels)
+    inputs = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     if settings.path == "compiled":
         return composite_compiled(*inputs, pairs, grid, settings)[:-1]
     return composite(*inputs, make_blocks(pairs, settings.chunk, len(screen.ids)), grid, settings)[:-1]

@@ -47,7 +47,7 @@ def blend_tile(
 ) -> Float[Tensor, "C h w"]:
     """Splats `rows`, nearest first, blended at `places`."""
     x, y = (places - screen.means[rows, None, None]).unbind(-1)
-    u0, u1, u2 = screen.factors[rows, :, None, None].unbind(1)
+    u0, u1, u2 = screen.conic_factors[rows, :, None, None].unbind(1)
     full = torch.exp(screen.log_opacities[rows, None, None] - (u0 * x + u1 * y) ** 2 - (u2 * y) ** 2)
     clamped = full + (full.clamp(max=settings.alpha_max) - full).detach()
     alpha = torch.where(clamped >= settings.alpha_min, clamped, 0.0)

@@ -68,7 +68,7 @@ def screen_of(
         means=means[order],
         depths=depths[order],
         covariances=covariances[order],
-        factors=factors_of(covariances)[order],
+        conic_factors=factors_of(covariances)[order],
         log_opacities=opacities[order].log(),
         channels=colours[order],
         dropped=0,

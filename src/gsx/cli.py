@@ -352,7 +352,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
     from gsx.core.run_folder.run_key import claimed, place_of, scene_stamp
-    from gsx.experiments.runs.session import pursue
+    from gsx.experiments.runs.session import resume_or_start
 
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
@@ -362,7 +362,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with claimed(folder) as alone:
         if not alone:
             raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
-        _, run = pursue(settings, loaded, stamp)
+        _, run = resume_or_start(settings, loaded, stamp)
         if run is None:
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0

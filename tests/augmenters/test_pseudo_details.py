@@ -95,7 +95,7 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
     run.sampler.order = [picked]
     step = backward(run)
     found = gradients(run)
-    run.backbone.discard()
+    run.backbone.zero_grad()
     views = augmenter_of(run).views[picked]
     assert len(views) == 3
     losses = [pseudo_loss(picture(run, view.camera), view) for view in views]
@@ -115,7 +115,7 @@ def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Pa
     run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
-    run.backbone.discard()
+    run.backbone.zero_grad()
     assert step.terms["own"] == pytest.approx(0.85 * float(own_loss(run, 0).detach()), rel=1e-4)
 
 
@@ -137,7 +137,7 @@ def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
-    run.backbone.discard()
+    run.backbone.zero_grad()
     assert step.terms["own"] == pytest.approx(0.75 * float(own_loss(run, 0).detach()), rel=1e-4)
     assert list(step.terms) == ["own", "upscale", "bootstrap"]
 
@@ -149,7 +149,7 @@ def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_pat
     run.sampler.order = [1]
     backward(run)
     found = gradients(run)
-    run.backbone.discard()
+    run.backbone.zero_grad()
     (0.85 * own_loss(run, 1)).backward()
     alone = gradients(run)
     colour = [name for name in alone if name.startswith("heads.colour")]
@@ -188,7 +188,7 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     step = backward(run)
     assert len(renders) == (3 if background == "true" else 2)
     found = gradients(run)
-    run.backbone.discard()
+    run.backbone.zero_grad()
     views = augmenter_of(run).views[2]
     assert [(view.provenance["scale"], view.camera.size) for view in views] == [(1, (48, 36)), (2, (48, 36))]
     assert torch.equal(views[0].target.float() / 255, run.scene.train[2].image())

@@ -321,9 +321,9 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
         regulariser = model.regulariser(drawn)
         assert regulariser is None or float(regulariser.detach()) == 0
         assert all(not gradient.any() for _, gradient in model.gradients())
-        model.record(model.observe(drawn, rendering, 1000))
+        model.accumulate(model.observe(drawn, rendering, 1000))
         assert model.table["visits"].sum() == len(drawn.anchors.rows)
-        assert model.adapt(1000) == {}
+        assert model.densify_and_prune(1000) == {}
         model.update(1000)
         assert all(torch.isfinite(value).all() for value in model.tensors().values())
 
@@ -361,12 +361,12 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
         screen = rendering.screen
         for place, splat in enumerate(screen.ids.tolist()):
             if int(screen.radii[place]) > 0:
-                x, y = screen.shift.grad[place].tolist()
+                x, y = screen.means2d_offset.grad[place].tolist()
                 slot = int(decoded.slots[splat])
                 wanted[2][slot] += math.hypot(x * camera.width / 2, y * camera.height / 2)
                 wanted[3][slot] += 1
-        backbone.record(backbone.observe(drawn, rendering, 1000))
-        backbone.discard()
+        backbone.accumulate(backbone.observe(drawn, rendering, 1000))
+        backbone.zero_grad()
     for column, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(backbone.table[column].flatten(), torch.tensor(values))
     assert 0 < sum(visits > 0 for visits in wanted[0]) < count
@@ -377,7 +377,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
 @pytest.mark.parametrize(("step", "counts"), [(500, False), (501, True), (14999, True), (15000, False)])
 def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: bool) -> None:
     backbone = small_anchors("scaffold")
-    backbone.record(backbone.observe(*render(backbone, backbone.cameras[0], step), step))
+    backbone.accumulate(backbone.observe(*render(backbone, backbone.cameras[0], step), step))
     assert bool(backbone.table["visits"].any()) == counts
 
 
@@ -414,7 +414,7 @@ def test_a_growth_step_moves_only_the_networks(name: str) -> None:
     moments = {n: table.optimiser.state[table[n]]["exp_avg"].clone() for n in table.parameters}
     held = {n: p.detach().clone() for n, p in heads.items()}
     before = len(table)
-    done = backbone.adapt(1600)
+    done = backbone.densify_and_prune(1600)
     assert done["grown"] > 0
     assert done["pruned"] == 5
     assert len(table) == before + done["grown"] - 5
@@ -441,7 +441,7 @@ def test_eligible_offsets_and_ready_anchors_are_reset_and_nothing_else(name: str
     table["visits"][10:] = 80.0
     table["opacity_sum"][10:] = 7.0
     before = len(table)
-    backbone.adapt(1600)
+    backbone.densify_and_prune(1600)
     old = before - 5
     assert not table["gradient_count"][:15].any()
     assert not table["gradient_sum"][:15].any()
@@ -460,7 +460,7 @@ def test_lengths_are_clamped_in_units_of_the_world_or_the_extent(quirk: str, uni
     backbone = small_anchors("scaffold", f"quirks.clamp={quirk}", scene=scene)
     with torch.no_grad():
         backbone.table["log_scales"].fill_(4.0)
-    backbone.adapt(1600)
+    backbone.densify_and_prune(1600)
     lengths = backbone.table["log_scales"].exp()
     torch.testing.assert_close(lengths[:, 3:], torch.full_like(lengths[:, 3:], unit * math.exp(0.05)))
     torch.testing.assert_close(lengths[:, :3], torch.full_like(lengths[:, :3], math.exp(4)))
@@ -469,19 +469,19 @@ def test_lengths_are_clamped_in_units_of_the_world_or_the_extent(quirk: str, uni
 def test_one_camera_has_no_extent_to_clamp_by() -> None:
     scene = small_scene(spread(60), extent=0.0, views=1)
     backbone = small_anchors("scaffold", "fidelity=sane", scene=scene)
-    assert backbone.adapt(1600) == {"grown": 0, "pruned": 0}
+    assert backbone.densify_and_prune(1600) == {"grown": 0, "pruned": 0}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_cap_is_never_passed(name: str) -> None:
     count = len(small_anchors(name).table)
     backbone = judged(name, f"max_primitives={count + 2}")
-    free = judged(name, "max_primitives=0").adapt(1600)
+    free = judged(name, "max_primitives=0").densify_and_prune(1600)
     assert "withheld" not in free
-    capped = backbone.adapt(1600)
+    capped = backbone.densify_and_prune(1600)
     assert (capped["grown"], capped["pruned"]) == (2, 5)
     assert capped["withheld"] >= free["grown"] - 2  # what found no room takes no finer anchor's cell either
-    full = judged(name, f"max_primitives={count - 7}").adapt(1600)
+    full = judged(name, f"max_primitives={count - 7}").densify_and_prune(1600)
     assert (full["grown"], full["pruned"]) == (0, 5)
     assert full["withheld"] > 0
 
@@ -491,7 +491,7 @@ def test_the_cap_is_never_passed(name: str) -> None:
 ])  # fmt: skip
 def test_the_gate_opens_when_all_levels_train(quirk: str, step: int, opens: bool) -> None:
     backbone = judged("octree_scaffold", f"quirks.gate={quirk}", "levels.count=4")
-    backbone.adapt(step)
+    backbone.densify_and_prune(step)
     assert bool(backbone.table["bias"].any()) == opens
 
 
@@ -525,7 +525,7 @@ def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
         backbone.table["offsets"][7, 1, 0] = torch.inf
     before = backbone.table["anchors"].clone()
     kept = [row for row in range(len(before)) if row not in (3, 7)]
-    assert backbone.heal([], 1) == 2
+    assert backbone.remove_nonfinite([], 1) == 2
     assert torch.equal(backbone.table["anchors"], before[kept])
     assert {len(column) for column in backbone.table.columns.values()} == {len(kept)}
 

@@ -255,7 +255,7 @@ def test_an_event_by_hand() -> None:
     backbone = due()
     before = raw_of(backbone)
     assert before["level"][:4].tolist() == [0, 0, 0, 0]
-    done = backbone.adapt(1600)
+    done = backbone.densify_and_prune(1600)
     assert done == {"cloned": 2, "split": 2, "pruned": 0}
     after, count = raw_of(backbone), len(before["means"])
     for name, value in before.items():
@@ -276,7 +276,7 @@ def test_an_event_by_hand() -> None:
 
 @pytest.mark.parametrize(("step", "happens"), [(1500, False), (1600, True), (24900, True), (25000, False)])
 def test_events_come_every_hundred_steps_of_their_window(step: int, happens: bool) -> None:
-    assert bool(due(step=step).adapt(step)) == happens
+    assert bool(due(step=step).densify_and_prune(step)) == happens
 
 
 @pytest.mark.parametrize(("word", "step", "split"), [
@@ -286,21 +286,21 @@ def test_events_come_every_hundred_steps_of_their_window(step: int, happens: boo
 ])  # fmt: skip
 def test_the_gate_keeps_splits_until_all_levels_train(word: str, step: int, split: int) -> None:
     backbone = due(word, step=step)
-    done = backbone.adapt(step)
+    done = backbone.densify_and_prune(step)
     assert (done["cloned"], done["split"]) == (2, split)
     assert bool(backbone.table["bias"][3] > 0) == (split > 0)
 
 
 def test_splits_that_wait_take_no_room() -> None:
     count = len(small_octree().table)
-    done = due("quirks.gate=closed", f"max_primitives={count + 1}").adapt(1600)
+    done = due("quirks.gate=closed", f"max_primitives={count + 1}").densify_and_prune(1600)
     assert (done["cloned"], done["split"]) == (1, 0)
 
 
 def test_the_cap_is_never_passed() -> None:
     count = len(small_octree().table)
-    done = due(f"max_primitives={count + 1}").adapt(1600)
-    free = due("max_primitives=0").adapt(1600)
+    done = due(f"max_primitives={count + 1}").densify_and_prune(1600)
+    free = due("max_primitives=0").densify_and_prune(1600)
     assert "withheld" not in free
     more = free["cloned"] + free["split"] - 1
     assert done == {"cloned": 0, "split": 1, "pruned": 0, "withheld": more}  # the largest gradient comes first
@@ -312,7 +312,7 @@ def test_the_cap_is_never_passed() -> None:
 def test_bias_has_a_limit_where_the_reference_has_none(word: str, bias: float) -> None:
     backbone = due(word, "quirks.gate=open")
     backbone.table["bias"][3] = 0.995
-    backbone.adapt(1600)
+    backbone.densify_and_prune(1600)
     assert float(backbone.table["bias"][3]) == pytest.approx(bias)
 
 
@@ -338,7 +338,7 @@ def test_faint_gaussians_go_at_once_and_huge_ones_after_step_3000(step: int, pru
     with torch.no_grad():
         backbone.table["opacity_logits"][10] = -6.0
         backbone.table["log_scales"][11:13, 1] = math.log(0.11)
-    assert backbone.adapt(step) == {"cloned": 0, "split": 0, "pruned": pruned}
+    assert backbone.densify_and_prune(step) == {"cloned": 0, "split": 0, "pruned": pruned}
 
 
 def test_opacities_are_never_reset() -> None:
@@ -388,7 +388,7 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
     """From afar level 0 alone is drawn; its rows lie anywhere in the table once levels are mixed."""
     backbone = small_octree()
     backbone.table["level"].copy_(torch.arange(len(backbone.table)) % 3)
-    backbone.record(backbone.observe(*render(backbone, seen_from(30.0), 1), 1))
+    backbone.accumulate(backbone.observe(*render(backbone, seen_from(30.0), 1), 1))
     coarse = backbone.table["level"] == 0
     assert backbone.statistics.count[coarse].sum() > 10
     assert not backbone.statistics.count[~coarse].any()

@@ -14,7 +14,7 @@ from gsx.backbones.heads import Heads
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.training.density import Table
+from gsx.core.training.density import ParameterTable
 
 CAMERA = look_at([0.3, -4, 1], [0, 0, 0], fov_x=0.9, width=24, height=16)
 FIELDS = ("means", "scales", "quats", "log_opacities", "colours")
@@ -32,17 +32,17 @@ class Fixed(Heads):
         return self.outputs
 
 
-def table_of(count: int = 6, k: int = 3, dtype: torch.dtype = torch.float32, **columns: Tensor) -> Table:
+def table_of(count: int = 6, k: int = 3, dtype: torch.dtype = torch.float32, **columns: Tensor) -> ParameterTable:
     """Anchors with random values."""
     generator = torch.Generator().manual_seed(5)
     shapes = {"offsets": (count, k, 3), "features": (count, 8), "log_scales": (count, 6)}
     values = {name: torch.randn(*shape, generator=generator).to(dtype) for name, shape in shapes.items()}
     values["log_scales"] = values["log_scales"] / 2 - 1
     positions = torch.randn(count, 3, generator=generator).to(dtype)
-    return Table({name: Parameter(value) for name, value in values.items()}, {"anchors": positions, **columns})
+    return ParameterTable({name: Parameter(value) for name, value in values.items()}, {"anchors": positions, **columns})
 
 
-def explicit_table(count: int = 6, dtype: torch.dtype = torch.float32, degree: int = 3) -> Table:
+def explicit_table(count: int = 6, dtype: torch.dtype = torch.float32, degree: int = 3) -> ParameterTable:
     generator, bands = torch.Generator().manual_seed(6), (degree + 1) ** 2 - 1
     shapes = {
         "offsets": (count, 1, 3), "log_scales": (count, 6), "quats": (count, 4), "opacity_logits": (count,),
@@ -50,7 +50,7 @@ def explicit_table(count: int = 6, dtype: torch.dtype = torch.float32, degree: i
     }  # fmt: skip
     values = {name: torch.randn(*shape, generator=generator).to(dtype) / 2 for name, shape in shapes.items()}
     positions = torch.randn(count, 3, generator=generator).to(dtype)
-    return Table({name: Parameter(value) for name, value in values.items()}, {"anchors": positions})
+    return ParameterTable({name: Parameter(value) for name, value in values.items()}, {"anchors": positions})
 
 
 def draw(rows: list[int], weights: list[float] | None = None, camera: Camera = CAMERA, **more: int) -> VisibleAnchors:
@@ -71,7 +71,7 @@ def fixed_outputs(opacities: list[list[float]]) -> Fixed:
     return Fixed(torch.tensor(opacities), shapes, torch.arange(rows * k * 3).reshape(rows, k, 3) / 100 + 0.01)
 
 
-def check_against_loop(decoded: Decoded, table: Table, heads: Fixed, drawn: VisibleAnchors) -> None:
+def check_against_loop(decoded: Decoded, table: ParameterTable, heads: Fixed, drawn: VisibleAnchors) -> None:
     """Which Gaussians there are, in which order, with which values: one anchor and offset after the other."""
     opacities, shapes, colours = (output.tolist() for output in heads.outputs)
     offsets, lengths = table["offsets"].tolist(), table["log_scales"].exp().tolist()
@@ -132,7 +132,7 @@ def test_fresh_anchors_decode_to_their_place_at_about_half_their_length() -> Non
     rows = neural.rows(torch.tensor([0.0, 1.0, -2.0]), torch.full((3, 3), 0.5))
     assert not rows["features"].any()
     assert not rows["offsets"].any()
-    table = Table({n: Parameter(v) for n, v in rows.items()}, {"anchors": torch.arange(9.0).view(3, 3)})
+    table = ParameterTable({n: Parameter(v) for n, v in rows.items()}, {"anchors": torch.arange(9.0).view(3, 3)})
     decoded = neural.decode(table, draw([0, 1, 2]), None)
     owner = decoded.slots // 3
     assert torch.equal(decoded.splats.means, table["anchors"][owner])

@@ -57,8 +57,8 @@ def trained(backbone: Backbone, scene: Scene) -> list[float]:
         extra = backbone.regulariser(drawn)
         loss = loss if extra is None else loss + extra
         loss.backward()
-        backbone.record(backbone.observe(drawn, rendering, step))
-        backbone.adapt(step)
+        backbone.accumulate(backbone.observe(drawn, rendering, step))
+        backbone.densify_and_prune(step)
         backbone.update(step)
         losses.append(float(loss.detach()))
     return losses

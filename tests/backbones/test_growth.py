@@ -30,7 +30,7 @@ from gsx.backbones.growth import (
     resolved,
 )
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
-from gsx.core.training.density import Table
+from gsx.core.training.density import ParameterTable
 
 PUBLISHED = GrowthOptions(
     observe_from=500, start=1500, stop=15000, every=100, success=0.8, gradient=2e-4, prune_opacity=0.005,
@@ -51,7 +51,7 @@ def cloud(
     seen: float = SEEN,
     levels: list[int] | None = None,
     explicit: bool = False,
-) -> tuple[Table, Neural | Explicit]:
+) -> tuple[ParameterTable, Neural | Explicit]:
     """Anchors of unit reach with offsets in world units and mean gradients; the features are random."""
     count, k = len(anchors), len(offsets[0])
     representation = Explicit(1, -2.0) if explicit else Neural(heads_of(SMALL, offsets=k))
@@ -64,7 +64,7 @@ def cloud(
     columns["gradient_sum"] = torch.tensor(gradients) * seen
     if levels is not None:
         columns |= {"level": torch.tensor(levels, dtype=torch.int16), "bias": torch.zeros(count)}
-    return Table({name: Parameter(value) for name, value in rows.items()}, columns), representation
+    return ParameterTable({name: Parameter(value) for name, value in rows.items()}, columns), representation
 
 
 @pytest.fixture
@@ -73,13 +73,15 @@ def keep_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "rand", lambda shape, generator=None: torch.full(shape, 0.999))
 
 
-def deepen(table: Table, representation, *, voxel: float = 1.0, early: bool = True, most: int = ALL, **changes) -> int:
+def deepen(
+    table: ParameterTable, representation, *, voxel: float = 1.0, early: bool = True, most: int = ALL, **changes
+) -> int:
     generator = torch.Generator().manual_seed(9)
     options = replace(PUBLISHED, **changes)
     return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, most)[0]
 
 
-def grown(table: Table, before: int) -> list[tuple[float, ...]]:
+def grown(table: ParameterTable, before: int) -> list[tuple[float, ...]]:
     """Positions of the new anchors in the order of their rows."""
     return [tuple(place) for place in table["anchors"][before:].tolist()]
 
@@ -200,7 +202,7 @@ def node(place: list[float], size: float, origin: float = 0.0) -> tuple[int, ...
     return tuple(round((value - origin) / size) for value in place)
 
 
-def by_depth_loop(table: Table, early: bool, sizes=(16.0, 4.0, 1.0), least: float = 40.0) -> list[tuple]:
+def by_depth_loop(table: ParameterTable, early: bool, sizes=(16.0, 4.0, 1.0), least: float = 40.0) -> list[tuple]:
     """(position, feature, size) of every new anchor, by brute force."""
     taken, new = [list(place) for place in table["anchors"].tolist()], []
     for depth, size in enumerate(sizes):
@@ -222,7 +224,7 @@ def by_depth_loop(table: Table, early: bool, sizes=(16.0, 4.0, 1.0), least: floa
     return new
 
 
-def random_cloud(seed: int, count: int = 30, k: int = 3, levels: int | None = None) -> tuple[Table, Neural]:
+def random_cloud(seed: int, count: int = 30, k: int = 3, levels: int | None = None) -> tuple[ParameterTable, Neural]:
     """Positions and offsets in quarters, gradients over the range of thresholds, sightings around 40."""
     generator = torch.Generator().manual_seed(seed)
     anchors = torch.randint(-80, 80, (count, 3), generator=generator) / 4
@@ -263,7 +265,13 @@ TAUS = (2.0e-4, 2.2974e-4, 2.639e-4, 3.0314e-4)
 
 
 def level_up(
-    table: Table, representation, levels: Levels | None = None, *, gate: bool = True, most: int = ALL, **changes
+    table: ParameterTable,
+    representation,
+    levels: Levels | None = None,
+    *,
+    gate: bool = True,
+    most: int = ALL,
+    **changes,
 ) -> int:
     """`changes` are of quirks or of growth options."""
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
@@ -271,7 +279,7 @@ def level_up(
     return grow_by_level(table, representation, options, levels or three_levels(), 40.0, quirks, gate, most)[0]
 
 
-def grown_levels(table: Table, before: int) -> list[tuple]:
+def grown_levels(table: ParameterTable, before: int) -> list[tuple]:
     """(level, position) of the new anchors."""
     return list(zip(table["level"][before:].tolist(), grown(table, before), strict=True))
 
@@ -280,7 +288,9 @@ FAR = [[0.0, 0.0, 4.0], [0.0, 0.0, 6.0], [0.0, 0.0, 7.0]]
 """An anchor of each level, all out of the way."""
 
 
-def one_offset(gradient: float, level: int, offset: list[float], levels=(0, 1, 2), **more) -> tuple[Table, Neural]:
+def one_offset(
+    gradient: float, level: int, offset: list[float], levels=(0, 1, 2), **more
+) -> tuple[ParameterTable, Neural]:
     """An anchor of `level` at the origin with one offset, and anchors of `levels` elsewhere."""
     others = [FAR[other] for other in levels]
     return cloud(
@@ -433,7 +443,7 @@ def test_new_anchors_are_no_candidates_in_the_same_call() -> None:
     assert table["bias"][4].item() == 0
 
 
-def bias_case() -> tuple[Table, Neural]:
+def bias_case() -> tuple[ParameterTable, Neural]:
     """Anchors of levels 0, 1, 2 with mean gradients above a quarter of tau_0, tau_1 and below that of tau_2."""
     anchors, gradients = [[0.0, 0, 0], [4.0, 4, 0], [8.0, 0, 4]], [[5.1e-5], [5.8e-5], [6.5e-5]]
     return cloud(anchors, [[[0.0] * 3]] * 3, gradients, levels=[0, 1, 2])
@@ -471,7 +481,7 @@ def test_bias_looks_at_the_mean_over_eligible_offsets() -> None:
         assert table["bias"].tolist() == pytest.approx([wanted])
 
 
-def by_level_loop(table: Table, levels: int, inherit: bool) -> list[tuple]:
+def by_level_loop(table: ParameterTable, levels: int, inherit: bool) -> list[tuple]:
     """(level, position, feature) of every new anchor: gate open, next level's duplicates, nothing weeded."""
     taken = list(zip(table["level"].tolist(), table["anchors"].tolist(), strict=True))
     new = []
@@ -570,7 +580,7 @@ def test_offsets_are_judged_after_more_than_forty_sightings() -> None:
     assert table["gradient_count"].tolist() == [[0.0, 40.0, 0.0, 0.0]]
 
 
-def pruning_case(visits: list[float], sums: list[float]) -> Table:
+def pruning_case(visits: list[float], sums: list[float]) -> ParameterTable:
     table, _ = cloud([[float(i), 0, 0] for i in range(len(visits))], [[[0.0] * 3]] * len(visits), [[0.0]] * len(visits))
     table.columns |= {"visits": torch.tensor(visits), "opacity_sum": torch.tensor(sums)}
     return table

@@ -175,7 +175,12 @@ def seen_as(
     shift = torch.zeros(len(ids), 2, requires_grad=True)
     shift.grad = torch.tensor(gradients)
     screen = ScreenStatistics(
-        ids=torch.tensor(ids), radii=torch.tensor(radii), shift=shift, probe=None, heaviest=None, size=(24, 16)
+        ids=torch.tensor(ids),
+        radii=torch.tensor(radii),
+        means2d_offset=shift,
+        absgrad=None,
+        max_weights=None,
+        size=(24, 16),
     )
     drawn = backbone.draw(camera(), 1)
     return drawn, replace(rasterize(drawn.splats, camera(), RasterSettings()), screen=screen)
@@ -184,8 +189,8 @@ def seen_as(
 def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     # half the raster is (12, 8) px: the norms are 60, 15 (unseen: radius 0) and then 20 with the opposite sign
-    backbone.record(backbone.observe(*seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
-    backbone.record(backbone.observe(*seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
+    backbone.accumulate(backbone.observe(*seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
+    backbone.accumulate(backbone.observe(*seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
     assert backbone.statistics.count.tolist() == [2, 0, 1]
     expected = torch.tensor([(math.hypot(36, 48) + math.hypot(12, 16)) / 2, 0.0, 4.0])
     torch.testing.assert_close(backbone.statistics.mean_gradient(), expected)
@@ -193,8 +198,8 @@ def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() ->
 
 def test_statistics_end_with_density_control() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
-    backbone.record(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
-    backbone.record(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
+    backbone.accumulate(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
+    backbone.accumulate(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
     assert backbone.statistics.count.tolist() == [1, 0, 0]
 
 
@@ -205,7 +210,7 @@ def test_rows_are_survivors_clones_first_children_second_children() -> None:
     # quiet, clone (exactly at the threshold), split, clone, split, unseen
     backbone = hand_made([0.00019, 0.0002, 0.001, 0.1, 0.0003, 0.0], [0.02, 0.009, 0.02, 0.001, 0.05, 0.02])
     before = snapshot(backbone)
-    done = backbone.adapt(600)
+    done = backbone.densify_and_prune(600)
     assert done == {"cloned": 2, "split": 2, "pruned": 0}
     assert labels(backbone) == [0, 1, 3, 5, 1, 3, 2, 4, 2, 4]
     after = snapshot(backbone)
@@ -221,20 +226,20 @@ def test_rows_are_survivors_clones_first_children_second_children() -> None:
 @pytest.mark.parametrize("extent", [1.0, 20.0])
 def test_what_is_large_depends_on_the_extent(extent: float) -> None:
     sizes = [extent * 0.0099, extent * 0.0101]
-    assert hand_made([1.0, 1.0], sizes, extent=extent).adapt(600) == {"cloned": 1, "split": 1, "pruned": 0}
+    assert hand_made([1.0, 1.0], sizes, extent=extent).densify_and_prune(600) == {"cloned": 1, "split": 1, "pruned": 0}
 
 
 def test_nothing_happens_between_events() -> None:
     backbone = hand_made([1.0, 1.0], [0.001, 0.05], [0.5, 0.001])
     table = dict(backbone.table.parameters)
     for step in (1, 500, 599, 601, 15000, 15100, 30000):
-        assert backbone.adapt(step) == {}
+        assert backbone.densify_and_prune(step) == {}
     assert all(backbone.table[name] is table[name] for name in NAMES)
 
 
 def test_statistics_start_anew_after_an_event() -> None:
     backbone = hand_made([1.0, 0.0, 1.0], [0.001, 0.001, 0.05])
-    backbone.adapt(600)
+    backbone.densify_and_prune(600)
     assert backbone.statistics.count.tolist() == [0] * 5
     assert backbone.statistics.gradient.tolist() == [0.0] * 5
 
@@ -275,14 +280,14 @@ def test_splitting_a_zero_quaternion_stays_finite() -> None:
     backbone = hand_made([1.0, 0.0], [0.05, 0.05])
     with torch.no_grad():
         backbone.table["quats"][0] = 0
-    backbone.adapt(600)
+    backbone.densify_and_prune(600)
     assert all(torch.isfinite(value).all() for value in snapshot(backbone).values())
 
 
 def test_faint_primitives_go_and_huge_ones_after_the_first_reset() -> None:
     def event(step: int) -> tuple[dict[str, int], list[int]]:
         backbone = hand_made([0.0] * 5, [0.01, 0.01, 0.099, 0.11, 5.0], [0.0051, 0.0049, 0.5, 0.5, 0.5])
-        return backbone.adapt(step), labels(backbone)
+        return backbone.densify_and_prune(step), labels(backbone)
 
     assert event(600) == ({"cloned": 0, "split": 0, "pruned": 1}, [0, 2, 3, 4])
     assert event(3000)[1] == [0, 2, 3, 4]
@@ -291,13 +296,13 @@ def test_faint_primitives_go_and_huge_ones_after_the_first_reset() -> None:
 
 def test_new_children_are_pruned_at_once_where_they_are_faint_or_huge() -> None:
     backbone = hand_made([1.0, 1.0, 1.0, 0.0], [0.159, 0.161, 0.05, 0.01], [0.5, 0.5, 0.004, 0.5])
-    assert backbone.adapt(3100) == {"cloned": 0, "split": 3, "pruned": 4}
+    assert backbone.densify_and_prune(3100) == {"cloned": 0, "split": 3, "pruned": 4}
     assert labels(backbone) == [3, 0, 0]  # 0.159 / 1.6 is below 0.1, 0.161 / 1.6 above
 
 
 def test_a_cloud_about_to_vanish_stays() -> None:
     backbone = hand_made([0.0, 0.0], [0.01, 0.01], [0.001, 0.002])
-    assert backbone.adapt(600)["pruned"] == 0
+    assert backbone.densify_and_prune(600)["pruned"] == 0
     assert labels(backbone) == [0, 1]
 
 
@@ -315,7 +320,7 @@ def test_a_cloud_about_to_vanish_stays() -> None:
 )
 def test_no_primitive_is_added_beyond_the_cap_and_strong_gradients_come_first(cap: int, expected: list[int]) -> None:
     backbone = hand_made([0.0, 0.0003, 0.5, 0.2], [0.001, 0.001, 0.05, 0.001], cap=cap)
-    done = backbone.adapt(600)
+    done = backbone.densify_and_prune(600)
     assert labels(backbone) == expected
     assert done["cloned"] + done["split"] == len(expected) - 4
     assert done.get("withheld", 0) == 7 - len(expected)
@@ -358,7 +363,7 @@ def test_reset_leaves_invisible_primitives_finite() -> None:
 )
 def test_resets_come_when_due(background: float, step: int, resets: bool) -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2, background=background)
-    assert backbone.adapt(step).get("opacity_resets", 0) == int(resets)
+    assert backbone.densify_and_prune(step).get("opacity_resets", 0) == int(resets)
     expected = 0.01 if resets else 0.5
     torch.testing.assert_close(backbone.table["opacity_logits"].detach().sigmoid(), torch.full((2,), expected))
 
@@ -366,7 +371,7 @@ def test_resets_come_when_due(background: float, step: int, resets: bool) -> Non
 def test_reset_comes_after_the_event_of_the_same_step() -> None:
     backbone = hand_made([0.0, 1.0, 0.0], [0.01, 0.001, 0.01], [0.9, 0.9, 0.0049])
     backbone.options = published_options(reset_opacity=0.004)  # below what is pruned: the order shows
-    assert backbone.adapt(3000) == {"cloned": 1, "split": 0, "pruned": 1, "opacity_resets": 1}
+    assert backbone.densify_and_prune(3000) == {"cloned": 1, "split": 0, "pruned": 1, "opacity_resets": 1}
     torch.testing.assert_close(backbone.table["opacity_logits"].detach().sigmoid(), torch.full((3,), 0.004))
 
 
@@ -378,7 +383,7 @@ def test_an_event_costs_the_step_and_new_rows_start_without_moments() -> None:
     learn(backbone)
     backbone.update(599)
     learn(backbone)
-    backbone.adapt(600)
+    backbone.densify_and_prune(600)
     before = snapshot(backbone)
     backbone.update(600)
     for name in NAMES:
@@ -393,7 +398,7 @@ def test_an_event_costs_the_step_and_new_rows_start_without_moments() -> None:
 def test_an_event_without_candidates_costs_the_step_too() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2)
     learn(backbone)
-    backbone.adapt(600)
+    backbone.densify_and_prune(600)
     before = snapshot(backbone)
     backbone.update(600)
     assert all(torch.equal(backbone.table[name], before[name]) for name in NAMES)
@@ -402,7 +407,7 @@ def test_an_event_without_candidates_costs_the_step_too() -> None:
 def test_a_reset_outside_an_event_costs_only_opacity_its_step() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2, background=1.0)
     learn(backbone)
-    backbone.adapt(500)
+    backbone.densify_and_prune(500)
     before = snapshot(backbone)
     backbone.update(500)
     moved = [name for name in NAMES if not torch.equal(backbone.table[name], before[name])]
@@ -414,7 +419,7 @@ def test_discard_forgets_gradients_without_moving() -> None:
     learn(backbone)
     assert sorted(name for name, _ in backbone.gradients()) == sorted(NAMES)
     before = snapshot(backbone)
-    backbone.discard()
+    backbone.zero_grad()
     assert list(backbone.gradients()) == []
     assert all(torch.equal(backbone.table[name], before[name]) for name in NAMES)
 
@@ -430,8 +435,8 @@ def step_on(backbone: GS3D, step: int) -> dict[str, int]:
     drawn = backbone.draw(seen, step)
     picture = rasterize(drawn.splats, seen, RasterSettings())
     photometric(picture.image, target, 0.2).backward()
-    backbone.record(backbone.observe(drawn, picture, step))
-    done = backbone.adapt(step)
+    backbone.accumulate(backbone.observe(drawn, picture, step))
+    done = backbone.densify_and_prune(step)
     backbone.update(step)
     return done
 

@@ -149,7 +149,7 @@ def test_where_nothing_is_removed_nothing_is_touched(name: str, tmp_path: Path) 
     run = run_of(name, tmp_path)
     backward(run)
     before = {key: (value, value.grad) for key, value in run.backbone.parameters()}
-    assert run.backbone.heal([view.camera for view in run.scene.train], 1) == 0
+    assert run.backbone.remove_nonfinite([view.camera for view in run.scene.train], 1) == 0
     for key, value in run.backbone.parameters():
         assert value is before[key][0]
         assert value.grad is before[key][1]
@@ -162,7 +162,7 @@ def test_a_model_that_is_lost_as_a_whole_is_left_as_it_is(name: str, tmp_path: P
     with torch.no_grad():
         backbone_of(run).table["log_scales"].fill_(torch.nan)
     count = len(backbone_of(run).table)
-    assert run.backbone.heal([run.scene.train[0].camera], 1) == 0
+    assert run.backbone.remove_nonfinite([run.scene.train[0].camera], 1) == 0
     assert len(backbone_of(run).table) == count
 
 

@@ -259,7 +259,7 @@ def test_sizes_are_computed_when_published(monkeypatch: pytest.MonkeyPatch, back
     monkeypatch.setattr(gs3d, "filter_sizes", counted)
     backbone = mip_gs3d(small_scene(spread(3), background=background))
     for step in range(1, 30001):
-        backbone.adapt(step)
+        backbone.densify_and_prune(step)
     assert steps == [0, *range(600, 15000, 100), *range(15100, 29900, 100)]
 
 
@@ -271,7 +271,7 @@ def test_without_the_filter_nothing_is_computed() -> None:
 def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
     backbone = row_values([0.5, 0.001, 0.5, 0.5], [0.5] * 4, [1.0, 1.0, 0.0, 0.0])
     before = backbone.table["filter"].clone()
-    assert backbone.adapt(600) == {"cloned": 1, "split": 1, "pruned": 0}
+    assert backbone.densify_and_prune(600) == {"cloned": 1, "split": 1, "pruned": 0}
     cameras = [view.camera for view in small_scene(spread(1)).train]
     expected = torch.tensor(sizes_in_loops(backbone.table["means"].detach(), cameras))
     torch.testing.assert_close(backbone.table["filter"], expected)
@@ -317,7 +317,7 @@ def test_a_reset_never_raises_an_opacity(rows: list[tuple[float, float]], highes
 def test_a_reset_uses_the_sizes_of_the_event_before_it() -> None:
     backbone = row_values([2.0, 2.0], [0.9, 0.9])
     backbone.table.columns["filter"] = torch.zeros(2) + 1e-6  # stale
-    assert backbone.adapt(3000)["opacity_resets"] == 1
+    assert backbone.densify_and_prune(3000)["opacity_resets"] == 1
     torch.testing.assert_close(drawn_opacities(backbone), torch.full((2,), 0.01))
 
 
@@ -336,14 +336,14 @@ def test_size_and_opacity_tests_are_of_raw_values() -> None:
     assert float(backbone.table["filter"].min()) > 0.05
     assert float(drawn_opacities(backbone)[0]) < 0.005
     assert float(backbone.draw(backbone.cameras[0], 1).splats.scales.detach()[3].max()) > 0.1
-    assert backbone.adapt(3100) == {"cloned": 1, "split": 1, "pruned": 2}
+    assert backbone.densify_and_prune(3100) == {"cloned": 1, "split": 1, "pruned": 2}
     assert labels(backbone) == [0, 3, 0, 1, 1]
 
 
 def test_children_are_drawn_from_raw_scales() -> None:
     backbone = row_values([0.02, 0.001], [0.5, 0.5], [1.0, 0.0])
     parent = backbone.table["means"].detach()[0].clone()
-    assert backbone.adapt(600)["split"] == 1
+    assert backbone.densify_and_prune(600)["split"] == 1
     offsets = (backbone.table["means"].detach()[1:] - parent).norm(dim=1)
     assert 0 < float(offsets.max()) < 0.1  # five raw standard deviations; the filter is several times that
     torch.testing.assert_close(backbone.table["log_scales"].detach()[1:, 0].exp(), torch.full((2,), 0.02 / 1.6))
@@ -376,14 +376,14 @@ def test_both_kinds_of_candidates_meet_the_same_size_test() -> None:
     sums = [0.0, 8.0, 9.0, 0.0, 7.0, 7.5]
     scales = [0.02, 0.009, 0.02, 0.02, 0.02, 0.009]
     backbone = row_values(scales, [0.5] * 6, [0.0, 0.0, 0.0, 0.0, 1.0, 1.0], sums)
-    assert backbone.adapt(600) == {"cloned": 2, "split": 2, "pruned": 0}
+    assert backbone.densify_and_prune(600) == {"cloned": 2, "split": 2, "pruned": 0}
     assert labels(backbone) == [0, 1, 3, 5, 1, 5, 2, 4, 2, 4]
     assert backbone.statistics.absolute.tolist() == [0.0] * 10
 
 
 def test_without_any_gradient_nothing_is_chosen() -> None:
     backbone = row_values([0.001] * 3, [0.5] * 3, [0.0] * 3, [0.0] * 3)
-    assert backbone.adapt(600) == {"cloned": 0, "split": 0, "pruned": 0}
+    assert backbone.densify_and_prune(600) == {"cloned": 0, "split": 0, "pruned": 0}
 
 
 def weighted_render(backbone: GS3D, camera: Camera, weights: Tensor, absolute: bool) -> ScreenStatistics:
@@ -405,12 +405,12 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
         for pixel in range(96):
             alone = torch.zeros(96).index_fill_(0, torch.tensor([pixel]), 1.0).view(8, 12)
             screen = weighted_render(backbone, small, weights * alone, absolute=False)
-            by_mean = screen.shift.grad.double().abs()
+            by_mean = screen.means2d_offset.grad.double().abs()
             truth.index_add_(0, screen.ids, by_mean[:, 0] * 12 / 2 + by_mean[:, 1] * 8 / 2)
         drawn = backbone.draw(small, 1)
         picture = rasterize(drawn.splats, small, backbone.raster, absolute_gradient=True)
         (picture.image * weights).sum().backward()
-        backbone.record(backbone.observe(drawn, picture, number + 1))
+        backbone.accumulate(backbone.observe(drawn, picture, number + 1))
     assert backbone.absolute_gradient
     assert backbone.statistics.count.tolist() == [2] * 12
     torch.testing.assert_close(backbone.statistics.mean_absolute().double(), truth / 2, rtol=1e-4, atol=1e-6)
@@ -554,8 +554,8 @@ def test_training_stays_finite(name: str) -> None:
         assert torch.isfinite(picture.image).all()
         photometric(picture.image, torch.full_like(picture.image, 0.5), 0.2).backward()
         assert all(torch.isfinite(gradient).all() for _, gradient in backbone.gradients())
-        backbone.record(backbone.observe(drawn, picture, step))
-        backbone.adapt(step)
+        backbone.accumulate(backbone.observe(drawn, picture, step))
+        backbone.densify_and_prune(step)
         backbone.update(step)
         assert finite(backbone.draw(camera, step).splats)
     assert (backbone.table["filter"] > 0).all()

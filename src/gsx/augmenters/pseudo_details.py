@@ -363,7 +363,7 @@ class PseudoDetails:
         fresh = run.step == event
         made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
-            run.ranks.everyone(None)  # the others wait for the file
+            run.ranks.all_gather(None)  # the others wait for the file
         return self.recalled(run, event) if made is None else made
 
     def written(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], dict[str, Any]]:

@@ -57,13 +57,13 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
     ADAM_EPSILON,
-    Table,
+    ParameterTable,
     adam_tensors,
+    densification_statistics,
     finite_rows,
     keep_rows,
     restore_adam,
     restored_table,
-    sightings,
     table_tensors,
 )
 from gsx.core.training.schedule import log_linear
@@ -272,14 +272,14 @@ class Anchors:
 
     # -- the beginning -----------------------------------------------------------------------------------------
 
-    def initial_table(self, points: PointCloud) -> Table:
+    def initial_table(self, points: PointCloud) -> ParameterTable:
         """Anchors on the grid nodes next to the points (spec 2.1 and 3.3)."""
         positions, columns, owner, source = self.initial_anchors(points.positions.float())
         colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
         squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
         rows = self.representation.rows(0.5 * squares.log(), colours)
         columns |= fresh_statistics(len(positions), self.representation.offsets, self.device) | {"anchors": positions}
-        return Table(
+        return ParameterTable(
             {name: Parameter(value.to(self.device)) for name, value in rows.items()},
             {name: value.to(self.device) for name, value in columns.items()},
         )
@@ -358,7 +358,7 @@ class Anchors:
         if not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
             return {}
         decoded = drawn.decoded
-        seen = sightings(rendering.screen, decoded.slots, weight)
+        seen = densification_statistics(rendering.screen, decoded.slots, weight)
         return {
             "rows": drawn.anchors.rows,
             "opacities": decoded.opacities,
@@ -367,12 +367,12 @@ class Anchors:
             "weight": seen["weight"].to(decoded.opacities),
         }
 
-    def record(self, seen: Observation) -> None:
+    def accumulate(self, seen: Observation) -> None:
         """Add an observation to the columns of the table."""
         if seen:
             observe(self.table, **seen)
 
-    def adapt(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> dict[str, int]:
         """Grow and prune when due (spec 2.6)."""
         if self.growth_due(step):
             done = self.adapt_now(step)
@@ -392,7 +392,7 @@ class Anchors:
             make_identity_where_zero(self.table["quats"])
         if self.head_optimiser is not None:
             self.head_optimiser.step()
-        self.discard()
+        self.zero_grad()
 
     def parameters(self) -> Iterable[tuple[str, Parameter]]:
         """Parameters by name, those of anchors before those of the heads."""
@@ -411,7 +411,7 @@ class Anchors:
         return () if self.heads is None else self.heads.colour.parameters()
 
     @torch.no_grad()
-    def heal(self, cameras: Sequence[Camera], step: int) -> int:
+    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove anchors with a value that is not finite, or with a Gaussian that a camera cannot draw."""
         kept = finite_rows(self.table)
         for camera in cameras:
@@ -434,7 +434,7 @@ class Anchors:
         usable = everyone.index_fill(0, owners[lost], False)
         return usable if bool(usable[owners].any()) else everyone
 
-    def discard(self) -> None:
+    def zero_grad(self) -> None:
         """Forget the gradients."""
         self.table.optimiser.zero_grad(set_to_none=True)
         if self.head_optimiser is not None:

@@ -15,7 +15,7 @@ from gsx.backbones.levels import Levels, initial_nodes, thresholds
 from gsx.backbones.sampling import sampled_means
 from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import Table
+from gsx.core.training.density import ParameterTable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def bias_levels(table: Table, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
+def bias_levels(table: ParameterTable, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
     """Let Gaussians with fair gradients be drawn from a little farther, by at most so many levels."""
     table["bias"][: len(biased)] += step * biased
     table["bias"].clamp_max_(most)

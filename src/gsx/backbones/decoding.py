@@ -16,7 +16,7 @@ from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Float, Int
-from gsx.core.training.density import Table
+from gsx.core.training.density import ParameterTable
 
 LARGEST_LOG_SCALE = 30.0
 """Lengths are held below e^30 world units, so that their squares stay finite in float32."""
@@ -63,19 +63,19 @@ class Representation(Protocol):
         """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
         ...
 
-    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """The Gaussians of the anchors drawn, differentiable."""
         ...
 
-    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+    def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
         """Rotations of the anchors as ellipsoids, for the pre-filter (spec 2.5)."""
         ...
 
-    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
         """The Gaussians decoded, as a standard splat file holds them."""
         ...
 
-    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
         """What follows positions and levels in the published file of this representation (spec 5.1)."""
         ...
 
@@ -125,7 +125,7 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (spec 2.4)."""
         rows, k = drawn.rows, self.offsets
         anchors = table["anchors"][rows]
@@ -153,16 +153,16 @@ class Neural:
         )
         return Decoded(splats=splats, slots=rows[owner] * k + chosen % k, opacities=opacities.detach().clamp_min(0))
 
-    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+    def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
         """An anchor's own rotation never learns in the reference, so it is the identity (spec 2.2)."""
         return identity_quats(table["anchors"])
 
-    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
         """Colours as the camera saw them, in the constant band."""
         colours = constant_from_colour(decoded.splats.colours)
         return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
 
-    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
         """79 floats a row with the position; what never learns has its initial value (spec 2.2)."""
         zeros = torch.zeros_like(table["anchors"][:, 0])
         if levels is None:
@@ -200,7 +200,7 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: Table, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = drawn.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
@@ -221,16 +221,16 @@ class Explicit:
         )
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 
-    def quats(self, table: Table) -> Float[Tensor, "N 4"]:
+    def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
         """The Gaussian's own."""
         return table["quats"]
 
-    def explicit(self, decoded: Decoded, table: Table) -> Gaussians:
+    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
         """All bands."""
         rows = decoded.slots
         return baked(decoded.splats, table["sh_constant"].detach()[rows, 0], table["sh_rest"].detach()[rows])
 
-    def columns(self, table: Table, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
         """67 floats a row with position and level at degree 3; f_rest is channel-major."""
         return (
             numbered("f_offset_", table["offsets"].flatten(1))

@@ -16,7 +16,7 @@ from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import Table, append_rows, keep_rows, mean_of, room_under, within_room
+from gsx.core.training.density import ParameterTable, append_rows, keep_rows, mean_of, room_under, within_room
 
 LARGEST_CELL = 2.0**53
 """Integers up to this are exact in float64."""
@@ -131,7 +131,7 @@ def fresh_statistics(count: int, offsets: int, device: torch.device | str) -> di
 
 @torch.no_grad()
 def observe(
-    table: Table,
+    table: ParameterTable,
     rows: Int[Tensor, "A"],
     opacities: Float[Tensor, "A k"],
     slots: Int[Tensor, "M"],
@@ -150,7 +150,7 @@ def observe(
     table["gradient_count"].view(-1).index_add_(0, slots, weight.expand(len(slots)))
 
 
-def eligible(table: Table, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
+def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
     """(offsets seen in more than `least` steps, their mean gradients; 0 for the others) (spec 2.9)."""
     count = table["gradient_count"]
     enough = count > least
@@ -196,14 +196,14 @@ def strongest(sprouts: Sprouts, room: int) -> Sprouts:
     return some(sprouts, within_room(everyone, sprouts.strength, room))
 
 
-def offset_means(table: Table) -> Float[Tensor, "N k 3"]:
+def offset_means(table: ParameterTable) -> Float[Tensor, "N k 3"]:
     """Where every offset's Gaussian is, world units."""
     reach = lengths(table["log_scales"].detach()[:, :3])
     return table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
 
 
 def sprout(
-    table: Table,
+    table: ParameterTable,
     candidates: Bool[Tensor, "N k"],
     gradient: Float[Tensor, "N k"],
     cells: Int[Tensor, "M 3"],
@@ -229,7 +229,7 @@ def sprout(
     )
 
 
-def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, most: int) -> tuple[int, int]:
+def add_anchors(table: ParameterTable, sprouts: Sprouts, representation: Representation, most: int) -> tuple[int, int]:
     """Append the sprouts with fresh statistics, up to a table of `most` anchors; (how many, how many found no room)."""
     wanted = len(sprouts.positions)
     sprouts = strongest(sprouts, room_under(most, len(table)))
@@ -249,7 +249,7 @@ def add_anchors(table: Table, sprouts: Sprouts, representation: Representation, 
 
 
 def grow_by_depth(
-    table: Table,
+    table: ParameterTable,
     representation: Representation,
     options: GrowthOptions,
     voxel: float,
@@ -293,7 +293,7 @@ def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]
 
 
 def grow_by_level(
-    table: Table,
+    table: ParameterTable,
     representation: Representation,
     options: GrowthOptions,
     levels: Levels,
@@ -327,7 +327,7 @@ def grow_by_level(
 
 
 def bias_anchors(
-    table: Table,
+    table: ParameterTable,
     gradient: Float[Tensor, "N"],
     own: Bool[Tensor, "N"],
     options: GrowthOptions,
@@ -345,7 +345,7 @@ def bias_anchors(
 
 
 def sprouts_of_level(
-    table: Table,
+    table: ParameterTable,
     enough: Bool[Tensor, "N k"],
     gradient: Float[Tensor, "N k"],
     means: Float[Tensor, "N k 3"],
@@ -372,7 +372,7 @@ def sprouts_of_level(
 
 
 def at_level(
-    table: Table,
+    table: ParameterTable,
     candidates: Bool[Tensor, "N k"],
     gradient: Float[Tensor, "N k"],
     means: Float[Tensor, "N k 3"],
@@ -399,13 +399,13 @@ def weeded(sprouts: Sprouts, levels: Levels) -> Sprouts:
 # -- after growing ---------------------------------------------------------------------------------------------------
 
 
-def reset_offsets(table: Table, enough: Bool[Tensor, "N k"]) -> None:
+def reset_offsets(table: ParameterTable, enough: Bool[Tensor, "N k"]) -> None:
     """Forget the gradients of the offsets that were judged; the others keep theirs over later intervals (spec 2.9)."""
     for name in ("gradient_sum", "gradient_count"):
         table[name][: len(enough)][enough] = 0
 
 
-def prune(table: Table, options: GrowthOptions, least: float) -> int:
+def prune(table: ParameterTable, options: GrowthOptions, least: float) -> int:
     """Remove anchors that were visited often and stayed faint; returns how many (spec 2.10)."""
     ready = table["visits"] > least
     doomed = ready & (table["opacity_sum"] < options.prune_opacity * table["visits"])
@@ -417,7 +417,7 @@ def prune(table: Table, options: GrowthOptions, least: float) -> int:
     return int(doomed.sum())
 
 
-def clamp_scales(table: Table, largest: float) -> None:
+def clamp_scales(table: ParameterTable, largest: float) -> None:
     """Hold the log-scales of the Gaussians, not the reach of the offsets, below a limit (spec 2.10)."""
     with torch.no_grad():
         table["log_scales"][:, 3:].clamp_(max=largest)

@@ -48,15 +48,15 @@ from gsx.core.rasterizer import Rendering, drawable, take_rows
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
+    ParameterTable,
     Statistics,
-    Table,
     append_rows,
+    densification_statistics,
     finite_rows,
     keep_rows,
     reset_column,
     restored_table,
     room_under,
-    sightings,
     table_tensors,
     withheld,
     within_room,
@@ -227,7 +227,7 @@ class GS3D:
         until = all_levels_from(options, self.schedule)
         return derive(points.positions.float(), self.cameras, options, until)
 
-    def initial_table(self, points: PointCloud, device: torch.device) -> Table:
+    def initial_table(self, points: PointCloud, device: torch.device) -> ParameterTable:
         """One Gaussian per point, or per node of the levels."""
         columns: dict[str, Tensor] = {}
         if self.levels is not None:
@@ -235,7 +235,7 @@ class GS3D:
             for warning in warnings_of(self.levels, len(points)):
                 logger.warning("%s", warning)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
-        return Table(
+        return ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
         )
@@ -298,14 +298,14 @@ class GS3D:
         """Screen gradients, which count until density control ends (spec 7, cadence)."""
         if step >= self.schedule.step(self.options.density.stop):
             return {}
-        return sightings(rendering.screen, drawn.rows, weight)
+        return densification_statistics(rendering.screen, drawn.rows, weight)
 
-    def record(self, seen: Observation) -> None:
+    def accumulate(self, seen: Observation) -> None:
         """Add screen gradients to the statistics."""
         if seen:
             self.statistics.add(seen)
 
-    def adapt(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> dict[str, int]:
         """Clone, split, prune and reset when due."""
         done: dict[str, int] = {}
         if self.density_due(step):
@@ -333,7 +333,7 @@ class GS3D:
         self.set_rates(step)
         self.table.optimiser.step()
         make_identity_where_zero(self.table["quats"])
-        self.discard()
+        self.zero_grad()
 
     def parameters(self) -> Iterable[tuple[str, Parameter]]:
         """Parameters by name."""
@@ -348,7 +348,7 @@ class GS3D:
         return ()
 
     @torch.no_grad()
-    def heal(self, cameras: Sequence[Camera], step: int) -> int:
+    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove rows with a value that is not finite, or without a splat for a camera, with their statistics."""
         sound = finite_rows(self.table)
         for camera in cameras:
@@ -367,7 +367,7 @@ class GS3D:
             return good
         return torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, drawn.rows, good)
 
-    def discard(self) -> None:
+    def zero_grad(self) -> None:
         """Forget the gradients."""
         self.table.optimiser.zero_grad(set_to_none=True)
 

@@ -144,7 +144,7 @@ def test_gradients_add_up_over_a_batch() -> None:
         assert torch.allclose(getattr(together, name).grad, value, rtol=1e-5, atol=1e-9), name
     assert torch.allclose(shared.grad, each.grad)
     # each rendering keeps the statistics of its own camera
-    norms = [float(rendering.screen.shift.grad.norm()) for rendering in batch]
+    norms = [float(rendering.screen.means2d_offset.grad.norm()) for rendering in batch]
     assert len(set(norms)) == 3
     assert min(norms) > 0
 

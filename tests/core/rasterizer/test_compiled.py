@@ -74,9 +74,9 @@ def test_absolute_gradient_is_that_of_the_eager_path() -> None:
         rendering = rasterize(leaves(random_splats(200, seed=3)), front_camera(), rules, absolute_gradient=True)
         weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
         (rendering.image * weights).sum().backward()
-        assert rendering.screen.probe is not None
-        assert rendering.screen.probe.grad is not None
-        return rendering.screen.probe.grad
+        assert rendering.screen.absgrad is not None
+        assert rendering.screen.absgrad.grad is not None
+        return rendering.screen.absgrad.grad
 
     eager, compiled = probe(replace(QUICK, path="eager")), probe(QUICK)
     assert eager.abs().sum() > 0

@@ -99,7 +99,7 @@ def test_projection_is_that_of_another_implementation(case: str) -> None:
     splats = inputs.splats()
     screen = project(splats, inputs.camera(), rules_of(case))
     assert screen.ids.tolist() == list(range(len(splats)))
-    first, middle, last = screen.factors.unbind(1)
+    first, middle, last = screen.conic_factors.unbind(1)
     # U^T U is half the inverse covariance
     conics = 2 * torch.stack([first * first, first * middle, middle * middle + last * last], 1)
     for name, found in (("means2d", screen.means), ("depths", screen.depths), ("conics", conics)):

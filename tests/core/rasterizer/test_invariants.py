@@ -163,9 +163,9 @@ def test_screen_gradient_is_the_blending_path_only_in_pixels() -> None:
             for d in (-step, step)
         ]
         expected = float(moved[1] - moved[0]) / (2 * step)
-        assert float(rendering.screen.shift.grad[0, axis]) == pytest.approx(expected, rel=1e-5)
-    ndc = rendering.screen.ndc_gradient(rendering.screen.shift)
-    assert torch.allclose(ndc, rendering.screen.shift.grad * torch.tensor([83 / 2, 61 / 2]))
+        assert float(rendering.screen.means2d_offset.grad[0, axis]) == pytest.approx(expected, rel=1e-5)
+    ndc = rendering.screen.ndc_gradient(rendering.screen.means2d_offset)
+    assert torch.allclose(ndc, rendering.screen.means2d_offset.grad * torch.tensor([83 / 2, 61 / 2]))
 
 
 def test_absolute_gradient_sums_the_absolute_values_over_pixels() -> None:
@@ -180,9 +180,9 @@ def test_absolute_gradient_sums_the_absolute_values_over_pixels() -> None:
         for x in range(9):
             again = rasterize(live, view, rules)
             again.image[:, y, x].sum().backward()
-            total += again.screen.shift.grad.abs()
-    assert torch.allclose(rendering.screen.probe.grad, total, rtol=1e-3, atol=1e-6)
-    assert (rendering.screen.probe.grad >= rendering.screen.shift.grad.abs() - 1e-5).all()
+            total += again.screen.means2d_offset.grad.abs()
+    assert torch.allclose(rendering.screen.absgrad.grad, total, rtol=1e-3, atol=1e-6)
+    assert (rendering.screen.absgrad.grad >= rendering.screen.means2d_offset.grad.abs() - 1e-5).all()
 
 
 def test_heaviest_weight_is_the_largest_over_all_pixels() -> None:
@@ -190,7 +190,7 @@ def test_heaviest_weight_is_the_largest_over_all_pixels() -> None:
     each = Splats(**(vars(splats) | {"colours": torch.eye(20)}))  # channel n shows the weight of splat n
     rendering = rasterize(each, camera(), RasterSettings(), max_weight=True)
     assert torch.allclose(
-        rendering.screen.heaviest, rendering.image.flatten(1).amax(1)[rendering.screen.ids], atol=1e-6
+        rendering.screen.max_weights, rendering.image.flatten(1).amax(1)[rendering.screen.ids], atol=1e-6
     )
 
 

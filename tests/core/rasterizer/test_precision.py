@@ -115,7 +115,7 @@ def test_absolute_gradient_is_the_same_in_every_form(exponent: str, evaluation: 
         rules = RasterSettings(cull="tight", exponent=exponent, evaluation=evaluation)
         rendering = rasterize(leaves(random_splats()), front_camera(), rules, absolute_gradient=True)
         rendering.image.square().mean().backward()
-        return rendering.screen.probe.grad
+        return rendering.screen.absgrad.grad
 
     exact, found = probe("squares", "float32"), probe(exponent, evaluation)
     bound = {"float32": 1e-5, "float16": 1e-2, "bfloat16": 8e-2}[evaluation]
@@ -125,7 +125,7 @@ def test_absolute_gradient_is_the_same_in_every_form(exponent: str, evaluation: 
 def blended(screen, dtype: torch.dtype, rules: RasterSettings) -> torch.Tensor:
     """The picture of given screen splats, their numbers held in `dtype`."""
     camera = front_camera()
-    values = (screen.means, screen.factors, screen.log_opacities, screen.channels)
+    values = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     blocks = make_blocks(pair(screen, camera, rules), rules.chunk, len(screen.ids))
     return composite(*(v.to(dtype) for v in values), blocks, TileGrid.of(camera, rules.tile_size), rules)
 
@@ -208,8 +208,8 @@ def test_every_pair_of_formats_keeps_the_dtype_of_the_splats(
     splats = leaves(random_splats(20), dtype)
     rendering = rasterize(splats, front_camera(20, 20), rules, depth=True, absolute_gradient=True, max_weight=True)
     (rendering.image.mean() + rendering.depth.mean()).backward()
-    results = [rendering.image, rendering.alpha, rendering.depth, rendering.screen.heaviest]
-    results += [rendering.screen.probe.grad, *(value.grad for value in vars(splats).values())]
+    results = [rendering.image, rendering.alpha, rendering.depth, rendering.screen.max_weights]
+    results += [rendering.screen.absgrad.grad, *(value.grad for value in vars(splats).values())]
     assert all(value.dtype == dtype and torch.isfinite(value).all() for value in results)
 
 
@@ -219,7 +219,7 @@ def test_the_bound_of_the_exponent_holds_and_is_reached(dilation: float, tile: i
     splats = random_splats(2000, size=1e-4)
     screen = project(splats, front_camera(), rules)
     pairs = pair(screen, front_camera(), rules)
-    values = (screen.means, screen.factors, screen.log_opacities, screen.channels)
+    values = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     tables = make_tables(*values, make_blocks(pairs, 1, len(screen.ids)), TileGrid.of(front_camera(), tile), rules)
     log_alpha, _ = tables.exponent.log_alphas(tables.rows, tables.basis)
     largest = float((tables.rows[:, :, 6:] - log_alpha).max())

@@ -40,9 +40,9 @@ def test_absolute_gradient_is_that_of_every_pixel_of_the_truth(seed: int, expone
     screen = rendering.screen
     truth = torch.zeros(2, len(splats), 2, dtype=torch.float64)
     truth[:, rows] = torch.stack([signed, absolute])
-    assert torch.allclose(screen.shift.grad, truth[0, screen.ids], rtol=1e-9, atol=1e-10)
-    assert torch.allclose(screen.probe.grad, truth[1, screen.ids], rtol=1e-9, atol=1e-10)
-    assert float(screen.probe.grad.sum()) > 3 * float(screen.shift.grad.abs().sum())  # the two do differ
+    assert torch.allclose(screen.means2d_offset.grad, truth[0, screen.ids], rtol=1e-9, atol=1e-10)
+    assert torch.allclose(screen.absgrad.grad, truth[1, screen.ids], rtol=1e-9, atol=1e-10)
+    assert float(screen.absgrad.grad.sum()) > 3 * float(screen.means2d_offset.grad.abs().sum())  # the two do differ
 
 
 REPEATED = """

@@ -13,13 +13,13 @@ from torch.nn import Parameter
 from gsx.core.errors import CheckpointError
 from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.training.density import (
+    ParameterTable,
     Statistics,
-    Table,
     append_rows,
+    densification_statistics,
     keep_rows,
     reset_column,
     restored_table,
-    sightings,
     table_tensors,
 )
 
@@ -69,7 +69,7 @@ class Ledger:
         self.identities = list(identities)
         self.rows = {name: {i: Row(values(name, i)) for i in identities} for name in SHAPES}
         self.steps = dict.fromkeys(SHAPES, 0)
-        self.table = Table({name: Parameter(value) for name, value in rows_of(identities).items()})
+        self.table = ParameterTable({name: Parameter(value) for name, value in rows_of(identities).items()})
         for name, rate in RATES.items():
             self.table.set_rate(name, rate)
 
@@ -153,7 +153,7 @@ def trained(count: int = 5) -> Ledger:
     return ledger
 
 
-def moments(table: Table, name: str) -> tuple[Tensor, Tensor, float]:
+def moments(table: ParameterTable, name: str) -> tuple[Tensor, Tensor, float]:
     state = table.optimiser.state[table[name]]
     return state["exp_avg"].clone(), state["exp_avg_sq"].clone(), float(state["step"])
 
@@ -231,7 +231,7 @@ def test_surgery_on_all_rows_skips_the_whole_step(surgery: str) -> None:
 
 @pytest.mark.parametrize(("step", "factor"), [(1, 1.0), (600, 2.124), (30000, 3.162)])
 def test_first_move_of_a_fresh_row_is_larger_late_in_the_run(step: int, factor: float) -> None:
-    table = Table({"x": Parameter(torch.zeros(1))})
+    table = ParameterTable({"x": Parameter(torch.zeros(1))})
     table.set_rate("x", 0.01)
     if step > 1:
         table["x"].grad = torch.zeros(1)
@@ -258,7 +258,12 @@ def screen(ids: list[int], radii: list[int], gradient: list[list[float]], size: 
     shift = torch.zeros(len(ids), 2, requires_grad=True)
     shift.grad = torch.tensor(gradient)
     return ScreenStatistics(
-        ids=torch.tensor(ids), radii=torch.tensor(radii), shift=shift, probe=None, heaviest=None, size=size
+        ids=torch.tensor(ids),
+        radii=torch.tensor(radii),
+        means2d_offset=shift,
+        absgrad=None,
+        max_weights=None,
+        size=size,
     )
 
 
@@ -268,7 +273,7 @@ def test_statistics_are_means_of_norms_in_ndc_over_the_views_that_saw_the_row() 
     one = screen([3, 0, 1], [5, 0, 2], [[0.3, 1.0], [9.0, 9.0], [0.0, 0.5]], (20, 8))  # norms 5, -, 2
     other = screen([1, 3], [1, 1], [[-0.6, 2.0], [-0.3, -1.0]], (20, 8))  # 10 and 5: opposite to the first view
     for picture in (one, other):
-        statistics.add(sightings(picture))
+        statistics.add(densification_statistics(picture))
     assert statistics.count.tolist() == [0, 2, 0, 2]
     torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([0.0, 6.0, 0.0, 5.0]))
 
@@ -276,8 +281,8 @@ def test_statistics_are_means_of_norms_in_ndc_over_the_views_that_saw_the_row() 
 def test_sightings_count_by_their_weight() -> None:
     """Gradients carry the weight already: 4 at weight 1 and 2 of 8 at weight 1/4 have the mean 6 / 1.25."""
     statistics = Statistics.zeros(2, "cpu")
-    statistics.add(sightings(screen([0], [1], [[0.4, 0.0]], (20, 8))))
-    statistics.add(sightings(screen([0, 1], [1, 1], [[0.2, 0.0], [0.0, 0.25]], (20, 8)), weight=0.25))
+    statistics.add(densification_statistics(screen([0], [1], [[0.4, 0.0]], (20, 8))))
+    statistics.add(densification_statistics(screen([0, 1], [1, 1], [[0.2, 0.0], [0.0, 0.25]], (20, 8)), weight=0.25))
     assert statistics.count.tolist() == [1.25, 0.25]
     torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([6 / 1.25, 4.0]))
 
@@ -285,15 +290,20 @@ def test_sightings_count_by_their_weight() -> None:
 def test_a_view_without_gradient_still_counts() -> None:
     statistics = Statistics.zeros(2, "cpu")
     unused = ScreenStatistics(
-        ids=torch.tensor([1]), radii=torch.tensor([3]), shift=torch.zeros(1, 2), probe=None, heaviest=None, size=(4, 4)
+        ids=torch.tensor([1]),
+        radii=torch.tensor([3]),
+        means2d_offset=torch.zeros(1, 2),
+        absgrad=None,
+        max_weights=None,
+        size=(4, 4),
     )
-    statistics.add(sightings(unused))
+    statistics.add(densification_statistics(unused))
     assert statistics.count.tolist() == [0, 1]
     assert statistics.mean_gradient().tolist() == [0.0, 0.0]
 
 
 def test_a_column_the_run_did_not_have_is_named() -> None:
-    table = Table({name: Parameter(value) for name, value in rows_of([1, 2]).items()})
+    table = ParameterTable({name: Parameter(value) for name, value in rows_of([1, 2]).items()})
     saved = table_tensors(table)
     table.columns["filter"] = torch.zeros(2)
     with pytest.raises(CheckpointError, match="holds no filter: it was trained with other options"):

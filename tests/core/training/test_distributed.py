@@ -207,8 +207,8 @@ def test_a_process_by_itself_exchanges_nothing() -> None:
     ranks = ranks_here()
     part = {"rows": torch.arange(3)}
     assert (ranks.rank, ranks.size, ranks.first) == (0, 1, True)
-    assert ranks.everyone("word") == ["word"]
-    assert ranks.of_first(lambda: 5) == ranks.in_turn(lambda: 5) == 5
+    assert ranks.all_gather("word") == ["word"]
+    assert ranks.broadcast(lambda: 5) == ranks.rank0_first(lambda: 5) == 5
     assert ranks.gathered([part], torch.device("cpu"))[0] is part
     assert placed(torch.device("cuda")) == torch.device("cuda")
 
@@ -231,7 +231,7 @@ class Two(Ranks):
 
     other: str = ""
 
-    def everyone(self, word: str) -> list[str]:
+    def all_gather(self, word: str) -> list[str]:
         return [word, self.other or word]
 
 

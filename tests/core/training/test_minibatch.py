@@ -47,7 +47,7 @@ def alone(run: Run, view: int, background: Tensor | None = None) -> tuple[Tensor
 def gradients(run: Run) -> dict[str, Tensor]:
     """Copies of the gradients there are, which are cleared."""
     found = {name: gradient.clone() for name, gradient in run.backbone.gradients()}
-    run.backbone.discard()
+    run.backbone.zero_grad()
     return found
 
 
@@ -156,8 +156,8 @@ def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) ->
     sums, seen = torch.zeros(count), torch.zeros(count)
     for view in (4, 1):
         screen = alone(run, view)[1].screen
-        assert screen.shift.grad is not None
-        norms = (screen.shift.grad * torch.tensor([48, 36]) / 2).norm(dim=1)
+        assert screen.means2d_offset.grad is not None
+        norms = (screen.means2d_offset.grad * torch.tensor([48, 36]) / 2).norm(dim=1)
         sums[screen.ids[screen.radii > 0]] += norms[screen.radii > 0]
         seen[screen.ids[screen.radii > 0]] += 1
         gradients(run)
@@ -185,8 +185,8 @@ class Judge:
         run.sampler.order, run.sampler.batch, run.augmenters = [0, 5, 1, 4], batch, augmenters
         for _ in range(steps):
             for seen in backward(run).seen:
-                run.backbone.record(seen)
-            run.backbone.discard()
+                run.backbone.accumulate(seen)
+            run.backbone.zero_grad()
         names = ("statistics", "columns.visits", "columns.opacity_sum", "columns.gradient")
         return {name: value.clone() for name, value in run.backbone.tensors().items() if name.startswith(names)}
 
@@ -305,7 +305,7 @@ def test_pseudo_views_are_made_for_all_views_of_a_window(tmp_path: Path) -> None
     assert isinstance(augmenter, PseudoDetails)
     assert sorted(augmenter.views) == [1, 2, 4, 5]
     assert step.terms["upscale"] > 0
-    run.backbone.discard()
+    run.backbone.zero_grad()
     run.step = 45
     backward(run)
     assert run.sampler.order == [0]

@@ -64,7 +64,7 @@ class FourSplats:
 
     def record(self, seen: dict[str, Tensor]) -> None: ...
 
-    def adapt(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> dict[str, int]:
         return {}
 
     def update(self) -> None: ...
@@ -78,10 +78,10 @@ class FourSplats:
     def shared(self) -> Iterator[Tensor]:
         return iter(())
 
-    def heal(self) -> int:
+    def remove_nonfinite(self) -> int:
         return 0
 
-    def discard(self) -> None: ...
+    def zero_grad(self) -> None: ...
 
     raster = RasterSettings()
     absolute_gradient = False

@@ -86,9 +86,11 @@ def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation
     )
 
 
-def padded_table(means: Tensor, factors: Tensor, log_opacities: Tensor, channels: Tensor) -> Float[Tensor, "M_1 F"]:
+def padded_table(
+    means: Tensor, conic_factors: Tensor, log_opacities: Tensor, channels: Tensor
+) -> Float[Tensor, "M_1 F"]:
     """Everything blending needs of each splat in one row, and last a row that draws nothing."""
-    table = torch.cat([means, factors, log_opacities[:, None], channels], 1)
+    table = torch.cat([means, conic_factors, log_opacities[:, None], channels], 1)
     nothing = table.new_zeros(1, table.shape[1])
     nothing[0, TABLE - 1] = NOTHING
     return torch.cat([table, nothing])
@@ -286,12 +288,12 @@ class CompiledComposite(torch.autograd.Function):
     """See `composite_compiled` for the arguments."""
 
     @staticmethod
-    def forward(ctx, means, factors, log_opacities, channels, probe, pairs, job):
-        table = padded_table(means, factors, log_opacities, channels).to(job.precision.exact)
+    def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, pairs, job):
+        table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         light, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside_of(job, means))
         if any(ctx.needs_input_grad):
-            ctx.kept = (job, pairs, table, rows, kept, probe is not None, means.dtype)
+            ctx.kept = (job, pairs, table, rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(light, job.lanes, columns * lines)).to(means.dtype)
 
@@ -303,24 +305,24 @@ class CompiledComposite(torch.autograd.Function):
         values = job.loops.entry_gradients(table, job.lanes.entries, job.centre, moments)
         total = sum_by_splat(values.view(-1, values.shape[-1]), pairs, job.lanes, len(table) - 1).to(dtype)
         width = TABLE + job.rules.channels
-        probe = total[:, width:] if absolute else None
-        return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], probe, None, None)
+        absgrad = total[:, width:] if absolute else None
+        return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)
 
 
 def composite_compiled(
     means: Float[Tensor, "M 2"],
-    factors: Float[Tensor, "M 3"],
+    conic_factors: Float[Tensor, "M 3"],
     log_opacities: Float[Tensor, "M"],
     channels: Float[Tensor, "M C"],
     pairs: Pairs,
     grid: TileGrid,
     settings: RasterSettings,
     *,
-    probe: Float[Tensor, "M 2"] | None = None,
+    absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Float[Tensor, "C_plus_1 H W"]:
-    """What `composite` returns, through compiled loops; `probe` as there. There must be a pair."""
+    """What `composite` returns, through compiled loops; `absgrad` as there. There must be a pair."""
     precision = Precision.of(settings, means.dtype)
-    rules = rules_of(settings, channels.shape[1], probe is not None, precision.evaluation, means.device.type)
+    rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
     batch = batch_groups(settings)
     lanes = lay_out(pairs, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)
@@ -335,7 +337,7 @@ def composite_compiled(
         batch=batch,
         segments=settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"),
     )
-    return CompiledComposite.apply(means, factors, log_opacities, channels, probe, pairs, job)
+    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, pairs, job)
 
 
 # -- when? --------------------------------------------------------------------------------------------------------

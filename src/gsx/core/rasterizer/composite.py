@@ -75,7 +75,7 @@ class Tables:
 
 def make_tables(
     means: Float[Tensor, "M 2"],
-    factors: Float[Tensor, "M 3"],
+    conic_factors: Float[Tensor, "M 3"],
     log_opacities: Float[Tensor, "M"],
     channels: Float[Tensor, "M C"],
     blocks: Blocks,
@@ -83,7 +83,7 @@ def make_tables(
     settings: RasterSettings,
 ) -> Tables:
     """Gather what every list entry needs; padding draws nothing. A channel of ones, for coverage, is appended."""
-    features = torch.cat([means, factors, log_opacities[:, None], channels, torch.ones_like(means[:, :1])], 1)
+    features = torch.cat([means, conic_factors, log_opacities[:, None], channels, torch.ones_like(means[:, :1])], 1)
     nothing = means.new_zeros(1, features.shape[1])
     nothing[0, 5] = NOTHING
     precision, exponent = Precision.of(settings, means.dtype), EXPONENTS[settings.exponent]
@@ -235,19 +235,19 @@ def walk(
 
 
 def blend_all(
-    tables: Tables, blocks: Blocks, keep: bool, heaviest: Float[Tensor, "S K"] | None
+    tables: Tables, blocks: Blocks, keep: bool, max_weights: Float[Tensor, "S K"] | None
 ) -> tuple[Float[Tensor, "T P C"], list[Front]]:
     """Blend every tile; returns the tiles and, if `keep`, the fronts for the backward pass.
 
-    `heaviest`, where given, receives each list entry's largest blending weight.
+    `max_weights`, where given, receives each list entry's largest blending weight.
     """
     pictures = tables.channels.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
     fronts: list[Front] = []
     for batch in batches(blocks, tables.settings):
         for front, light, weight in walk(tables, blocks, batch):
             pictures.index_add_(0, front.tiles, light)
-            if heaviest is not None:
-                heaviest[front.blocks] = weight.amax(2).to(heaviest)
+            if max_weights is not None:
+                max_weights[front.blocks] = weight.amax(2).to(max_weights)
             if keep:
                 fronts.append(front)
     return pictures, fronts
@@ -300,13 +300,13 @@ class Composite(torch.autograd.Function):
     """See `composite` for the arguments."""
 
     @staticmethod
-    def forward(ctx, means, factors, log_opacities, channels, probe, blocks, grid, settings, heaviest):
-        tables = make_tables(means, factors, log_opacities, channels, blocks, grid, settings)
+    def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights):
+        tables = make_tables(means, conic_factors, log_opacities, channels, blocks, grid, settings)
         keep = any(ctx.needs_input_grad)
         with tables.precision.products():
-            pictures, fronts = blend_all(tables, blocks, keep, heaviest)
+            pictures, fronts = blend_all(tables, blocks, keep, max_weights)
         if keep:
-            ctx.kept = (tables, blocks, grid, fronts, len(means), probe is not None)
+            ctx.kept = (tables, blocks, grid, fronts, len(means), absgrad is not None)
         return grid.to_raster(pictures).to(means.dtype)
 
     @staticmethod
@@ -320,30 +320,34 @@ class Composite(torch.autograd.Function):
         total = sum_by_splat(torch.cat(parts, -1).flatten(0, 1), blocks.splats.view(-1), count + 1)[:-1]
         total = (total if unit is None else total * unit).to(gradient.dtype)
         width = 6 + channels.shape[2] - 1
-        probe = total[:, width:] if absolute else None
-        return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], probe, None, None, None, None)
+        absgrad = total[:, width:] if absolute else None
+        return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None, None, None)
 
 
 def composite(
     means: Float[Tensor, "M 2"],
-    factors: Float[Tensor, "M 3"],
+    conic_factors: Float[Tensor, "M 3"],
     log_opacities: Float[Tensor, "M"],
     channels: Float[Tensor, "M C"],
     blocks: Blocks,
     grid: TileGrid,
     settings: RasterSettings,
     *,
-    probe: Float[Tensor, "M 2"] | None = None,
-    heaviest: Float[Tensor, "S K"] | None = None,
+    absgrad: Float[Tensor, "M 2"] | None = None,
+    max_weights: Float[Tensor, "S K"] | None = None,
 ) -> Float[Tensor, "C_plus_1 H W"]:
     """Blended channels, then coverage (the sum of weights), on the raster of `grid`.
 
-    `probe` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
-    mean (px). `heaviest` receives the largest blending weight of each list entry.
+    `absgrad` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
+    mean (px). `max_weights` receives the largest blending weight of each list entry.
     """
     if not Precision.of(settings, means.dtype).narrow:
-        return Composite.apply(means, factors, log_opacities, channels, probe, blocks, grid, settings, heaviest)
+        return Composite.apply(
+            means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights
+        )
     # 16 bits hold neither a depth of 1e5 nor a colour of 1e-6: blend what lies within 1
     units = channel_units(channels)
-    blended = Composite.apply(means, factors, log_opacities, channels / units, probe, blocks, grid, settings, heaviest)
+    blended = Composite.apply(
+        means, conic_factors, log_opacities, channels / units, absgrad, blocks, grid, settings, max_weights
+    )
     return blended * torch.cat([units, units.new_ones(1)])[:, None, None]

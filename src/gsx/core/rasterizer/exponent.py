@@ -43,10 +43,10 @@ class Exponent:
 
 
 def squares_rows(
-    offsets: Float[Tensor, "S K 2"], factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
+    offsets: Float[Tensor, "S K 2"], conic_factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
 ) -> Float[Tensor, "S K 7"]:
     """(u0, u1, k0, 0, u2, k1, ln o)."""
-    u0, u1, u2 = factors.unbind(-1)
+    u0, u1, u2 = conic_factors.unbind(-1)
     x, y = offsets.unbind(-1)
     return torch.stack([u0, u1, -(u0 * x + u1 * y), torch.zeros_like(u0), u2, -u2 * y, log_opacities], -1)
 
@@ -105,10 +105,10 @@ def squares_by_splat(
 
 
 def direct_rows(
-    offsets: Float[Tensor, "S K 2"], factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
+    offsets: Float[Tensor, "S K 2"], conic_factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
 ) -> Float[Tensor, "S K 6"]:
     """(mean x, mean y, u0, u1, u2, ln o)."""
-    return torch.cat([offsets, factors, log_opacities[..., None]], -1)
+    return torch.cat([offsets, conic_factors, log_opacities[..., None]], -1)
 
 
 def direct_log_alphas(
@@ -165,10 +165,10 @@ def direct_by_splat(
 
 
 def expanded_rows(
-    offsets: Float[Tensor, "S K 2"], factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
+    offsets: Float[Tensor, "S K 2"], conic_factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
 ) -> Float[Tensor, "S K 9"]:
     """Coefficients of (1, x, y, x^2, xy, y^2), then (u0, u1, u2)."""
-    u0, u1, u2 = factors.unbind(-1)
+    u0, u1, u2 = conic_factors.unbind(-1)
     x, y = offsets.unbind(-1)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
     constant, by_x, by_y = log_opacities - k0 * k0 - k1 * k1, -2 * u0 * k0, -2 * (u1 * k0 + u2 * k1)

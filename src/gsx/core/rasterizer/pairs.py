@@ -162,7 +162,7 @@ def reached_tiles(
     refuse_too_many(int(heights.sum()), grid, settings)
     rank = torch.repeat_interleave(heights)
     # one gather of floats and one of integers for every row of tiles, in the order of memory
-    shapes = torch.cat([screen.means, screen.factors, limits[:, None]], 1)[order].index_select(0, rank)
+    shapes = torch.cat([screen.means, screen.conic_factors, limits[:, None]], 1)[order].index_select(0, rank)
     top = first[order, 1] - (heights.cumsum(0) - heights).int()
     top, left, right = torch.stack([top, first[order, 0], last[order, 0]], 1).index_select(0, rank).unbind(1)
     row = top + torch.arange(len(rank), device=rank.device, dtype=torch.int32)

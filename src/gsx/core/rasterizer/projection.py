@@ -38,7 +38,7 @@ class ScreenSplats:
     """Camera z, scene units."""
     covariances: Float[Tensor, "M 3"]
     """xx, xy, yy after dilation, px^2."""
-    factors: Float[Tensor, "M 3"]
+    conic_factors: Float[Tensor, "M 3"]
     """(u0, u1, u2): half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]]."""
     log_opacities: Float[Tensor, "M"]
     """Compensated for dilation where the settings ask for it."""
@@ -151,7 +151,7 @@ def project(
     low, high = slope_bounds(lens, camera.frame, margin)
     rotation = camera.rotation.to(scales)
     rules = settings.dilation, settings.compensate
-    means, covariances, factors, gains = geometry_of(settings, ids)(
+    means, covariances, conic_factors, gains = geometry_of(settings, ids)(
         points, scales, quats, rotation, lens, low.to(scales), high.to(scales), *rules
     )
     return ScreenSplats(
@@ -159,7 +159,7 @@ def project(
         means=means,
         depths=points[:, 2].to(scales),
         covariances=covariances,
-        factors=factors,
+        conic_factors=conic_factors,
         log_opacities=log_opacities if gains is None else log_opacities + gains,
         channels=channels,
         dropped=len(good) - int(good.sum()),

@@ -25,11 +25,11 @@ class ScreenStatistics:
     """Row of the splat in the input."""
     radii: Int[Tensor, "M"]
     """Published radius, px; 0: touches no tile."""
-    shift: Float[Tensor, "M 2"]
+    means2d_offset: Float[Tensor, "M 2"]
     """Zeros added to the screen means; their gradient is that of the means, px, blending path only (spec 4)."""
-    probe: Float[Tensor, "M 2"] | None
+    absgrad: Float[Tensor, "M 2"] | None
     """Its gradient is the sum over pixels of absolute gradients, px; None unless asked for."""
-    heaviest: Float[Tensor, "M"] | None
+    max_weights: Float[Tensor, "M"] | None
     """Largest blending weight over all pixels; None unless asked for."""
     size: tuple[int, int]
     """(width, height) of the raster."""
@@ -40,7 +40,7 @@ class ScreenStatistics:
         return self.radii > 0
 
     def ndc_gradient(self, of: Tensor) -> Float[Tensor, "M 2"]:
-        """Gradient of `shift` or `probe` in NDC units: pixels times half the raster (spec 4)."""
+        """Gradient of `means2d_offset` or `absgrad` in NDC units: pixels times half the raster (spec 4)."""
         gradient = of.grad if of.grad is not None else torch.zeros_like(of)
         return gradient * gradient.new_tensor(self.size) / 2
 
@@ -70,22 +70,22 @@ def heaviest_by_splat(by_entry: Float[Tensor, "S K"], blocks: Blocks, count: int
 
 def blend(
     screen: ScreenSplats,
-    shift: Float[Tensor, "M 2"],
+    means2d_offset: Float[Tensor, "M 2"],
     channels: Float[Tensor, "M C"],
     pairs: Pairs,
     camera: Camera,
     settings: RasterSettings,
-    probe: Float[Tensor, "M 2"] | None,
+    absgrad: Float[Tensor, "M 2"] | None,
     max_weight: bool,
 ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
     """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for."""
-    inputs = (screen.means + shift, screen.factors, screen.log_opacities, channels)
+    inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, channels)
     grid = TileGrid.of(camera, settings.tile_size)
-    if takes(settings, channels.shape[1], len(pairs.splats), max_weight, shift.device.type):
-        return composite_compiled(*inputs, pairs, grid, settings, probe=probe), None
+    if takes(settings, channels.shape[1], len(pairs.splats), max_weight, means2d_offset.device.type):
+        return composite_compiled(*inputs, pairs, grid, settings, absgrad=absgrad), None
     blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
-    blended = composite(*inputs, blocks, grid, settings, probe=probe, heaviest=by_entry)
+    blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
     return blended, None if by_entry is None else heaviest_by_splat(by_entry, blocks, len(screen.ids))
 
 
@@ -112,10 +112,10 @@ def rasterize(
     screen = project(splats, camera, settings, intrinsics)
     pairs = capped(pair(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
-    shift = torch.zeros_like(screen.means, requires_grad=learning)
-    probe = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
+    means2d_offset = torch.zeros_like(screen.means, requires_grad=learning)
+    absgrad = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
-    blended, heaviest = blend(screen, shift, channels, pairs, camera, settings, probe, max_weight)
+    blended, max_weights = blend(screen, means2d_offset, channels, pairs, camera, settings, absgrad, max_weight)
     count = splats.colours.shape[1]
     image, alpha = blended[:count], blended[-1]
     if background is not None:
@@ -129,9 +129,9 @@ def rasterize(
         screen=ScreenStatistics(
             ids=screen.ids,
             radii=pairs.radii,
-            shift=shift,
-            probe=probe,
-            heaviest=heaviest,
+            means2d_offset=means2d_offset,
+            absgrad=absgrad,
+            max_weights=max_weights,
             size=camera.size,
         ),
     )

@@ -55,7 +55,7 @@ class Backbone(Protocol[D]):
     """A scene representation that trains itself and draws itself as splats.
 
     A step calls, in this order: for each view `draw`, `regulariser`, (backward), `observe`; for each observation
-    `record`; `adapt`, `update`. Gradients of the views add up in between. Steps count from 1.
+    `accumulate`; `densify_and_prune`, `update`. Gradients of the views add up in between. Steps count from 1.
     """
 
     @property
@@ -84,11 +84,11 @@ class Backbone(Protocol[D]):
         """
         ...
 
-    def record(self, seen: Observation) -> None:
+    def accumulate(self, seen: Observation) -> None:
         """Count an observation in by its weight: one of this process, or of another that trains the same model."""
         ...
 
-    def adapt(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> dict[str, int]:
         """Change the number of primitives; returns what was done, for the log, empty when nothing."""
         ...
 
@@ -104,7 +104,7 @@ class Backbone(Protocol[D]):
         """Name and gradient of every parameter that has one."""
         ...
 
-    def heal(self, cameras: Sequence[Camera], step: int) -> int:
+    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
         """Remove primitives with values that are not finite, or that one of the cameras cannot draw; returns how many.
 
         Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
@@ -112,7 +112,7 @@ class Backbone(Protocol[D]):
         """
         ...
 
-    def discard(self) -> None:
+    def zero_grad(self) -> None:
         """Clear the gradients without moving anything."""
         ...
 

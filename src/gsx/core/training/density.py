@@ -22,7 +22,7 @@ ADAM_EPSILON = 1e-15
 
 
 @dataclass(eq=False)
-class Table:
+class ParameterTable:
     """Named parameters with N rows each, and the Adam that moves them."""
 
     parameters: dict[str, Parameter]
@@ -49,7 +49,9 @@ class Table:
         return next(group for group in self.optimiser.param_groups if group["name"] == name)
 
 
-def edit(table: Table, name: str, change: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
+def edit(
+    table: ParameterTable, name: str, change: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]
+) -> None:
     """Replace a parameter by `change` of it and its Adam moments by `moments` of them."""
     old = table.parameters[name]
     new = Parameter(change(old.detach()).contiguous())
@@ -69,7 +71,7 @@ def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda old: torch.cat([old, new])
 
 
-def append_rows(table: Table, rows: dict[str, Tensor]) -> None:
+def append_rows(table: ParameterTable, rows: dict[str, Tensor]) -> None:
     """Append rows to every parameter and column; `rows` names all of them. New rows start with zero moments."""
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
@@ -77,7 +79,7 @@ def append_rows(table: Table, rows: dict[str, Tensor]) -> None:
         table.columns[name] = torch.cat([column, rows[name]])
 
 
-def keep_rows(table: Table, kept: Bool[Tensor, "N"]) -> None:
+def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
     """Keep the marked rows of every parameter, with their moments, and of every column."""
     for name in table.parameters:
         edit(table, name, lambda old: old[kept], lambda moment: moment[kept])
@@ -104,12 +106,12 @@ def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, 
     return {"withheld": count} if count else {}
 
 
-def reset_column(table: Table, name: str, values: Tensor) -> None:
+def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
     """Replace all values of one parameter and zero its moments."""
     edit(table, name, lambda old: values, torch.zeros_like)
 
 
-def finite_rows(table: Table) -> Bool[Tensor, "N"]:
+def finite_rows(table: ParameterTable) -> Bool[Tensor, "N"]:
     """Rows whose parameters are finite in every value."""
     flat = [parameter.detach().reshape(len(parameter), -1) for parameter in table.parameters.values()]
     return torch.stack([torch.isfinite(values).all(1) for values in flat]).all(0)
@@ -129,7 +131,7 @@ def restore_adam(
         optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
 
 
-def table_tensors(table: Table) -> dict[str, Tensor]:
+def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     """Everything of a table, by the names it is saved under."""
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     for name, parameter in table.parameters.items():
@@ -138,7 +140,7 @@ def table_tensors(table: Table) -> dict[str, Tensor]:
     return out
 
 
-def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device) -> Table:
+def restored_table(like: ParameterTable, tensors: dict[str, Tensor], device: torch.device) -> ParameterTable:
     """The table that `table_tensors` saw, with the parameters and columns of `like`.
 
     Raises:
@@ -151,7 +153,7 @@ def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device
             f"the checkpoint holds no {' and no '.join(missing)}: it was trained with other options of the backbone; "
             "go on with those, or train anew"
         )
-    table = Table(
+    table = ParameterTable(
         {name: Parameter(tensors[f"parameters.{name}"].to(device)) for name in like.parameters},
         {name: tensors[f"columns.{name}"].to(device) for name in like.columns},
     )
@@ -160,7 +162,7 @@ def restored_table(like: Table, tensors: dict[str, Tensor], device: torch.device
     return table
 
 
-def sightings(
+def densification_statistics(
     screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
 ) -> dict[str, Tensor]:
     """Of one render after its backward pass the visible primitives, and the norms of their gradients (spec 4).
@@ -171,10 +173,10 @@ def sightings(
     ids = screen.ids[visible]
     seen = {
         "rows": ids if drawn is None else drawn[ids],
-        "gradient": screen.ndc_gradient(screen.shift)[visible].norm(dim=1),
-        "weight": screen.shift.new_tensor([weight]),
+        "gradient": screen.ndc_gradient(screen.means2d_offset)[visible].norm(dim=1),
+        "weight": screen.means2d_offset.new_tensor([weight]),
     }
-    return seen if screen.probe is None else seen | {"absolute": screen.ndc_gradient(screen.probe)[visible].sum(1)}
+    return seen if screen.absgrad is None else seen | {"absolute": screen.ndc_gradient(screen.absgrad)[visible].sum(1)}
 
 
 def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
@@ -206,7 +208,7 @@ class Statistics:
         return Statistics(sums, torch.zeros_like(sums), torch.zeros_like(sums) if absolute else None)
 
     def add(self, seen: dict[str, Tensor]) -> None:
-        """Count in what `sightings` found in one render."""
+        """Count in what `densification_statistics` found in one render."""
         rows = seen["rows"]
         self.gradient.index_add_(0, rows, seen["gradient"].to(self.gradient))
         self.count[rows] += seen["weight"].to(self.count)

@@ -40,7 +40,7 @@ class Ranks:
         each = len(batch) // self.size
         return batch[self.rank * each : (self.rank + 1) * each]
 
-    def everyone(self, word: T) -> list[T]:
+    def all_gather(self, word: T) -> list[T]:
         """The word of every rank, in order.
 
         Raises:
@@ -55,24 +55,24 @@ class Ranks:
         """The parts of all ranks, in order, on the device. They may differ in number and size."""
         return list(parts)
 
-    def of_first(self, make: Callable[[], T]) -> T:
+    def broadcast(self, make: Callable[[], T]) -> T:
         """What the first rank makes, on all of them; the others wait."""
-        return self.everyone(make() if self.first else None)[0]  # type: ignore[return-value]
+        return self.all_gather(make() if self.first else None)[0]  # type: ignore[return-value]
 
-    def in_turn(self, make: Callable[[], T]) -> T:
+    def rank0_first(self, make: Callable[[], T]) -> T:
         """What every rank makes for itself, the first before the others, which find in caches what it has kept."""
         if self.first:
             made = make()
-            self.everyone(None)
+            self.all_gather(None)
             return made
-        self.everyone(None)
+        self.all_gather(None)
         return make()
 
 
 class Joined(Ranks):
     """Processes that torchrun has started."""
 
-    def everyone(self, word: T) -> list[T]:
+    def all_gather(self, word: T) -> list[T]:
         """The word of every rank, in order; see `Ranks`."""
         words = exchange(word)
         for rank, other in enumerate(words):
@@ -89,7 +89,7 @@ class Joined(Ranks):
         """Shapes first, then every tensor from its rank to the others."""
         shapes = [{name: (value.shape, value.dtype) for name, value in part.items()} for part in parts]
         out: list[dict[str, Tensor]] = []
-        for rank, listed in enumerate(self.everyone(shapes)):
+        for rank, listed in enumerate(self.all_gather(shapes)):
             empty = [{name: torch.empty(*of[:1], dtype=of[1], device=device) for name, of in p.items()} for p in listed]
             held = list(parts) if rank == self.rank else empty
             for part in held:

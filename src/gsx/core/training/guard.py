@@ -69,7 +69,7 @@ class Agreement:
             Disagreement: they differ.
         """
         due = run.step % run.training.checkpoint_every == 0 or run.complete
-        if due and run.ranks.size > 1 and len(set(run.ranks.everyone(digest(run)))) > 1:
+        if due and run.ranks.size > 1 and len(set(run.ranks.all_gather(digest(run)))) > 1:
             raise Disagreement(
                 f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
                 f"checkpoint before, if there is one, with gsx resume {run.folder}"

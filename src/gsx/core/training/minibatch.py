@@ -65,7 +65,7 @@ def account_of(run: Run, steps: Sequence[Step]) -> Account:
 
 def merged(run: Run, steps: Sequence[Step]) -> Step:
     """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
-    accounts = run.ranks.everyone(account_of(run, steps))
+    accounts = run.ranks.all_gather(account_of(run, steps))
     average(run, set().union(*(account.learnt for account in accounts)))
     losses = [loss for account in accounts for loss in account.losses]
     return replace(

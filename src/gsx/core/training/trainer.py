@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 def train(run: Run, plugins: Plugins) -> None:
     """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
     plugins.emit.gsx_run_started(run=run)
-    while not (run.complete or any(run.ranks.everyone(run.stopping))):
+    while not (run.complete or any(run.ranks.all_gather(run.stopping))):
         begun = time.perf_counter()
         step = take_step(run, plugins)
         run.seconds += time.perf_counter() - begun
@@ -41,11 +41,11 @@ def take_step(run: Run, plugins: Plugins) -> Step:
     step = backward(run)
     reason = veto(run, step, plugins)
     if reason:
-        run.backbone.discard()
+        run.backbone.zero_grad()
     else:
         for seen in step.seen:
-            run.backbone.record(seen)
-        step.changes.update(run.backbone.adapt(step.number))
+            run.backbone.accumulate(seen)
+        step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.update(step.number)
     run.step = step.number
     synchronise(run.device)
@@ -54,15 +54,17 @@ def take_step(run: Run, plugins: Plugins) -> Step:
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:
     """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
-    removed = healed(run, step) if step.dropped else ""
+    removed = remove_lost(run, step) if step.dropped else ""
     reason = removed or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
-    reason = next(filter(None, run.ranks.everyone(reason)), "")
-    return reason if removed or not reason else "; ".join(filter(None, [reason, healed(run, step)]))
+    reason = next(filter(None, run.ranks.all_gather(reason)), "")
+    return reason if removed or not reason else "; ".join(filter(None, [reason, remove_lost(run, step)]))
 
 
-def healed(run: Run, step: Step) -> str:
+def remove_lost(run: Run, step: Step) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
-    removed = run.backbone.heal([run.scene.train[number].camera for number in run.sampler.taken], step.number)
+    removed = run.backbone.remove_nonfinite(
+        [run.scene.train[number].camera for number in run.sampler.taken], step.number
+    )
     if removed:
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
@@ -194,7 +196,7 @@ def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weigh
     if not weight > 0:
         return {}
     views = run.training.batch
-    for moved in (rendering.screen.shift, rendering.screen.probe):
+    for moved in (rendering.screen.means2d_offset, rendering.screen.absgrad):
         if views > 1 and moved is not None and moved.grad is not None:
             moved.grad /= views
     return run.backbone.observe(drawn, rendering, number, weight / views)
@@ -202,7 +204,7 @@ def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weigh
 
 def finite_shift(rendering: Rendering) -> bool:
     """Whether the screen gradients that density control gathers are finite: those of a step to be vetoed may not be."""
-    gradient = rendering.screen.shift.grad
+    gradient = rendering.screen.means2d_offset.grad
     return gradient is None or bool(torch.isfinite(gradient).all())
 
 

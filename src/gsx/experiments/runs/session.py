@@ -280,12 +280,12 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     if settings.general.iterations < 1:
         raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
     choose_device(settings.general.device)
-    ranks.of_first(lambda: refuse_used(settings.general.folder))
+    ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
-    run = build(settings, ranks.in_turn(lambda: load_scene(settings)), Path(), training=True)
-    run.folder = ranks.of_first(lambda: begun(run, settings, plugins))
+    run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
+    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of a trunk
         checkpoint.restore(run)
     return run
@@ -324,13 +324,13 @@ def open_run(
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
-    run = build(settings, ranks_here().in_turn(lambda: load_scene(settings)), folder, training)
+    run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     return run
 
 
-def pursue(settings: Settings, plugins: Plugins, stamp: str) -> tuple[Path, Run | None]:
+def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[Path, Run | None]:
     """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
 
     `stamp`: of its scene.
