@@ -14,10 +14,10 @@ def gsx_register(registry: Registry) -> None:
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
-    from gsx.regenerators.diffusion.ladder import Ladder, LadderOptions
+    from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
+    from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
     from gsx.regenerators.diffusion.options import PipelineOptions, UpscalerOptions
     from gsx.regenerators.diffusion.options import RestorerOptions as DiffusionRestorerOptions
-    from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO
     from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
@@ -47,7 +47,7 @@ def gsx_register(registry: Registry) -> None:
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
     registry.add("regenerator", "callable", Called, CalledOptions)
     registry.add("regenerator", "diffusers_pipeline", any_pipeline, PipelineOptions)
-    registry.add("regenerator", "sd_by_scale", Ladder, LadderOptions)
+    registry.add("regenerator", "sd_by_scale", Cascade, CascadeOptions)
     registry.add("regenerator", "sd_x2_latent", partial(Diffusion, SD_X2_LATENT), UpscalerOptions)
     registry.add("regenerator", "sd_x4", partial(Diffusion, SD_X4), UpscalerOptions)
     registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)

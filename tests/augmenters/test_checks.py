@@ -114,7 +114,7 @@ def test_what_is_left_weighs_as_if_nothing_were_lost(mode: str, reduce: str, tmp
     assert [weight for _, weight in whole.parts] == pytest.approx([each, each])
     assert [weight for _, weight in lost.parts] == pytest.approx([each])
     assert lost.parts[0][0].provenance["scale"] == 1
-    assert (whole.taken, lost.taken) == pytest.approx((0.0, 0.0) if mode == "direct" else (0.3, 0.15))
+    assert (whole.replaces, lost.replaces) == pytest.approx((0.0, 0.0) if mode == "direct" else (0.3, 0.15))
 
 
 def test_an_augmenter_tells_what_became_of_its_pictures_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

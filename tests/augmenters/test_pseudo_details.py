@@ -170,11 +170,11 @@ def test_freezing_for_half_of_a_window(tmp_path: Path) -> None:
 
 def test_trust_weighs_pixels() -> None:
     target = torch.zeros(3, 2, 2, dtype=torch.uint8)
-    trust = torch.tensor([[255, 0], [51, 0]], dtype=torch.uint8)
+    pixel_weight = torch.tensor([[255, 0], [51, 0]], dtype=torch.uint8)
     camera = compose_camera()
-    view = PseudoView(camera=camera, target=target, parent=0, trust=trust)
+    view = PseudoView(camera=camera, target=target, parent=0, pixel_weight=pixel_weight)
     assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), view)) == pytest.approx(0.5 * 1.2 / 4)
-    assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, trust=None))) == pytest.approx(0.5)
+    assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, pixel_weight=None))) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("background", ["false", "true"])
@@ -313,7 +313,7 @@ def test_everything_is_reduced_as_the_scene_says(tmp_path: Path) -> None:
         assert float(pseudo_loss(shown, view)) < 0.6 * float(pseudo_loss(shown, replace(view, reduction=Reduction())))
     assert float(torch.stack(right).float().mean()) > 0.95
     assert sum(view.provenance["consistent"] for view in views) > 0.95 * len(views)
-    assert all(view.trust is None or float((view.trust == 255).float().mean()) > 0.9 for view in views)
+    assert all(view.pixel_weight is None or float((view.pixel_weight == 255).float().mean()) > 0.9 for view in views)
     (path,) = (run.folder / "pseudo").glob("*.safetensors")
     assert {view.reduction.filter for view in load_views(path)[0]} == {"bicubic"}
 
@@ -369,7 +369,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     spot = (own.centre + distance * own.rotation[2]).float()
     table.columns["anchors"] = spot.expand(len(table), 3).clone()
     table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)
-    cameras = [own, *(augmenter_of(run).sketch(run, 44, 0, scale, 0).camera for scale in (2, 4))]
+    cameras = [own, *(augmenter_of(run).spec(run, 44, 0, scale, 0).camera for scale in (2, 4))]
     drawn = [table["level"][backbone.visible(camera, 80).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
     assert drawn == [[0, 1], [0, 1, 2], [0, 1, 2, 3]]
 
@@ -422,8 +422,10 @@ def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path
         run = run_at(tmp_path / f"run{scale}", 44, "augmenter=upscale_paper", *words)
         augmenter_of(run).term(run, 45, 0)
         views = [view for views in augmenter_of(run).views.values() for view in views]
-        trust = [1.0 if view.trust is None else float(view.trust.float().mean()) / 255 for view in views]
-        shares.append(sum(trust) / len(trust))
+        pixel_weight = [
+            1.0 if view.pixel_weight is None else float(view.pixel_weight.float().mean()) / 255 for view in views
+        ]
+        shares.append(sum(pixel_weight) / len(pixel_weight))
     assert shares[0] < 0.5 < shares[1]
 
 
@@ -440,8 +442,8 @@ def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
             kept = table["opacity_logits"].detach().clone()
             table["opacity_logits"].data.copy_(torch.where(places[:, :1] > 16, -30.0, 0.0).view_as(kept))
             augmenter = by_options(run, least_alpha=wanted)
-            sketch = augmenter.sketch(run, 44, parent, 4, 0)
-            alphas.append(float(render(run, sketch.inside.of(sketch.seen)).alpha.mean()))
+            spec = augmenter.spec(run, 44, parent, 4, 0)
+            alphas.append(float(render(run, spec.inside.of(spec.seen)).alpha.mean()))
             table["opacity_logits"].data.copy_(kept)
         least[wanted] = min(alphas)
     assert least[0.0] < 0.5
@@ -649,18 +651,18 @@ def test_files_hold_everything(tmp_path: Path) -> None:
         camera=camera,
         target=torch.arange(6, dtype=torch.uint8).view(3, 2, 1),
         parent=4,
-        trust=torch.tensor([[7], [255]], dtype=torch.uint8),
+        pixel_weight=torch.tensor([[7], [255]], dtype=torch.uint8),
         provenance={"seed": 22},
         coarse=torch.ones(3, 1, 1, dtype=torch.uint8),
         coarse_weight=0.25,
         reduction=Reduction(filter="lanczos", light="linear"),
     )
-    save_views(tmp_path / "views", [view, replace(view, trust=None)], {"event": 3})
+    save_views(tmp_path / "views", [view, replace(view, pixel_weight=None)], {"event": 3})
     (first, second), facts = load_views(tmp_path / "views")
     assert facts == {"event": 3}
     assert torch.equal(first.target, view.target)
-    assert torch.equal(first.trust, view.trust)
-    assert second.trust is None
+    assert torch.equal(first.pixel_weight, view.pixel_weight)
+    assert second.pixel_weight is None
     assert first.coarse is not None
     assert torch.equal(first.coarse, torch.ones(3, 1, 1, dtype=torch.uint8))
     assert (first.coarse_weight, first.reduction) == (0.25, view.reduction)

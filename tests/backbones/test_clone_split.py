@@ -16,7 +16,7 @@ from torch import Tensor
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
     clones,
-    judged,
+    densify_masks,
     relative_sizes,
     small_children,
     starting_points,
@@ -155,7 +155,7 @@ def test_verdicts_by_hand(level: int, gradient: float, scale: float, wanted: str
     scales[0, 1] = scale
     gradients = torch.zeros(401)
     gradients[0] = gradient
-    found = judged(gradients, scales, of, levels, CONTROL, threshold=2e-4, large=0.01, splitting=True)
+    found = densify_masks(gradients, scales, of, levels, CONTROL, threshold=2e-4, large=0.01, splitting=True)
     assert [name for name in ("cloned", "split", "biased") if getattr(found, name)[0]] == wanted.split()
     assert not any(bool(getattr(found, name)[1:].any()) for name in ("cloned", "split", "biased"))
 

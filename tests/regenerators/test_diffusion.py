@@ -24,9 +24,9 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
 from gsx.experiments.runs.config import compose
 from gsx.experiments.runs.session import open_run
-from gsx.regenerators.diffusion.ladder import Ladder
+from gsx.regenerators.diffusion.cascade import Cascade
+from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, ModelSpec, steps_for
 from gsx.regenerators.diffusion.options import DiffusionOptions
-from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
 from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.diffusion.tuning import closest
@@ -189,13 +189,13 @@ def test_what_is_added_is_the_picture_reflected() -> None:
 class Blocks:
     """A pipeline without flaw: every pixel becomes a block. It complains as real ones do of sizes, or resizes."""
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe, self.calls = recipe, list[Batch]()
+    def __init__(self, spec: ModelSpec) -> None:
+        self.spec, self.calls = spec, list[Batch]()
 
     def __call__(self, pipe: Any, batch: Batch, options: Any) -> Tensor:
         self.calls.append(batch)
-        assert all(side % self.recipe.multiple == 0 and side >= self.recipe.least for side in batch.images.shape[2:])
-        return as_blocks(batch.images, self.recipe.factor)
+        assert all(side % self.spec.multiple == 0 and side >= self.spec.least for side in batch.images.shape[2:])
+        return as_blocks(batch.images, self.spec.factor)
 
 
 def with_call(name: str, call: Callable[..., Tensor], *more: str) -> Diffusion:
@@ -211,11 +211,11 @@ def test_results_lie_where_their_pictures_do(name: str, size: tuple[int, int]) -
     """Every size from one pixel to 2k, portrait and landscape; of x4 a quarter of that."""
     if name == "sd_x4" and max(size) > 1000:
         size = (size[0] // 4, size[1] // 4)
-    recipe = RECIPES[name]
-    (result,) = with_call(name, Blocks(recipe), f"regenerator.{role_of(name)}.cache_gb=0").regenerate(
-        [request(noise(*size), recipe.factor)]
+    spec = RECIPES[name]
+    (result,) = with_call(name, Blocks(spec), f"regenerator.{role_of(name)}.cache_gb=0").regenerate(
+        [request(noise(*size), spec.factor)]
     )
-    assert torch.equal(result, as_blocks(noise(*size), recipe.factor))
+    assert torch.equal(result, as_blocks(noise(*size), spec.factor))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (19, 41), (41, 19), (48, 64)])
@@ -268,16 +268,16 @@ def test_the_latent_upscaler_does_not_shift(models: dict[str, Path], tmp_path: P
 @pytest.mark.parametrize("name", ["sd_x2_latent", "sd_x4", "sdxl_turbo_raw"])
 def test_results_do_not_depend_on_company_or_order(name: str, models: dict[str, Path], tmp_path: Path) -> None:
     """To a level of 8 bits; and the same call again gives the same bits."""
-    recipe = RECIPES[name]
+    spec = RECIPES[name]
     model = models[name.removesuffix("_raw")]
     off = f"regenerator.{role_of(name)}.cache_gb=0"
     together = ready(name, tmp_path, off, model=model)
     alone = ready(name, tmp_path, off, f"regenerator.{role_of(name)}.batch_pixels=1", model=model)
-    asked = [request(noise(20, 30, n), recipe.factor, seed=n) for n in range(3)]
-    asked.insert(1, request(noise(9, 70), recipe.factor))
+    asked = [request(noise(20, 30, n), spec.factor, seed=n) for n in range(3)]
+    asked.insert(1, request(noise(9, 70), spec.factor))
     first, second = together.regenerate(asked), alone.regenerate(asked[::-1])[::-1]
     for a, b, asking in zip(first, second, asked, strict=True):
-        assert tuple(a.shape[1:]) == tuple(side * recipe.factor for side in asking.image.shape[1:])
+        assert tuple(a.shape[1:]) == tuple(side * spec.factor for side in asking.image.shape[1:])
         assert float((a - b).abs().max()) <= 1.01 / 255
     assert all(torch.equal(a, b) for a, b in zip(first, together.regenerate(asked), strict=True))
     assert not torch.equal(first[0], together.regenerate([replace(asked[0], seed=99)])[0])
@@ -303,11 +303,11 @@ def test_the_ladder_reaches_every_scale_by_the_model_for_it(models: dict[str, Pa
     """x2 and x4 as these models alone, x8 as x4 then x2; models that no scale needs are not looked for."""
     words = ["regenerator/upscale=sd_by_scale", f"regenerator.upscale.x2.model={models['sd_x2_latent']}"]
     views = small_scene(spread(4)).train
-    half = Ladder(compose(words, plugins()).regenerators["upscale"].options)
+    half = Cascade(compose(words, plugins()).regenerators["upscale"].options)
     half.check(views, [2], False)
     with pytest.raises(InputError, match=r"regenerator.upscale.x4.model="):
         half.check(views, [4], False)
-    whole = Ladder(
+    whole = Cascade(
         compose([*words, f"regenerator.upscale.x4.model={models['sd_x4']}"], plugins()).regenerators["upscale"].options
     )
     whole.check(views, [1, 2, 4, 8], False)
@@ -371,12 +371,12 @@ def test_results_are_kept_and_taken_again(models: dict[str, Path], tmp_path: Pat
     asked = [request(noise(20, 30, 50 + n), 4) for n in range(2)]
     first = ready("sd_x4", tmp_path, model=models["sd_x4"]).regenerate(asked)
     again = ready("sd_x4", tmp_path, model=models["sd_x4"])
-    again.recipe = replace(again.recipe, call=lambda *more: pytest.fail("drawn again"))
+    again.spec = replace(again.spec, call=lambda *more: pytest.fail("drawn again"))
     assert all(torch.equal(a, b) for a, b in zip(first, again.regenerate(asked), strict=True))
     with pytest.raises(pytest.fail.Exception):
         again.regenerate([replace(asked[0], seed=1)])
     broken = ready("sd_x4", tmp_path, model=models["sd_x4"])
-    broken.recipe = replace(broken.recipe, call=lambda pipe, batch, options: as_blocks(batch.images / 0, 4))
+    broken.spec = replace(broken.spec, call=lambda pipe, batch, options: as_blocks(batch.images / 0, 4))
     for _ in range(2):
         assert not bool(torch.isfinite(broken.regenerate([request(noise(5, 5, 60), 4)])[0]).all())
 

@@ -38,7 +38,7 @@ class SteadyZoom:
         if view not in self.views:
             self.views[view] = self.zoomed(view)
         parts = [(self.views[view], self.options.weight)]
-        return Term(name=self.context.name, parts=parts, taken=0.0, observed=False, shared=True)
+        return Term(name=self.context.name, parts=parts, replaces=0.0, observed=False, shared=True)
 
     def zoomed(self, number: int) -> PseudoView:
         """The middle half of a photograph, redrawn; it depends on nothing else, so a resumed run makes it again."""

@@ -28,8 +28,8 @@ from gsx.augmenters.cameras import (
     worst_window,
 )
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
+from gsx.augmenters.pixel_weights import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
-from gsx.augmenters.trust import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import to_uint8, write_image
 from gsx.core.data.reduction import Reduction, as_blocks, projected
@@ -215,7 +215,7 @@ class PseudoOptions:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sketch:
+class PseudoViewSpec:
     """A pseudo view before its picture is drawn."""
 
     parent: int
@@ -331,7 +331,7 @@ class PseudoDetails:
         return Term(
             name=self.context.name,
             parts=[(view, each / count * (area_share(view, whole) if options.per_pixel else 1.0)) for view in views],
-            taken=0.0 if direct else share * len(views) / pictures,
+            replaces=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
             shared=not frozen,
             squared=options.loss == "l2",
@@ -425,12 +425,12 @@ class PseudoDetails:
         if learnt:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)
-        sketches = list(self.sketches(run, event, parents))
-        drawn = self.all_drawn(run, event, sketches)
+        specs = list(self.specs(run, event, parents))
+        drawn = self.all_drawn(run, event, specs)
         views = [one.view for one in drawn if one.view is not None]
         views += [
             self.coarser_view(run, event, parent, factor)
-            for parent in sorted({sketch.parent for sketch in sketches})
+            for parent in sorted({spec.parent for spec in specs})
             for factor in self.options.coarser
         ]
         facts: dict[str, Any] = {
@@ -440,7 +440,7 @@ class PseudoDetails:
             "learnt": learnt,
             **self.judged(event, drawn),
         }
-        trusted = [float(view.trust.float().mean()) / 255 for view in views if view.trust is not None]
+        trusted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
         if kept:
             share = sum(kept) / len(kept)
@@ -452,13 +452,13 @@ class PseudoDetails:
             logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * masked)
         return views, facts
 
-    def all_drawn(self, run: Run, event: int, sketches: Sequence[Sketch]) -> list[Drawn]:
+    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[Drawn]:
         """What has become of each sketch, told batch by batch."""
         drawn: list[Drawn] = []
-        shown = sorted({sketch.parent for sketch in sketches})[:SHOWN]
-        for first in range(0, len(sketches), BATCH):
-            drawn += self.drawn(run, event, sketches[first : first + BATCH], shown)
-            logger.info("%s at step %d: %d of %d pictures", self.context.name, event, len(drawn), len(sketches))
+        shown = sorted({spec.parent for spec in specs})[:SHOWN]
+        for first in range(0, len(specs), BATCH):
+            drawn += self.drawn(run, event, specs[first : first + BATCH], shown)
+            logger.info("%s at step %d: %d of %d pictures", self.context.name, event, len(drawn), len(specs))
         return drawn
 
     def judged(self, event: int, drawn: Sequence[Drawn]) -> dict[str, Any]:
@@ -485,7 +485,7 @@ class PseudoDetails:
             logger.warning("%s: %d of %d pictures kept although %s", name, len(strays), len(drawn), first)
         return {"asked": asked, "dropped": dropped, "warned": warned}
 
-    def sketches(self, run: Run, event: int, parents: Set[int]) -> Iterator[Sketch]:
+    def specs(self, run: Run, event: int, parents: Set[int]) -> Iterator[PseudoViewSpec]:
         """Cameras of an event beside some training views, in the order of these, base before random."""
         options = self.options
         for parent in sorted(parents):
@@ -493,7 +493,7 @@ class PseudoDetails:
                 continue
             for scale in self.scales_of(event):
                 variants = range(0 if options.base else 1, options.variants + 1)
-                yield from (self.sketch(run, event, parent, scale, variant) for variant in variants)
+                yield from (self.spec(run, event, parent, scale, variant) for variant in variants)
 
     def scales_of(self, event: int) -> list[int]:
         """All of them, or the one whose turn it is."""
@@ -502,7 +502,7 @@ class PseudoDetails:
             return scales
         return [scales[self.events.index(event) * len(scales) // len(self.events)]]
 
-    def sketch(self, run: Run, event: int, parent: int, scale: int, variant: int) -> Sketch:
+    def spec(self, run: Run, event: int, parent: int, scale: int, variant: int) -> PseudoViewSpec:
         """One camera; variant 0 is the training camera's own."""
         options, own = self.options, run.scene.train[parent].camera
         generator = torch.Generator().manual_seed(
@@ -521,7 +521,7 @@ class PseudoDetails:
             result = result.zoom(zoom)
         elif scale > 1:  # the other reading: fewer pixels are redrawn to as many
             inside, seen, result = reduced(window, pose, scale)
-        return Sketch(
+        return PseudoViewSpec(
             parent=parent,
             scale=scale,
             kind="base" if variant == 0 else "random",
@@ -591,21 +591,21 @@ class PseudoDetails:
             return worst_window((render(run, pose).image - view.image()).abs().mean(0), size)
         return centred_window(width, height, size)
 
-    def drawn(self, run: Run, event: int, sketches: Sequence[Sketch], shown: Sequence[int]) -> list[Drawn]:
+    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[Drawn]:
         """What becomes of each sketch; pictures of the training views `shown` are kept to be looked at."""
         regenerator = self.context.regenerator(self.options.role)
-        requests = [self.request(run, event, sketch) for sketch in sketches]
+        requests = [self.request(run, event, spec) for spec in specs]
         samples = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
         out: list[Drawn] = []
-        for sketch, request, *results in zip(sketches, requests, *samples, strict=True):
+        for spec, request, *results in zip(specs, requests, *samples, strict=True):
             result = torch.stack([result.detach().cpu().float() for result in results]).mean(0)
-            one = self.checked(run, event, sketch, request, result)
-            if one.view is not None and sketch.parent in shown:
-                self.show(run.folder / "pseudo", sketch, request, one.view)
+            one = self.checked(run, event, spec, request, result)
+            if one.view is not None and spec.parent in shown:
+                self.show(run.folder / "pseudo", spec, request, one.view)
             out.append(one)
         return out
 
-    def checked(self, run: Run, event: int, sketch: Sketch, request: Request, result: Tensor) -> Drawn:
+    def checked(self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Tensor) -> Drawn:
         """The pseudo view of a result, if it may be used."""
         problem, found = unusable(request, result), dict[str, str]()
         if not problem:
@@ -616,23 +616,23 @@ class PseudoDetails:
             dropped = [told for check, told in found.items() if getattr(self.options.checks, check).action == "drop"]
             problem = "; ".join(dropped)
         named = problem and f"{request.view.name}: {problem}"
-        view = None if problem else self.view(run, event, sketch, request, result)
+        view = None if problem else self.view(run, event, spec, request, result)
         warnings = {} if problem else {check: f"{request.view.name}: {told}" for check, told in found.items()}
-        return Drawn(scale=sketch.scale, view=view, problem=named, warnings=warnings)
+        return Drawn(scale=spec.scale, view=view, problem=named, warnings=warnings)
 
-    def request(self, run: Run, event: int, sketch: Sketch) -> Request:
+    def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
-        view = run.scene.train[sketch.parent]
-        image = render(run, sketch.seen).image if sketch.outer is None else sketch.outer.cut(view.image())
+        view = run.scene.train[spec.parent]
+        image = render(run, spec.seen).image if spec.outer is None else spec.outer.cut(view.image())
         return Request(
             image=image,
-            scale=sketch.scale,
+            scale=spec.scale,
             reduction=run.scene.reduction,
-            camera=sketch.seen,
+            camera=spec.seen,
             view=view,
-            number=sketch.parent,
-            photo=sketch.outer is not None,
-            seed=sketch.seed,
+            number=spec.parent,
+            photo=spec.outer is not None,
+            seed=spec.seed,
             strength=ramp(self.options.strength, event, self.options.timing, self.schedule),
             strongest=self.options.strength[0],
             prompt=self.options.prompt.replace("{scene}", run.scene.name),
@@ -646,10 +646,10 @@ class PseudoDetails:
         return f", or augmenter.{self.context.name}.project=exact" if enlarging else ""
 
     def view(
-        self, run: Run, event: int, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"]
+        self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"]
     ) -> PseudoView:
         """The pseudo view of a result: its window, in 8 bits."""
-        a, inside = sketch.scale, sketch.inside
+        a, inside = spec.scale, spec.inside
         target = to_uint8(result.clamp(0, 1))
         if self.options.project == "exact" and a > 1 and request.photo:
             target = exactly_consistent(result, to_uint8(request.image), a, request.reduction)
@@ -661,17 +661,17 @@ class PseudoDetails:
             shares = {"consistent": float(inside.cut(same[None].float()).mean())}
         known = request.photo and a > 1 and self.options.coarse_weight > 0
         return PseudoView(
-            camera=sketch.camera,
+            camera=spec.camera,
             target=kept,
-            parent=sketch.parent,
-            trust=self.trust(run, sketch, request, target.float() / 255, window),
+            parent=spec.parent,
+            pixel_weight=self.pixel_weight(run, spec, request, target.float() / 255, window),
             coarse=to_uint8(inside.cut(request.image)).contiguous() if known else None,
             coarse_weight=self.options.coarse_weight if known else 0.0,
             reduction=request.reduction,
             provenance={
                 "event": event,
                 "view": request.view.name,
-                "kind": sketch.kind,
+                "kind": spec.kind,
                 "scale": a,
                 "source": "photo" if request.photo else "render",
                 "seed": request.seed,
@@ -705,23 +705,25 @@ class PseudoDetails:
             },
         )
 
-    def trust(
-        self, run: Run, sketch: Sketch, request: Request, result: Float[Tensor, "3 H W"], window: Window
+    def pixel_weight(
+        self, run: Run, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"], window: Window
     ) -> UInt8[Tensor, "h w"] | None:
         """How much each pixel of a window of the result counts; None where all count whole."""
-        options, trust = self.options, torch.ones(window.height, window.width)
+        options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
             photographs = [view.camera for view in run.scene.train]
-            trust = trust * weights(splats_for(run, sketch.camera), sketch.camera, photographs, run.raster).cpu()
-        if options.gate > 0 and request.photo and sketch.scale > 1:
-            agreed = agreeing(result, request.image, sketch.scale, request.reduction, options.gate)
-            trust = trust * window.cut(agreed[None])[0]
-        return None if bool((trust == 1).all()) else in_bytes(trust)
+            pixel_weight = (
+                pixel_weight * weights(splats_for(run, spec.camera), spec.camera, photographs, run.raster).cpu()
+            )
+        if options.gate > 0 and request.photo and spec.scale > 1:
+            agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)
+            pixel_weight = pixel_weight * window.cut(agreed[None])[0]
+        return None if bool((pixel_weight == 1).all()) else in_bytes(pixel_weight)
 
-    def show(self, folder: Path, sketch: Sketch, request: Request, view: PseudoView) -> None:
+    def show(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
         """Keep a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
-        given = as_blocks(sketch.inside.cut(request.image), sketch.scale)
+        given = as_blocks(spec.inside.cut(request.image), spec.scale)
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ class LevelDensityOptions:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Verdict:
+class DensifyMasks:
     """What happens to each of N Gaussians."""
 
     cloned: Bool[Tensor, "N"]
@@ -71,7 +71,7 @@ def relative_sizes(scales: Float[Tensor, "N 3"], of: Int[Tensor, "N"], count: in
     return torch.where(known, means / means[0].clamp_min(torch.finfo(means.dtype).tiny), 1.0).to(scales)
 
 
-def judged(
+def densify_masks(
     gradient: Float[Tensor, "N"],
     scales: Float[Tensor, "N 3"],
     of: Int[Tensor, "N"],
@@ -81,7 +81,7 @@ def judged(
     threshold: float,
     large: float,
     splitting: bool,
-) -> Verdict:
+) -> DensifyMasks:
     """Who is cloned, split and drawn from farther: each by the threshold and the size of its own level (spec 4B).
 
     `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` nothing happens to large
@@ -92,7 +92,7 @@ def judged(
     big = scales.amax(1) > large * relative_sizes(scales, of, levels.count)[of.long()]
     chosen = (gradient >= tau) & (gradient > 0) & (~big | splitting)
     biased = (gradient >= options.bias_gradient * tau) & (gradient > 0) & (~big | splitting)
-    return Verdict(cloned=chosen & ~big, split=chosen & big, biased=biased)
+    return DensifyMasks(cloned=chosen & ~big, split=chosen & big, biased=biased)
 
 
 def clones(raw: dict[str, Tensor], rows: Int[Tensor, "M"]) -> dict[str, Tensor]:

@@ -161,7 +161,7 @@ def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sprouts:
+class CandidateAnchors:
     """New anchors of one cell size."""
 
     positions: Float[Tensor, "U 3"]
@@ -178,22 +178,22 @@ class Sprouts:
     level: int
 
 
-def some(sprouts: Sprouts, keep: Bool[Tensor, "U"]) -> Sprouts:
+def selected(new: CandidateAnchors, keep: Bool[Tensor, "U"]) -> CandidateAnchors:
     """The marked ones, with their parents."""
-    number, inside = keep.cumsum(0) - 1, keep[sprouts.group]
+    number, inside = keep.cumsum(0) - 1, keep[new.group]
     return replace(
-        sprouts,
-        positions=sprouts.positions[keep],
-        parents=sprouts.parents[inside],
-        group=number[sprouts.group[inside]],
-        strength=sprouts.strength[keep],
+        new,
+        positions=new.positions[keep],
+        parents=new.parents[inside],
+        group=number[new.group[inside]],
+        strength=new.strength[keep],
     )
 
 
-def strongest(sprouts: Sprouts, room: int) -> Sprouts:
+def strongest(new: CandidateAnchors, room: int) -> CandidateAnchors:
     """At most `room` of them, those with the largest gradients."""
-    everyone = torch.ones_like(sprouts.strength, dtype=torch.bool)
-    return some(sprouts, within_room(everyone, sprouts.strength, room))
+    everyone = torch.ones_like(new.strength, dtype=torch.bool)
+    return selected(new, within_room(everyone, new.strength, room))
 
 
 def offset_means(table: ParameterTable) -> Float[Tensor, "N k 3"]:
@@ -202,7 +202,7 @@ def offset_means(table: ParameterTable) -> Float[Tensor, "N k 3"]:
     return table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
 
 
-def sprout(
+def candidate_anchors(
     table: ParameterTable,
     candidates: Bool[Tensor, "N k"],
     gradient: Float[Tensor, "N k"],
@@ -213,12 +213,12 @@ def sprout(
     *,
     inherit: bool = True,
     level: int = 0,
-) -> Sprouts:
+) -> CandidateAnchors:
     """New anchors in the cells of the M candidates that none of the cells taken is."""
     fresh, group = new_cells(cells, taken)
     parents = candidates.nonzero()[:, 0]
     inside = group >= 0
-    return Sprouts(
+    return CandidateAnchors(
         positions=(fresh.double() * size + origin).to(table["anchors"]),
         size=size,
         parents=parents[inside],
@@ -229,21 +229,23 @@ def sprout(
     )
 
 
-def add_anchors(table: ParameterTable, sprouts: Sprouts, representation: Representation, most: int) -> tuple[int, int]:
-    """Append the sprouts with fresh statistics, up to a table of `most` anchors; (how many, how many found no room)."""
-    wanted = len(sprouts.positions)
-    sprouts = strongest(sprouts, room_under(most, len(table)))
-    count, like = len(sprouts.positions), table["anchors"]
+def add_anchors(
+    table: ParameterTable, new: CandidateAnchors, representation: Representation, most: int
+) -> tuple[int, int]:
+    """Append new anchors with fresh statistics, up to a table of `most` anchors; (how many, how many found no room)."""
+    wanted = len(new.positions)
+    new = strongest(new, room_under(most, len(table)))
+    count, like = len(new.positions), table["anchors"]
     if count == 0:
         return 0, wanted
-    log_lengths = torch.full((count,), math.log(sprouts.size), dtype=like.dtype, device=like.device)
-    rows = representation.rows(log_lengths, torch.full_like(sprouts.positions, 0.5))
-    if sprouts.inherit:
-        rows |= {n: pooled_max(table[n].detach()[sprouts.parents], sprouts.group, count) for n in representation.pooled}
-    rows |= fresh_statistics(count, representation.offsets, like.device) | {"anchors": sprouts.positions}
+    log_lengths = torch.full((count,), math.log(new.size), dtype=like.dtype, device=like.device)
+    rows = representation.rows(log_lengths, torch.full_like(new.positions, 0.5))
+    if new.inherit:
+        rows |= {n: pooled_max(table[n].detach()[new.parents], new.group, count) for n in representation.pooled}
+    rows |= fresh_statistics(count, representation.offsets, like.device) | {"anchors": new.positions}
     rows |= {name: torch.zeros(count, device=like.device) for name in ("bias", "filter") if name in table.columns}
     if "level" in table.columns:
-        rows["level"] = torch.full((count,), sprouts.level, dtype=torch.int16, device=like.device)
+        rows["level"] = torch.full((count,), new.level, dtype=torch.int16, device=like.device)
     append_rows(table, rows)
     return count, wanted - count
 
@@ -274,7 +276,7 @@ def grow_by_depth(
         candidates = enough & (gradient >= threshold) & (chance > 0.5 ** (depth + 1))
         size = voxel * multiple
         cells, taken = nodes_of(means[candidates], size), nodes_of(table["anchors"], size)
-        found = sprout(table, candidates, gradient, cells, taken, 0.0, size)
+        found = candidate_anchors(table, candidates, gradient, cells, taken, 0.0, size)
         added, left = add_anchors(table, found, representation, most)
         grown, without_room = grown + added, without_room + left
         if early_stop and grown == 0:
@@ -318,7 +320,7 @@ def grow_by_level(
             continue
         if gate:
             bias_anchors(table, mean_gradient, own, options, taus[level], quirks)
-        for found in sprouts_of_level(
+        for found in candidates_of_level(
             table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
         ):
             added, left = add_anchors(table, found, representation, most)
@@ -344,7 +346,7 @@ def bias_anchors(
         bias.clamp_max_(1.0)
 
 
-def sprouts_of_level(
+def candidates_of_level(
     table: ParameterTable,
     enough: Bool[Tensor, "N k"],
     gradient: Float[Tensor, "N k"],
@@ -355,20 +357,22 @@ def sprouts_of_level(
     options: GrowthOptions,
     quirks: Quirks,
     gate: bool,
-) -> Iterator[Sprouts]:
+) -> Iterator[CandidateAnchors]:
     """Anchors on the same level, then promotions to the next (spec 3.8, 2 and 3)."""
     last = level == levels.count - 1
     below = gradient < taus[level + 1]
     if last and quirks.finest == "open":
         below = torch.ones_like(below)
     staying = enough & (gradient >= taus[level]) & below
-    yield weeded(at_level(table, staying, gradient, means, level, level, levels, options), levels)
+    yield filtered(at_level(table, staying, gradient, means, level, level, levels, options), levels)
     next_exists = options.overlap or bool((table["level"] == level + 1).any())
     if gate and not last and next_exists:
         compared = level if quirks.duplicates == "own" else level + 1
         promoted = enough & (gradient >= taus[level + 1])
         inherit = options.overlap or quirks.promoted == "max"
-        yield weeded(at_level(table, promoted, gradient, means, level + 1, compared, levels, options, inherit), levels)
+        yield filtered(
+            at_level(table, promoted, gradient, means, level + 1, compared, levels, options, inherit), levels
+        )
 
 
 def at_level(
@@ -381,19 +385,21 @@ def at_level(
     levels: Levels,
     options: GrowthOptions,
     inherit: bool = True,
-) -> Sprouts:
+) -> CandidateAnchors:
     """Anchors in the cells of a level that no anchor of level `compared` holds; with overlap in all of them."""
     occupied = table["anchors"][table["level"] == compared]
     taken = levels.cells(occupied[:0] if options.overlap else occupied, level)
     cells, size = levels.cells(means[candidates], level), levels.size(level)
-    return sprout(table, candidates, gradient, cells, taken, levels.origin, size, inherit=inherit, level=level)
+    return candidate_anchors(
+        table, candidates, gradient, cells, taken, levels.origin, size, inherit=inherit, level=level
+    )
 
 
-def weeded(sprouts: Sprouts, levels: Levels) -> Sprouts:
+def filtered(new: CandidateAnchors, levels: Levels) -> CandidateAnchors:
     """Without those that too few cameras would draw (spec 3.4)."""
-    positions = sprouts.positions
-    of = torch.full((len(positions),), sprouts.level, dtype=torch.int16, device=positions.device)
-    return some(sprouts, kept(levels, positions, of))
+    positions = new.positions
+    of = torch.full((len(positions),), new.level, dtype=torch.int16, device=positions.device)
+    return selected(new, kept(levels, positions, of))
 
 
 # -- after growing ---------------------------------------------------------------------------------------------------

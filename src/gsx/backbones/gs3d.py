@@ -15,7 +15,7 @@ from gsx.backbones.clone_split import (
     LevelDensityOptions,
     bias_levels,
     clones,
-    judged,
+    densify_masks,
     small_children,
     stacked,
     starting_points,
@@ -416,7 +416,7 @@ class GS3D:
         assert quirks is not None
         gradient, level = self.statistics.mean_gradient(), self.table["level"]
         raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
-        verdict = judged(
+        masks = densify_masks(
             gradient,
             raw["log_scales"].exp(),
             level,
@@ -426,12 +426,12 @@ class GS3D:
             large=density.split_extent * self.extent,
             splitting=quirks.gate == "open" or levels.highest(step) == levels.count - 1,
         )
-        cloned, split = (mask.nonzero()[:, 0] for mask in (verdict.cloned, verdict.split))
+        cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
         children_made = small_children(raw, split, levels, control.shrink, self.generator)
         new = stacked([clones(raw, cloned), children_made])
         seen = kept(levels, new["means"], new["level"])
         keep = within_room(seen, gradient[torch.cat([cloned, split])], self.room())
-        bias_levels(self.table, verdict.biased, control.bias_step, 1.0 if quirks.bias == "own" else math.inf)
+        bias_levels(self.table, masks.biased, control.bias_step, 1.0 if quirks.bias == "own" else math.inf)
         append_rows(self.table, {name: value[keep] for name, value in new.items()})
         pruned = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)

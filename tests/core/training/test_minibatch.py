@@ -111,7 +111,7 @@ class Still:
     def term(self, run: Run, step: int, view: int) -> Term | None:
         if view not in self.views:
             return None
-        return Term(name="still", parts=[(self.view_of(run, view), 0.5)], taken=0.1, observed=True, shared=False)
+        return Term(name="still", parts=[(self.view_of(run, view), 0.5)], replaces=0.1, observed=True, shared=False)
 
     def begins(self) -> int:
         return 0
@@ -212,14 +212,14 @@ def test_a_batch_counts_as_one_step_and_judges_as_its_views_one_by_one(judge: Ju
 class Again:
     """An augmenter: every training view once more with its own photograph as truth, at a weight."""
 
-    def __init__(self, weight: float, taken: float = 0.0, *, observed: bool = True, shared: bool = True) -> None:
-        self.weight, self.taken, self.observed, self.shared = weight, taken, observed, shared
+    def __init__(self, weight: float, replaces: float = 0.0, *, observed: bool = True, shared: bool = True) -> None:
+        self.weight, self.replaces, self.observed, self.shared = weight, replaces, observed, shared
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
         seen = run.scene.train[view]
         pseudo = PseudoView(camera=seen.camera, target=to_uint8(seen.image()), parent=view)
         kind = {"observed": self.observed, "shared": self.shared}
-        return Term(name="again", parts=[(pseudo, self.weight)], taken=self.taken, **kind)
+        return Term(name="again", parts=[(pseudo, self.weight)], replaces=self.replaces, **kind)
 
     def begins(self) -> int:
         return 0

@@ -96,7 +96,7 @@ def geometry(
     scales: Float[Tensor, "M 3"],
     quats: Float[Tensor, "M 4"],
     rotation: Float[Tensor, "3 3"],
-    lens: Float[Tensor, "4"],
+    intrinsics: Float[Tensor, "4"],
     low: Float[Tensor, "2"],
     high: Float[Tensor, "2"],
     dilation: float,
@@ -105,10 +105,10 @@ def geometry(
     """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
 
     Fourth is the ln of the factor on opacities that makes up for dilation; None unless asked for.
-    `points` and `lens` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
+    `points` and `intrinsics` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
     """
     x, y, z = points.unbind(1)
-    fx, fy, cx, cy = lens
+    fx, fy, cx, cy = intrinsics
     slopes = x / z, y / z
     means = slopes[0] * fx + cx, slopes[1] * fy + cy
     clamped = tuple(s.to(scales).clamp(a, b) for s, a, b in zip(slopes, low, high, strict=True))

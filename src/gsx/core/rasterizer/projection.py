@@ -47,41 +47,41 @@ class ScreenSplats:
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
 
 
-def lens_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
+def intrinsics_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
     """(fx, fy, cx, cy) of the camera's raster in float64, `intrinsics` where they are given."""
     if intrinsics is None:
         return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
     return intrinsics.double()
 
 
-def on_frame(lens: Float[Tensor, "4"], frame: Frame) -> Float[Tensor, "4"]:
+def on_frame(intrinsics: Float[Tensor, "4"], frame: Frame) -> Float[Tensor, "4"]:
     """The lens with its principal point counted on the frame."""
-    return lens + lens.new_tensor([0, 0, frame.left, frame.top])
+    return intrinsics + intrinsics.new_tensor([0, 0, frame.left, frame.top])
 
 
 def slope_bounds(
-    lens: Float[Tensor, "4"], frame: Frame, margin: float
+    intrinsics: Float[Tensor, "4"], frame: Frame, margin: float
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
     """Smallest and largest (x/z, y/z) over the frame widened by `margin` half-extents: asymmetric off centre."""
-    focal, centre = lens[:2], lens[2:]
-    size = lens.new_tensor([frame.width, frame.height])
+    focal, centre = intrinsics[:2], intrinsics[2:]
+    size = intrinsics.new_tensor([frame.width, frame.height])
     extra = margin * size / (2 * focal)
     return -centre / focal - extra, (size - centre) / focal + extra
 
 
 @torch.no_grad()
-def steepest_slope(lens: Float[Tensor, "4"], frame: Frame, margin: float) -> Float[Tensor, ""]:
+def steepest_slope(intrinsics: Float[Tensor, "4"], frame: Frame, margin: float) -> Float[Tensor, ""]:
     """Largest |x/z| or |y/z| within the bounds."""
-    return torch.cat(slope_bounds(lens, frame, margin)).abs().amax()
+    return torch.cat(slope_bounds(intrinsics, frame, margin)).abs().amax()
 
 
-def refuse_unusable(camera: Camera, lens: Float[Tensor, "4"], margin: float) -> None:
+def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: float) -> None:
     """Raise InputError for a camera through which nothing can be projected."""
-    fx, fy, cx, cy = lens.tolist()
+    fx, fy, cx, cy = intrinsics.tolist()
     words = f"fx={fx}, fy={fy}, cx={cx}, cy={cy}, near={camera.near}"
     if not (0 < fx < LENS_LIMIT and 0 < fy < LENS_LIMIT and 0 <= camera.near < math.inf):
         raise InputError(f"a camera has {words}: focal lengths must be in (0, {LENS_LIMIT:g}) px, near at least 0")
-    if not float(steepest_slope(on_frame(lens, camera.frame), camera.frame, margin)) < LENS_LIMIT:
+    if not float(steepest_slope(on_frame(intrinsics, camera.frame), camera.frame, margin)) < LENS_LIMIT:
         raise InputError(f"a camera has {words} and sees {LENS_LIMIT:g} focal lengths off its axis: check its lens")
     if not bool(torch.isfinite(camera.rotation).all() & torch.isfinite(camera.translation).all()):
         pose = f"rotation {camera.rotation.tolist()}, translation {camera.translation.tolist()}"
@@ -102,31 +102,31 @@ def usable(splats: Splats) -> Bool[Tensor, "N"]:
 
 @torch.no_grad()
 def in_range(
-    splats: Splats, points: Float[Tensor, "N 3"], lens: Float[Tensor, "4"], frame: Frame, margin: float
+    splats: Splats, points: Float[Tensor, "N 3"], intrinsics: Float[Tensor, "4"], frame: Frame, margin: float
 ) -> Bool[Tensor, "N"]:
     """Splats before the camera whose mean and axes in px can be squared in their dtype, as can 1 / depth."""
     largest = torch.finfo(splats.means.dtype).max
     x, y, z = points.abs().unbind(1)
-    size = splats.scales.abs().amax(1).clamp_min(1).double() * (1 + steepest_slope(lens, frame, margin))
-    fits = size.maximum(x).maximum(y) * lens[:2].amax() < largest**SQUARABLE * z
+    size = splats.scales.abs().amax(1).clamp_min(1).double() * (1 + steepest_slope(intrinsics, frame, margin))
+    fits = size.maximum(x).maximum(y) * intrinsics[:2].amax() < largest**SQUARABLE * z
     return fits & (x.maximum(y).maximum(z) <= largest)
 
 
 @torch.no_grad()
 def sound(
-    splats: Splats, points: Float[Tensor, "N 3"], lens: Float[Tensor, "4"], camera: Camera, margin: float
+    splats: Splats, points: Float[Tensor, "N 3"], intrinsics: Float[Tensor, "4"], camera: Camera, margin: float
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
     """(splats beyond the near plane, splats of which nothing is out of range). A depth that rounds to the near plane is
     not beyond it."""
     in_front = points[:, 2].to(splats.means) > camera.near
-    return in_front, usable(splats) & (in_range(splats, points, lens, camera.frame, margin) | ~in_front)
+    return in_front, usable(splats) & (in_range(splats, points, intrinsics, camera.frame, margin) | ~in_front)
 
 
 @torch.no_grad()
 def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
     """False for the splats that a render from this camera leaves out and counts as dropped."""
-    lens = on_frame(lens_of(camera, None), camera.frame).to(splats.means.device)
-    return sound(splats, camera_points(splats, camera), lens, camera, settings.jacobian_margin)[1]
+    intrinsics = on_frame(intrinsics_of(camera, None), camera.frame).to(splats.means.device)
+    return sound(splats, camera_points(splats, camera), intrinsics, camera, settings.jacobian_margin)[1]
 
 
 def project(
@@ -139,20 +139,20 @@ def project(
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
-    margin, lens = settings.jacobian_margin, lens_of(camera, intrinsics)
-    refuse_unusable(camera, lens, margin)
-    lens = on_frame(lens, camera.frame).to(splats.means.device)
+    margin, intrinsics = settings.jacobian_margin, intrinsics_of(camera, intrinsics)
+    refuse_unusable(camera, intrinsics, margin)
+    intrinsics = on_frame(intrinsics, camera.frame).to(splats.means.device)
     points = camera_points(splats, camera)
-    in_front, good = sound(splats, points, lens, camera, margin)  # selecting comes before any division (spec 12)
+    in_front, good = sound(splats, points, intrinsics, camera, margin)  # selecting comes before any division (spec 12)
     ids = (good & in_front).nonzero()[:, 0]
     points, scales, quats, log_opacities, channels = (
         take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     )
-    low, high = slope_bounds(lens, camera.frame, margin)
+    low, high = slope_bounds(intrinsics, camera.frame, margin)
     rotation = camera.rotation.to(scales)
     rules = settings.dilation, settings.compensate
     means, covariances, conic_factors, gains = geometry_of(settings, ids)(
-        points, scales, quats, rotation, lens, low.to(scales), high.to(scales), *rules
+        points, scales, quats, rotation, intrinsics, low.to(scales), high.to(scales), *rules
     )
     return ScreenSplats(
         ids=ids,

@@ -23,7 +23,7 @@ class PseudoView:
     target: UInt8[Tensor, "3 h w"]
     parent: int
     """Number of the training view it was made from."""
-    trust: UInt8[Tensor, "h w"] | None = None
+    pixel_weight: UInt8[Tensor, "h w"] | None = None
     """Weight of each pixel in the loss, 255 counts whole; None: all count whole."""
     coarse: UInt8[Tensor, "3 l m"] | None = None
     """What is known of it at a lower resolution: what it reduces to."""
@@ -42,7 +42,7 @@ class Term:
     name: str
     parts: Sequence[tuple[PseudoView, float]]
     """Pseudo views with their weights."""
-    taken: float
+    replaces: float
     """Share of the backbone's own loss that this term takes the place of; 0: it is added (spec 1.3)."""
     observed: bool
     """Whether the renders count in density control (the authors' code does so), each by its weight in `parts`. That is
@@ -58,8 +58,8 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool =
     beside it where that is known (SRGS, spec 6.1). `squared`: (render - target)^2 in both."""
     size = torch.square if squared else torch.abs
     difference = size(image - view.target.to(image.device).float() / 255)
-    if view.trust is not None:
-        difference = difference * (view.trust.to(image.device).float() / 255)
+    if view.pixel_weight is not None:
+        difference = difference * (view.pixel_weight.to(image.device).float() / 255)
     if view.coarse is None:
         return difference.mean()
     reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])
@@ -84,7 +84,8 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
     listed = []
     for number, view in enumerate(views):
         held = {"target": view.target, "rotation": view.camera.rotation, "translation": view.camera.translation}
-        held |= {name: value for name in ("trust", "coarse") if (value := getattr(view, name)) is not None}
+        optional = {"trust": view.pixel_weight, "coarse": view.coarse}
+        held |= {name: value for name, value in optional.items() if value is not None}
         tensors |= {
             f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
         }
@@ -133,7 +134,7 @@ def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> P
         camera=camera,
         target=tensors[f"{number}.target"],
         parent=entry["parent"],
-        trust=tensors.get(f"{number}.trust"),
+        pixel_weight=tensors.get(f"{number}.trust"),
         coarse=tensors.get(f"{number}.coarse"),
         coarse_weight=entry["coarse_weight"],
         reduction=Reduction(**entry.get("reduction", {})),

@@ -113,7 +113,7 @@ def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour
     divided = [divide(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: add_term(run, term, number, seen) for term, _ in ordered}
-    own = 1 - sum(term.taken for term in terms)
+    own = 1 - sum(term.replaces for term in terms)
     drawn = run.backbone.draw(view.camera, number)
     rendering = rasterize(
         drawn.splats,

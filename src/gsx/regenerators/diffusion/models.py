@@ -14,8 +14,8 @@ import torch
 
 from gsx.core.cache import content_key, source_digest
 from gsx.core.errors import ConfigError, InputError, TrainingError, first_line
+from gsx.regenerators.diffusion.model_specs import ModelSpec
 from gsx.regenerators.diffusion.options import DiffusionOptions
-from gsx.regenerators.diffusion.recipes import Recipe
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ def require(name: str, packages: Sequence[str]) -> None:
         raise ConfigError(f"regenerator {name} needs {', '.join(missing)}: pip install 'gsx[diffusion]'")
 
 
-def located(options: DiffusionOptions, recipe: Recipe) -> Path:
+def located(options: DiffusionOptions, spec: ModelSpec) -> Path:
     """The folder of a model, fetched first if it may be.
 
     Raises:
@@ -40,12 +40,12 @@ def located(options: DiffusionOptions, recipe: Recipe) -> Path:
     """
     folder = Path(options.model).expanduser()
     if not folder.is_dir():
-        folder = snapshot(options, recipe)
-    inspect(folder, options, recipe)
+        folder = snapshot(options, spec)
+    inspect(folder, options, spec)
     return folder
 
 
-def snapshot(options: DiffusionOptions, recipe: Recipe) -> Path:
+def snapshot(options: DiffusionOptions, spec: ModelSpec) -> Path:
     """The folder of a hub's id in the cache of huggingface_hub."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
@@ -66,7 +66,7 @@ def snapshot(options: DiffusionOptions, recipe: Recipe) -> Path:
         if partial := getattr(error, "snapshot_path", None):  # something is there: what is missing is told below
             return Path(partial)
         why = first_line(error) if options.download else "it is no folder, and not in the cache of the hub's client"
-    raise InputError(f"regenerator {options.name} finds no model '{options.model}' ({why}). {remedy(options, recipe)}")
+    raise InputError(f"regenerator {options.name} finds no model '{options.model}' ({why}). {remedy(options, spec)}")
 
 
 def wanted(options: DiffusionOptions) -> list[str]:
@@ -80,48 +80,48 @@ def unwanted(options: DiffusionOptions) -> list[str]:
     return [] if options.variant else ["*/*.*.safetensors"]
 
 
-def remedy(options: DiffusionOptions, recipe: Recipe) -> str:
+def remedy(options: DiffusionOptions, spec: ModelSpec) -> str:
     """Which files, how large, where to put them, and the command that does so."""
-    name, folder = recipe.hub, f"models/{recipe.hub.split('/')[-1]}"
+    name, folder = spec.hub, f"models/{spec.hub.split('/')[-1]}"
     patterns = " ".join(f"--include '{pattern}'" for pattern in wanted(options))
     patterns += "".join(f" --exclude '{pattern}'" for pattern in unwanted(options))
-    folders = ", ".join((*recipe.networks, *recipe.others)) or "that it names"
-    size = f", about {recipe.gigabytes:g} GB" if recipe.gigabytes else ""
+    folders = ", ".join((*spec.networks, *spec.others)) or "that it names"
+    size = f", about {spec.gigabytes:g} GB" if spec.gigabytes else ""
     return (
         f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {patterns} --local-dir {folder}; then "
-        f"{recipe.where}.model={folder}. Or let gsx fetch it: {recipe.where}.download=true. "
+        f"{spec.where}.model={folder}. Or let gsx fetch it: {spec.where}.download=true. "
         "Without diffusion: budget=quick"
     )
 
 
-def inspect(folder: Path, options: DiffusionOptions, recipe: Recipe) -> None:
-    """Whether a folder holds what the recipe needs, as far as can be told without reading the weights.
+def inspect(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> None:
+    """Whether a folder holds what the spec needs, as far as can be told without reading the weights.
 
     Raises:
         InputError: something is missing, of another architecture, or cut short.
     """
-    pipeline = class_named(folder, options, recipe)
-    if recipe.accepted and pipeline not in recipe.accepted:
+    pipeline = class_named(folder, options, spec)
+    if spec.accepted and pipeline not in spec.accepted:
         raise InputError(
             f"regenerator {options.name}: {folder / INDEX} is that of a {pipeline}, and must be that of a "
-            f"{' or '.join(recipe.accepted)}: set {recipe.where}.model to another folder"
+            f"{' or '.join(spec.accepted)}: set {spec.where}.model to another folder"
         )
-    missing = [part for part in (*recipe.networks, *recipe.others) if not (folder / part).is_dir()]
-    missing += [f"{part}/{weights_name(options)}" for part in recipe.networks if not weights_of(folder / part, options)]
+    missing = [part for part in (*spec.networks, *spec.others) if not (folder / part).is_dir()]
+    missing += [f"{part}/{weights_name(options)}" for part in spec.networks if not weights_of(folder / part, options)]
     if missing:
-        raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, recipe)}")
-    if recipe.code is not None and not recipe.code.is_file():
-        raise InputError(f"regenerator {options.name}: there is no file custom={recipe.code}")
+        raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, spec)}")
+    if spec.code is not None and not spec.code.is_file():
+        raise InputError(f"regenerator {options.name}: there is no file custom={spec.code}")
     for path in all_weights(folder, options):
         refuse_damaged(path, options)
 
 
-def class_named(folder: Path, options: DiffusionOptions, recipe: Recipe) -> str:
+def class_named(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str:
     """The class of pipeline that a folder says it is."""
     try:
         return str(json.loads((folder / INDEX).read_text(encoding="utf-8"))["_class_name"])
     except FileNotFoundError:
-        raise InputError(f"regenerator {options.name}: {folder} holds no {INDEX}. {remedy(options, recipe)}") from None
+        raise InputError(f"regenerator {options.name}: {folder} holds no {INDEX}. {remedy(options, spec)}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"regenerator {options.name}: {folder / INDEX} cannot be read ({error}): fetch it again"
@@ -159,12 +159,12 @@ def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
         raise InputError(f"regenerator {options.name}: {path} is damaged ({error}): fetch it again") from error
 
 
-def fingerprint(folder: Path, options: DiffusionOptions, recipe: Recipe) -> str:
+def fingerprint(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str:
     """SHA-256 of everything in files that decides what a model draws."""
     digest = hashlib.sha256()
     files = [path for path in folder.rglob("*") if path.suffix in (".json", ".txt", ".model", ".py")]
     files += all_weights(folder, options)
-    files += [recipe.code] if recipe.code is not None else []
+    files += [spec.code] if spec.code is not None else []
     for path in sorted(set(files)):
         digest.update(f"{path.name} {path.parent.name} {path.stat().st_size}\n".encode())
         with path.open("rb") as stream:
@@ -188,7 +188,7 @@ def number_type(options: DiffusionOptions, device: torch.device) -> torch.dtype:
     return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
 
 
-def opened(folder: Path, options: DiffusionOptions, recipe: Recipe, dtype: torch.dtype) -> Any:
+def opened(folder: Path, options: DiffusionOptions, spec: ModelSpec, dtype: torch.dtype) -> Any:
     """The pipeline of a folder, in main memory.
 
     Raises:
@@ -199,13 +199,13 @@ def opened(folder: Path, options: DiffusionOptions, recipe: Recipe, dtype: torch
     for library in ("diffusers", "transformers"):
         logging.getLogger(library).setLevel(logging.ERROR)  # advice about packages that are not needed
     try:
-        pipe = getattr(diffusers, recipe.loader).from_pretrained(
+        pipe = getattr(diffusers, spec.loader).from_pretrained(
             folder,
             local_files_only=True,
             use_safetensors=True,
             variant=options.variant or None,
             dtype=dtype,
-            **recipe.replaced,
+            **spec.replaced,
         )
     except Exception as error:  # whatever the libraries raise, the run must end in one sentence
         raise TrainingError(

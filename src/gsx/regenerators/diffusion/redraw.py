@@ -21,6 +21,7 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.classical import refuse_enlarging
+from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, spec_of
 from gsx.regenerators.diffusion.models import (
     PACKAGES,
     code_stamp,
@@ -33,7 +34,6 @@ from gsx.regenerators.diffusion.models import (
 )
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
 from gsx.regenerators.diffusion.pace import Pace
-from gsx.regenerators.diffusion.recipes import Batch, Recipe, recipe_of
 from gsx.regenerators.diffusion.sizes import enlarged, grown
 from gsx.regenerators.diffusion.tuning import Tuned, tuned
 
@@ -48,7 +48,7 @@ IRRELEVANT = ("download", "offload", "cache_gb", "model", "revision")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fitted:
+class PaddedImage:
     """A picture as the model takes it."""
 
     number: int
@@ -64,8 +64,8 @@ class Fitted:
 class Diffusion:
     """One pipeline, opened at the first event."""
 
-    def __init__(self, recipe: Recipe, options: DiffusionOptions) -> None:
-        self.recipe, self.options = recipe, options
+    def __init__(self, spec: ModelSpec, options: DiffusionOptions) -> None:
+        self.spec, self.options = spec, options
         self.folder: Path | None = None
         self.pipe: Any = None
         self.identity = ""
@@ -74,7 +74,7 @@ class Diffusion:
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
         """The packages and the model are there, the scales can be reached: all that can be known before training."""
         for scale in scales:
-            rounds_to(scale, self.recipe, self.options)
+            rounds_to(scale, self.spec, self.options)
         tuning = self.options.tuning.steps if isinstance(self.options, RestorerOptions) else 0
         require(self.options.name, (*PACKAGES, *(("peft",) if tuning else ())))
         if tuning and len(views) < 2:
@@ -82,7 +82,7 @@ class Diffusion:
                 f"regenerator {self.options.name} needs at least 2 training views to be tuned, there is {len(views)}: "
                 "choose regenerator/restore=sdxl_turbo_raw"
             )
-        self.folder = located(self.options, self.recipe)
+        self.folder = located(self.options, self.spec)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Open the pipeline, and tune it to the scene if it is to be; once per run.
@@ -96,19 +96,19 @@ class Diffusion:
             return {}
         begun = time.perf_counter()
         options = self.options
-        folder = self.folder or located(options, self.recipe)
-        files = fingerprint(folder, options, self.recipe)
+        folder = self.folder or located(options, self.spec)
+        files = fingerprint(folder, options, self.spec)
         dtype = number_type(options, context.device)
-        pipe = opened(folder, options, self.recipe, dtype)
+        pipe = opened(folder, options, self.spec, dtype)
         found = Tuned()
         try:
             if isinstance(options, RestorerOptions) and options.tuning.steps:
-                found = tuned(pipe, options, self.recipe, context, files)
+                found = tuned(pipe, options, self.spec, context, files)
             place(pipe, options, context.device)
         except (RuntimeError, ValueError) as error:
             raise TrainingError(
                 f"regenerator {options.name} cannot be made ready ({type(error).__name__}: {error}): if memory is "
-                f"short, set {self.recipe.where}.offload=model or a smaller dtype"
+                f"short, set {self.spec.where}.offload=model or a smaller dtype"
             ) from error
         telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
         machine = (code_stamp(), *machine_stamp(context.device), str(dtype))
@@ -121,7 +121,7 @@ class Diffusion:
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """Each picture, in order, in steps of 1/255, as it is kept; what is not finite is given back as it is."""
         images = {number: request.image.cpu().float() for number, request in enumerate(requests)}
-        rounds = [rounds_to(request.scale, self.recipe, self.options) for request in requests]
+        rounds = [rounds_to(request.scale, self.spec, self.options) for request in requests]
         for turn in range(max(rounds, default=0)):
             asked = {n: replace(r, image=images[n]) for n, r in enumerate(requests) if rounds[n] > turn}
             images |= self.redrawn(asked, turn)
@@ -129,20 +129,20 @@ class Diffusion:
 
     def redrawn(self, asked: Mapping[int, Request], turn: int) -> dict[int, Float[Tensor, "3 H W"]]:
         """Some of the pictures after one application more."""
-        recipe, progress = self.recipe, Pace(self.options.name, len(asked))
-        fitted = []
+        spec, progress = self.spec, Pace(self.options.name, len(asked))
+        padded = []
         for number, request in asked.items():
-            image, inside = grown(request.image, recipe.multiple, recipe.least)
-            photo = photograph(request, image) if recipe.reference else None
-            fitted.append(Fitted(number=number, image=image, inside=inside, request=request, reference=photo))
+            image, inside = grown(request.image, spec.multiple, spec.least)
+            photo = photograph(request, image) if spec.reference else None
+            padded.append(PaddedImage(number=number, image=image, inside=inside, request=request, reference=photo))
         out: dict[int, Tensor] = {}
-        for together in batches(fitted, self.options.batch_pixels // recipe.factor**2):
+        for together in batches(padded, self.options.batch_pixels // spec.factor**2):
             for part, result in zip(together, self.remembered(together, turn), strict=True):
-                out[part.number] = enlarged(part.inside, recipe.factor).cut(result)
+                out[part.number] = enlarged(part.inside, spec.factor).cut(result)
             progress.more(len(together))
         return out
 
-    def remembered(self, together: Sequence[Fitted], turn: int) -> list[Float[Tensor, "3 H W"]]:
+    def remembered(self, together: Sequence[PaddedImage], turn: int) -> list[Float[Tensor, "3 H W"]]:
         """Results of a batch, from the cache if it holds this batch: what is drawn may depend on the company."""
         contents = [content_of(part) for part in together]
         paths = [self.path(contents, number, turn) for number in range(len(together))]
@@ -162,16 +162,14 @@ class Diffusion:
             TrainingError: a single picture does not fit, or the pipeline fails; the run keeps its checkpoint.
         """
         try:
-            return self.of_the_right_size(
-                batch, self.recipe.call(self.pipe, batch, self.options).detach().cpu().float()
-            )
+            return self.of_the_right_size(batch, self.spec.call(self.pipe, batch, self.options).detach().cpu().float())
         except Exception as error:  # whatever a library or a custom pipeline raises, the run must end in one sentence
             if not any(words in str(error).lower() for words in MEMORY):
                 raise TrainingError(
                     f"regenerator {self.options.name} failed: {type(error).__name__}: {error}"
                 ) from error
             if len(batch) == 1:
-                where, (height, width) = self.recipe.where, batch.images.shape[2:]
+                where, (height, width) = self.spec.where, batch.images.shape[2:]
                 raise TrainingError(
                     f"regenerator {self.options.name} runs out of memory at one picture of {width} x {height} px: set "
                     f"{where}.tiling=true, {where}.offload=model or a smaller dtype, or narrow the augmenter's windows"
@@ -183,7 +181,7 @@ class Diffusion:
     def of_the_right_size(self, batch: Batch, results: Tensor) -> Float[Tensor, "B 3 H W"]:
         """The results, or ValueError if the pipeline has made something else of its pictures."""
         count, channels, height, width = batch.images.shape
-        expected = (count, channels, height * self.recipe.factor, width * self.recipe.factor)
+        expected = (count, channels, height * self.spec.factor, width * self.spec.factor)
         if tuple(results.shape) != expected:
             raise ValueError(f"its results are {tuple(results.shape)} and should be {expected}")
         return results
@@ -195,31 +193,31 @@ class Diffusion:
 
 def any_pipeline(options: PipelineOptions) -> Diffusion:
     """One that its options alone describe."""
-    return Diffusion(recipe_of(options), options)
+    return Diffusion(spec_of(options), options)
 
 
-def rounds_to(scale: int, recipe: Recipe, options: DiffusionOptions) -> int:
+def rounds_to(scale: int, spec: ModelSpec, options: DiffusionOptions) -> int:
     """How often a model is applied to reach a scale.
 
     Raises:
         ConfigError: it never gets there.
     """
-    if recipe.factor == 1:
+    if spec.factor == 1:
         refuse_enlarging(options.name, [scale])
         return 1
     rounds, reached = 0, 1
     while reached < scale:
-        rounds, reached = rounds + 1, reached * recipe.factor
+        rounds, reached = rounds + 1, reached * spec.factor
     if reached != scale:
-        ladder = ", ".join(f"x{recipe.factor**power}" for power in (1, 2, 3))
+        ladder = ", ".join(f"x{spec.factor**power}" for power in (1, 2, 3))
         raise ConfigError(f"regenerator {options.name} enlarges {ladder}, not x{scale}: change the augmenter's scales")
     return rounds
 
 
-def batches(fitted: Sequence[Fitted], pixels: int) -> list[list[Fitted]]:
+def batches(padded: Sequence[PaddedImage], pixels: int) -> list[list[PaddedImage]]:
     """Pictures of one size and strength together, so many pixels at a time, one picture at least."""
-    alike: dict[tuple[object, ...], list[Fitted]] = {}
-    for part in fitted:
+    alike: dict[tuple[object, ...], list[PaddedImage]] = {}
+    for part in padded:
         alike.setdefault((*part.image.shape, part.request.strength), []).append(part)
     out = []
     for group in alike.values():
@@ -234,7 +232,7 @@ def photograph(request: Request, image: Float[Tensor, "3 H W"]) -> Float[Tensor,
     return resize(whole, image.shape[2], image.shape[1], "bicubic").float() / 255
 
 
-def batch_of(together: Sequence[Fitted]) -> Batch:
+def batch_of(together: Sequence[PaddedImage]) -> Batch:
     """One call's worth."""
     references = [part.reference for part in together if part.reference is not None]
     return Batch(
@@ -246,7 +244,7 @@ def batch_of(together: Sequence[Fitted]) -> Batch:
     )
 
 
-def content_of(part: Fitted) -> str:
+def content_of(part: PaddedImage) -> str:
     """Of all that a picture's result depends on, but for its company."""
     request, exact = part.request, hashlib.sha256(part.image.numpy().tobytes())
     if part.reference is not None:

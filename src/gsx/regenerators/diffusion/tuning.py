@@ -27,10 +27,10 @@ from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.shapes import Float, Int
 from gsx.core.training.regenerator import RegeneratorContext
+from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, steps_for
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
 from gsx.regenerators.diffusion.pace import Pace
-from gsx.regenerators.diffusion.recipes import Batch, Recipe, steps_for
 from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 
@@ -68,7 +68,7 @@ class Pairs:
     """To measure on: the middles of views that are not learnt from."""
 
 
-def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, context: RegeneratorContext, files: str) -> Tuned:
+def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: RegeneratorContext, files: str) -> Tuned:
     """Merge the adapter of this scene into a model: the run's own, one from the cache, or a new one.
 
     It must bring held-out renders closer to their photographs than the model as it was does, and than they are.
@@ -81,7 +81,7 @@ def tuned(pipe: Any, options: RestorerOptions, recipe: Recipe, context: Regenera
         pairs = divided(context, options.tuning)
         shared = cache_folder(ADAPTERS, key_of(pairs, options, context, files))
         if not adopted(shared, own):
-            new_adapter(pipe.to(context.device), options, recipe, context, pairs, files, own)
+            new_adapter(pipe.to(context.device), options, spec, context, pairs, files, own)
             share(own, shared, options.cache_gb)
     facts = read_facts(own)
     refuse_another(facts, own, options, files)
@@ -114,7 +114,7 @@ def key_of(pairs: Pairs, options: RestorerOptions, context: RegeneratorContext, 
 def new_adapter(
     pipe: Any,
     options: RestorerOptions,
-    recipe: Recipe,
+    spec: ModelSpec,
     context: RegeneratorContext,
     pairs: Pairs,
     files: str,
@@ -122,17 +122,17 @@ def new_adapter(
 ) -> None:
     """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder."""
     others = pairs.others
-    figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, recipe, others)}
+    figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, spec, others)}
     begun = time.perf_counter()
     try:
-        whole = learn(pipe, options, recipe, pairs.own, context.seed)
+        whole = learn(pipe, options, spec, pairs.own, context.seed)
     except (RuntimeError, ValueError) as error:
         raise TrainingError(
             f"regenerator {options.name} cannot be tuned ({type(error).__name__}: {error}): lower "
             "regenerator.restore.tuning.batch or .crop, set .checkpointing=true, or choose sdxl_turbo_raw"
         ) from error
     figures["seconds"] = time.perf_counter() - begun
-    figures["error_tuned"] = error_of(pipe, options, recipe, others)
+    figures["error_tuned"] = error_of(pipe, options, spec, others)
     weights = adapter_bytes(pipe)
     pipe.unet.delete_adapters("default")
     best = closest(figures)
@@ -188,30 +188,30 @@ def middle(pair: Pair, crop: int) -> Pair:
 
 
 @torch.no_grad()
-def error_of(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[Pair]) -> float:
+def error_of(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair]) -> float:
     """Mean squared error of restored renders."""
     numbered = enumerate(pairs)
-    return mean_square((restored(pipe, options, recipe, render, n), photo) for n, (render, photo) in numbered)
+    return mean_square((restored(pipe, options, spec, render, n), photo) for n, (render, photo) in numbered)
 
 
 def restored(
-    pipe: Any, options: RestorerOptions, recipe: Recipe, render: Float[Tensor, "3 h w"], seed: int
+    pipe: Any, options: RestorerOptions, spec: ModelSpec, render: Float[Tensor, "3 h w"], seed: int
 ) -> Float[Tensor, "3 h w"]:
     """A render after the call that the run makes, half-way between its strengths."""
-    image, inside = grown(render, recipe.multiple, recipe.least)
+    image, inside = grown(render, spec.multiple, spec.least)
     strength = sum(options.tuning.strengths) / 2
     batch = Batch(images=image[None], prompts=[options.tuning.prompt], seeds=[seed], strength=strength)
-    return inside.cut(recipe.call(pipe, batch, options)[0].cpu().float().clamp(0, 1))
+    return inside.cut(spec.call(pipe, batch, options)[0].cpu().float().clamp(0, 1))
 
 
 def cropped(
-    pairs: Sequence[Pair], options: TuningOptions, recipe: Recipe, generator: torch.Generator
+    pairs: Sequence[Pair], options: TuningOptions, spec: ModelSpec, generator: torch.Generator
 ) -> tuple[Float[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"]]:
     """Crops at the same places of renders and photographs, mirrored at random, of sides that the model takes."""
     height, width = (min(options.crop, *(pair[0].shape[axis] for pair in pairs)) for axis in (1, 2))
     parts = [random_part(pairs, (height, width), generator) for _ in range(options.crops)]
     renders, photos = (
-        torch.stack([grown(image, recipe.multiple, recipe.least)[0] for image in images])
+        torch.stack([grown(image, spec.multiple, spec.least)[0] for image in images])
         for images in zip(*parts, strict=True)
     )
     return renders, photos
@@ -220,13 +220,13 @@ def cropped(
 # -- learning ----------------------------------------------------------------------------------------------------------
 
 
-def learn(pipe: Any, options: RestorerOptions, recipe: Recipe, pairs: Sequence[Pair], seed: int) -> bool:
+def learn(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair], seed: int) -> bool:
     """Give the model an adapter and train it; whether all steps were taken."""
     generator, tuning = torch.Generator().manual_seed(seed), options.tuning
     adapted = add_adapter(pipe, tuning, seed)
     optimiser = torch.optim.AdamW(adapted, lr=tuning.rate, weight_decay=WEIGHT_DECAY)
     rates = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: rate_at(step, tuning))
-    crops = cropped(pairs, tuning, recipe, generator)
+    crops = cropped(pairs, tuning, spec, generator)
     conditions = conditions_of(pipe, tuning.prompt, crops[0].shape[2:])
     renders, photos = (encoded(pipe, images) for images in crops)
     least, greatest = noise_steps(pipe, options)

@@ -9,13 +9,13 @@ from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
+from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4
 from gsx.regenerators.diffusion.options import UpscalerOptions
-from gsx.regenerators.diffusion.recipes import SD_X2_LATENT, SD_X4
 from gsx.regenerators.diffusion.redraw import Diffusion
 
 
 @dataclass(frozen=True, kw_only=True)
-class LadderOptions:
+class CascadeOptions:
     """Options; values in conf/regenerator/upscale/sd_by_scale.yaml."""
 
     name: str
@@ -35,10 +35,10 @@ def rungs(scale: int) -> list[int]:
     return [4] * (power // 2) + [2] * (power % 2)
 
 
-class Ladder:
+class Cascade:
     """Two upscalers; only those that the scales need are looked for and loaded."""
 
-    def __init__(self, options: LadderOptions) -> None:
+    def __init__(self, options: CascadeOptions) -> None:
         self.models = {
             2: Diffusion(replace(SD_X2_LATENT, part="x2"), options.x2),
             4: Diffusion(replace(SD_X4, part="x4"), options.x4),

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from gsx.augmenters.pseudo_details import WEIGHT_MAPS
-from gsx.augmenters.trust import (
+from gsx.augmenters.pixel_weights import (
     agreeing,
     best_densities,
     blended,
@@ -14,6 +13,7 @@ from gsx.augmenters.trust import (
     sampling_ratios,
     seen_alike,
 )
+from gsx.augmenters.pseudo_details import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.gaussians.splats import Splats

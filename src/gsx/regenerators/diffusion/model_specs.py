@@ -46,7 +46,7 @@ class Batch:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recipe:
+class ModelSpec:
     """A model and its pipeline."""
 
     hub: str
@@ -127,9 +127,9 @@ def redraw(pipe: Any, batch: Batch, options: PipelineOptions) -> Tensor:
     return pictures_of(pipe, batch, options.steps, options.guidance, **more)
 
 
-def recipe_of(options: PipelineOptions) -> Recipe:
+def spec_of(options: PipelineOptions) -> ModelSpec:
     """What the options say of a pipeline."""
-    return Recipe(
+    return ModelSpec(
         hub=options.model,
         gigabytes=0,
         loader="DiffusionPipeline",
@@ -146,7 +146,7 @@ def recipe_of(options: PipelineOptions) -> Recipe:
     )
 
 
-SD_X2_LATENT = Recipe(
+SD_X2_LATENT = ModelSpec(
     hub="stabilityai/sd-x2-latent-upscaler",
     gigabytes=2.3,
     loader="StableDiffusionLatentUpscalePipeline",
@@ -158,7 +158,7 @@ SD_X2_LATENT = Recipe(
     least=64,
     call=upscale_latents,
 )
-SD_X4 = Recipe(
+SD_X4 = ModelSpec(
     hub="stabilityai/stable-diffusion-x4-upscaler",
     gigabytes=3.5,
     loader="StableDiffusionUpscalePipeline",
@@ -171,7 +171,7 @@ SD_X4 = Recipe(
     call=upscale_pixels,
     replaced={"safety_checker": None, "feature_extractor": None, "watermarker": None},
 )
-SDXL_TURBO = Recipe(
+SDXL_TURBO = ModelSpec(
     hub="stabilityai/sdxl-turbo",
     gigabytes=6.9,
     loader="StableDiffusionXLImg2ImgPipeline",
