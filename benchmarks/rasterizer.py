@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from gsx.core.errors import GsxError, InputError, nearest
-from gsx.experiments.runs.session import choose_device
+from gsx.experiments.runs.build import choose_device
 from measuring import adapter
 from measuring.bench import Bench, say
 from measuring.ceiling import limits_section

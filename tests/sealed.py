@@ -13,7 +13,9 @@ from gsx.cli import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import ImageSource, Scene, View
 from gsx.core.training.run import Run
-from gsx.experiments.runs import session
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import start
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,12 @@ def sealed(scene: Scene) -> Scene:
 
 def trained_sealed(folder: Path, words: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """A tiny run, all of it but the evaluation at its end."""
-    load, evaluated = session.load_scene, list[Run]()
-    monkeypatch.setattr(session, "load_scene", lambda settings: sealed(load(settings)))
-    monkeypatch.setattr(session, "finish", lambda run, settings, plugins: evaluated.append(run))
+    evaluated = list[Run]()
+    runs = "gsx.experiments.runs"
+    monkeypatch.setattr(f"{runs}.open.load_scene", lambda settings: sealed(load_scene(settings)))
+    monkeypatch.setattr(f"{runs}.execute.finish", lambda run, settings, plugins: evaluated.append(run))
     settings, loaded = tiny_settings(folder, *words, "training.test_points=0"), plugins()
-    session.execute(session.start(settings, loaded), settings, loaded)
+    execute(start(settings, loaded), settings, loaded)
     (run,) = evaluated
     with pytest.raises(AssertionError, match="held-out picture"):
         run.scene.test[0].image()

@@ -46,7 +46,7 @@ def test_a_short_run_learns_the_scene_and_zoom_truth_is_finer(tmp_path: Path) ->
 def test_real_captures_load(name: str, train: int, test: int) -> None:
     from gsx.cli import plugins
     from gsx.experiments.runs.config import compose
-    from gsx.experiments.runs.session import load_scene
+    from gsx.experiments.runs.load_scene import load_scene
 
     scene = load_scene(compose(["scene=colmap", f"scene.path={real(name)}", "scene.downscale=4"], plugins()))
     assert (len(scene.train), len(scene.test)) == (train, test)

@@ -7,7 +7,8 @@ from gsx.cli import plugins
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import Settings, compose
-from gsx.experiments.runs.session import execute, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import start
 
 OVERRIDES = (
     "scene.width=48",

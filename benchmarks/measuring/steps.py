@@ -9,8 +9,10 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import take_step
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import build, load_scene, open_run
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import open_run
 from measuring.adapter import settings_of
 from measuring.bench import Bench, Row, section
 from measuring.results import Section

@@ -339,7 +339,7 @@ def sweep_job(config: Any) -> int:
 
 def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
     """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which."""
-    from gsx.experiments.runs.session import start
+    from gsx.experiments.runs.open import start
 
     if settings.general.reuse:
         return reused(settings, loaded, [] if folders is None else folders)
@@ -352,7 +352,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
     from gsx.core.run_folder.run_key import claimed, place_of, scene_stamp
-    from gsx.experiments.runs.session import resume_or_start
+    from gsx.experiments.runs.open import resume_or_start
 
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
@@ -371,7 +371,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     """Train to the end or to Ctrl-C, and say where things are."""
-    from gsx.experiments.runs.session import execute
+    from gsx.experiments.runs.execute import execute
 
     try:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
@@ -407,7 +407,7 @@ def verb_resume(words: list[str]) -> int:
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
     folder, overrides = run_words("resume", words, told)
     from gsx.experiments.runs.config import write_config
-    from gsx.experiments.runs.session import open_run
+    from gsx.experiments.runs.open import open_run
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides, training=True)
@@ -425,7 +425,9 @@ def verb_eval(words: list[str]) -> int:
     folder, overrides = run_words("eval", words, told)
     from gsx.core.rasterizer.prepare import warm
     from gsx.experiments.reports.report import write_report
-    from gsx.experiments.runs.session import as_trained, evaluate, finish, open_run
+    from gsx.experiments.runs.evaluate import evaluate
+    from gsx.experiments.runs.execute import finish
+    from gsx.experiments.runs.open import as_trained, open_run
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)
@@ -452,7 +454,8 @@ def verb_render(words: list[str]) -> int:
     given = parser.parse_args(words)
     if given.zoom <= 0 or given.frames < 1:
         raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
-    from gsx.experiments.runs.session import open_run, render_orbit, render_test_views
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.render import render_orbit, render_test_views
 
     run, settings = open_run(given.run, plugins())
     if given.orbit:
@@ -473,7 +476,9 @@ def verb_export(words: list[str]) -> int:
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     given = parser.parse_args(words)
     from gsx.core.gaussians.splat_files import refuse_suffix
-    from gsx.experiments.runs.session import export, open_run, reimport_psnr, view_named
+    from gsx.experiments.runs.export import export, reimport_psnr
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.render import view_named
 
     if given.file:
         refuse_suffix(given.file)

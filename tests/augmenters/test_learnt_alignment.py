@@ -17,7 +17,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import start
+from gsx.experiments.runs.open import start
 
 CONTROL = (
     "scene.width=64",

@@ -26,7 +26,8 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 
 PLAIN = ("regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager")
 

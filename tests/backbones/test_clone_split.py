@@ -34,7 +34,8 @@ from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import within_room
 from gsx.experiments.runs.config import compose, read_config, write_config
-from gsx.experiments.runs.session import execute, open_run
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
 
 WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
 CONTROL = LevelDensityOptions(update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, volume_weight=0.01)

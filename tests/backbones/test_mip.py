@@ -33,8 +33,12 @@ from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, ras
 from gsx.core.training.density import Statistics
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import build, execute, export, load_scene, open_run
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.export import export
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import open_run
 
 OPTIONS = MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=29900)
 UNIT = math.sqrt(0.2)

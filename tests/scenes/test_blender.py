@@ -18,7 +18,8 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.gaussians.ply import write_ply
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 from gsx.scenes.blender import BlenderOptions, box_averaged, load
 
 FOV = 2 * math.atan(0.5)  # the focal length is the width

@@ -14,7 +14,8 @@ from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
 from gsx.experiments.reports.overview import flattened
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, parameters, portions
 

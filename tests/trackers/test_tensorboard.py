@@ -13,7 +13,8 @@ from gsx.cli import plugins
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.tensorboard import events_folder
 

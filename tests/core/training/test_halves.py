@@ -20,7 +20,8 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.halves import held_out_renders
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import take_step
-from gsx.experiments.runs.session import execute, open_run
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
 
 TRAINING = TrainingOptions(
     ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=9, checkpoints_kept=1, test_points=0

@@ -20,7 +20,8 @@ from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import backward, take_step
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 
 PLAIN = ("iterations=40", "rasterizer=eager")
 

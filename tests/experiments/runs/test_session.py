@@ -13,7 +13,9 @@ from tiny import tiny_run, tiny_settings
 from gsx.cli import main, plugins
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians
-from gsx.experiments.runs.session import execute, open_run, remedies, start
+from gsx.experiments.runs.evaluate import remedies
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 
 
 def final_tensors(folder: Path) -> dict[str, torch.Tensor]:

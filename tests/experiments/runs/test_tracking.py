@@ -23,7 +23,8 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.baselines import key_of
 from gsx.experiments.reports.overview import flattened
 from gsx.experiments.runs.config import compose, read_config, write_config
-from gsx.experiments.runs.session import execute, open_run, start
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.tracking import Tracking, build_trackers
 from gsx.experiments.runs.warm_start import trunk_folder
 from gsx.trackers.figures import evaluation_figures, line_figures
@@ -259,7 +260,7 @@ def test_a_missing_package_is_refused_before_anything_is_done(
     tracker: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)  # an import of it fails
-    monkeypatch.setattr("gsx.experiments.runs.session.load_scene", lambda settings: pytest.fail("the scene was loaded"))
+    monkeypatch.setattr("gsx.experiments.runs.open.load_scene", lambda settings: pytest.fail("the scene was loaded"))
     settings = tiny_settings(tmp_path / "run", f"tracker=[{tracker}]")
     with pytest.raises(ConfigError, match=rf"tracker {tracker} needs {package} .*pip install 'gsx\[{tracker}\]'"):
         start(settings, plugins())

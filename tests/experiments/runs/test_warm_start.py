@@ -10,7 +10,8 @@ from tiny import tiny_run
 from torch import Tensor
 
 from gsx.cli import plugins
-from gsx.experiments.runs.session import execute, open_run
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.warm_start import trunk_folder
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",

@@ -12,7 +12,7 @@ from gsx.core.run_folder.run_key import composition_key
 from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run
 from gsx.experiments.runs.config import Compositions, Settings
-from gsx.experiments.runs.session import start
+from gsx.experiments.runs.open import start
 
 UP = "augmenter.upscale."
 BOOT = "augmenter.bootstrap."

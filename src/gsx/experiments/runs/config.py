@@ -55,7 +55,7 @@ class GeneralOptions:
     reuse: bool = False
     """The run's folder is named by its composition; what is finished there is not trained again (`core.identity`)."""
     init: str = "scratch"
-    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`core.trunk`)."""
+    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
     trunk_at: list[int] = field(default_factory=list)
     """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
     trunk_gb: float = 10.0

@@ -2,7 +2,7 @@
 
 Runs of one scene, backbone and seed that differ in their augmenters alone are identical until the first of them makes
 pseudo views. One of each such group, the one that goes on longest without (the control, where there is one), is trained
-first and leaves its state wherever another of them sets out; the others branch from there (`core.trunk`).
+first and leaves its state wherever another of them sets out; the others branch from there (`runs.warm_start`).
 """
 
 from collections.abc import Callable, Iterator, Sequence

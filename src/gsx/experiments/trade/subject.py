@@ -19,8 +19,10 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.render import splats_for
+from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.config import compose
-from gsx.experiments.runs.session import choose_device, load_scene, open_run
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import open_run
 
 FILE_SIZE = (640, 480)
 """Raster of the views of a splat file, px."""

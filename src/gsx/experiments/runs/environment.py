@@ -1,0 +1,82 @@
+"""What a run is trained on and with: environment.json, and the first lines of the log."""
+
+import logging
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx import __version__
+from gsx.core.cache import source_revision
+from gsx.core.device import device_name
+from gsx.core.plugins import Plugins
+from gsx.core.rasterizer.prepare import path_of
+from gsx.core.run_folder.run_key import (
+    scene_stamp,
+)
+from gsx.core.training.run import Run
+from gsx.experiments.runs.build import plan_of
+
+logger = logging.getLogger(__name__)
+PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
+
+
+def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
+    """Machine, versions and the rescaled schedule, for environment.json."""
+    return {
+        "gsx": __version__,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "rasterizer": path_of(run.raster, run.device),
+        "source": source_revision(),
+        "device": device_name(run.device),
+        "processes": run.ranks.size,
+        "packages": {name: installed_version(name) for name in PACKAGES},
+        "plugins": plugins.versions,
+        "plan": plan_of(run),
+        "scene": {
+            "stamp": scene_stamp(run.config),
+            "train_views": len(run.scene.train),
+            "test_views": len(run.scene.test),
+            "points": len(run.scene.points),
+            "extent": run.scene.extent,
+            "notes": list(run.scene.notes),
+        },
+    }
+
+
+def installed_version(package: str) -> str:
+    """Version of an installed distribution."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def announce(run: Run, plugins: Plugins) -> None:
+    """Say what is about to be trained, and by which schedule."""
+    scene = run.scene
+    (width, height), points = scene.train[0].camera.size, f"{len(scene.points):,}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height} px"
+    logger.info("scene %s: %s, %s points, extent %.3g", scene.name, views, points, scene.extent)
+    for note in scene.notes:
+        logger.info("note: %s", note)
+    for failure in plugins.failures:
+        logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
+    for name, part in plan_of(run).items():
+        logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in part.items()))
+    logger.info(
+        "seed %s, %d threads, %s; run folder %s", run.config["seed"], torch.get_num_threads(), run.device, run.folder
+    )
+
+
+def in_words(value: float | list[float]) -> str:
+    """A number of the plan, or several."""
+    return " ".join(f"{v:.6g}" for v in value) or "none" if isinstance(value, list) else f"{value:.6g}"

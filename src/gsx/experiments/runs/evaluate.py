@@ -1,0 +1,83 @@
+"""evaluation.json and the pictures of a run, and what they say in words."""
+
+import logging
+import time
+from typing import Any
+
+from gsx.core.evaluation.evaluator import Evaluator
+from gsx.core.files import write_json
+from gsx.core.run_folder.files import read_run
+from gsx.core.run_folder.run_key import (
+    judging,
+)
+from gsx.core.training.remarks import remarks_of
+from gsx.core.training.run import Run
+from gsx.experiments.reports.pictures import Pictures
+from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.progress import Countdown
+from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
+
+logger = logging.getLogger(__name__)
+
+
+def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
+    """Write evaluation.json and the pictures of a run."""
+    options, begun = settings.evaluation, time.perf_counter()
+    logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
+    evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
+    evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
+    pictures.write_index()
+    write_pseudo_pictures(run, options)
+    evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "judged": judging(settings.resolved)}
+    tell_of_paths(read_run(run.folder).evaluation, evaluation)
+    write_json(run.folder / "evaluation.json", evaluation)
+    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
+        logger.info("%s", line)
+    return evaluation
+
+
+def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Say so if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
+    path = before.get("render_path")
+    if path and path != now["render_path"]:
+        logger.warning(
+            "renders/s are now by the %s path; the evaluation before had %.1f by the %s path, which are not comparable",
+            now["render_path"], before["render_fps"], path,
+        )  # fmt: skip
+
+
+def summary(evaluation: dict[str, Any]) -> list[str]:
+    """The result in a few lines."""
+    e, path = evaluation, evaluation["render_path"]
+    lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
+    lines = [
+        f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}",
+        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s ({path}), "
+        f"{e['train_seconds']:.0f} s of training, {e['evaluate_seconds']:.0f} s of evaluation, "
+        f"peak memory {memory}",
+    ]
+    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()] + remarks_of(e)
+
+
+def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
+    """What to try where a render zoomed in loses to the enlarged one, and is not yet compensated for dilation."""
+    lost = [
+        factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
+    ]
+    if not lost or not remedy or run.raster.compensate:
+        return []
+    return [f"a model that is filtered for zooming in: the same command with {remedy}"]
+
+
+def zoom_line(factor: str, result: dict[str, Any]) -> str:
+    """One zoom figure with its verdict."""
+    if "unavailable" in result:
+        return f"zoom x{factor}: n/a, {result['unavailable']}"
+    if factor == "1":
+        return f"zoom x1: {result['psnr']:.2f} dB"
+    resized = "enlarged" if float(factor) > 1 else "reduced"
+    verdict = "wins against" if result["beats_enlarged"] else "loses to"
+    return (
+        f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the {resized} x1 render ({result['enlarged_psnr']:.2f} dB)"
+    )

@@ -1,0 +1,107 @@
+"""Train from the current step on, evaluate, export, report."""
+
+from typing import Any
+
+from gsx.core.errors import Disagreement, TrainingError
+from gsx.core.files import write_json
+from gsx.core.plugins import Plugins, hookimpl
+from gsx.core.rasterizer.prepare import warm
+from gsx.core.run_folder import checkpoint
+from gsx.core.training.guard import Agreement, Guard
+from gsx.core.training.remarks import CapNotice
+from gsx.core.training.run import Run, Step
+from gsx.core.training.trainer import train
+from gsx.experiments.reports.report import write_report
+from gsx.experiments.runs import warm_start
+from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.environment import announce
+from gsx.experiments.runs.evaluate import evaluate
+from gsx.experiments.runs.export import export
+from gsx.experiments.runs.open import say_what_changed
+from gsx.experiments.runs.progress import MetricsLog, Progress
+from gsx.experiments.runs.tracking import build_trackers, telling_of_failure
+
+
+class Checkpointer:
+    """Listener: saves every `training.checkpoint_every` steps and when training ends, complete or not."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """Save when due."""
+        if run.step % run.training.checkpoint_every == 0 and not run.complete:
+            checkpoint.save(run)
+
+    @hookimpl
+    def gsx_training_finished(self, run: Run) -> None:
+        """Save the last state."""
+        checkpoint.save(run)
+
+
+def status(run: Run, state: str, reason: str = "") -> None:
+    """Record how the run stands, for reports over many runs."""
+    write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
+
+
+def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
+    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint.
+
+    All ranks but the first only train.
+    """
+    if not run.ranks.first:
+        follow(run, plugins)
+        return
+    trackers = build_trackers(settings.trackers)
+    if not run.complete:
+        say_what_changed(run)
+    announce(run, plugins)
+    warm(run.raster, run.device)
+    status(run, "running")
+    log = MetricsLog(settings.evaluation)
+    listeners: list[object] = [
+        Guard(),
+        Agreement(),
+        CapNotice(),
+        log,
+        *trackers,
+        Checkpointer(),
+        Progress(),
+    ]  # trackers read the log
+    if run.trunk is not None:
+        general = settings.general
+        listeners.append(warm_start.TrunkKeeper(run.trunk, general.trunk_gb * 1e9, general.trunk_at))
+    try:
+        with plugins.listening(listeners), telling_of_failure(run, plugins):
+            train(run, plugins)
+            if run.complete:
+                finish(run, settings, plugins)
+    except TrainingError as error:
+        if not isinstance(error, Disagreement):
+            checkpoint.save(run)
+        status(run, "failed", str(error))
+        raise
+    except BaseException as error:
+        status(run, "failed", f"{type(error).__name__}: {error}")
+        raise
+    finally:
+        log.close()
+    if not run.complete:
+        status(run, "interrupted")
+        write_report(run.folder)
+
+
+def follow(run: Run, plugins: Plugins) -> None:
+    """Train as another process does, and write nothing."""
+    warm(run.raster, run.device)
+    with plugins.listening([Guard(), Agreement()]):
+        train(run, plugins)
+
+
+def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
+    """Evaluate, export, draw and report a trained run."""
+    evaluation = evaluate(run, settings)
+    plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
+    write_report(run.folder)
+    export(run, run.folder / "point_cloud.ply")
+    status(run, "ok")
+    plugins.emit.gsx_run_finished(run=run)
+    return evaluation

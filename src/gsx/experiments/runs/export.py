@@ -1,0 +1,52 @@
+"""Splat files of a run."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsx import __version__
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.quality.metrics import psnr
+from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.load_scene import unit_of
+
+
+def export(run: Run, path: Path, camera: Camera | None = None) -> None:
+    """Write the backbone's splat file, or what it draws for one camera as a standard one.
+
+    The comments hold the conventions that a viewer must know.
+    """
+    comments = [
+        f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
+        f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
+        *run.backbone.export_notes(),
+        *([f"SplatRenderMode: {render_mode(run.raster)}"] if camera is not None or run.backbone.standard_file else []),
+        "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
+    ]
+    if camera is None:
+        write_columns(path, run.backbone.file(), comments)
+    else:
+        write_gaussians(path, run.backbone.explicit(camera, run.model_step), comments)
+
+
+def render_mode(raster: RasterSettings) -> str:
+    """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
+
+    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads (spec B6 of splat formats).
+    """
+    return "mip" if raster.compensate else "default"
+
+
+def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View]) -> str:
+    """PSNR between the model and its exported standard file, both rendered from up to five views."""
+    gaussians, pixels = read_gaussians(path), settings.evaluation.tile_pixels
+    figures = []
+    for view in views[:5]:
+        splats = splats_of(gaussians, view.camera.centre)
+        again = rasterize_tiled(splats, view.camera, run.raster, background=run.background.cpu(), pixels=pixels)
+        figures.append(psnr(again.image.clamp(0, 1), render(run, view.camera, pixels).image))
+    return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical)"

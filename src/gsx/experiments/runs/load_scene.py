@@ -1,0 +1,93 @@
+"""A scene as a run needs it: in units that constants expect, with views to evaluate on."""
+
+import math
+from dataclasses import replace
+
+from gsx.core.data.camera import offsets_from
+from gsx.core.data.scene import Scene, View
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.training.run import Run
+from gsx.experiments.runs.config import Settings
+
+HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
+"""If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""
+
+
+def load_scene(settings: Settings) -> Scene:
+    """The scene, with views to evaluate on.
+
+    Raises:
+        InputError: it cannot be loaded, the split leaves no test views, or cameras and points are all in one place.
+    """
+    loaded = settings.scene.component.factory(settings.scene.options)
+    scene = warned_of_units(measured(in_units(loaded, getattr(settings.scene.options, "unit", 1.0))))
+    if not scene.test:
+        raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
+    if not scene.extent > 0:
+        raise InputError(
+            f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
+            "elsewhere, which gives no depth and no scale: use photos from different places"
+        )
+    return scene
+
+
+def in_units(scene: Scene, unit: float) -> Scene:
+    """The scene with positions of cameras and points multiplied by `unit`.
+
+    Raises:
+        ConfigError: `unit` is not a positive number.
+    """
+    if not 0 < unit < math.inf:
+        raise ConfigError(f"scene.unit is {unit}; give a positive number")
+    if unit == 1:
+        return scene
+    return replace(
+        scene,
+        train=[rescaled(view, unit) for view in scene.train],
+        test=[rescaled(view, unit) for view in scene.test],
+        points=replace(scene.points, positions=scene.points.positions * unit),
+        extent=scene.extent * unit,
+        notes=[*scene.notes, f"positions are multiplied by scene.unit={unit:g}"],
+    )
+
+
+def rescaled(view: View, unit: float) -> View:
+    """The view with its camera's position multiplied by `unit`."""
+    return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
+
+
+def measured(scene: Scene) -> Scene:
+    """The scene; one whose training cameras stand in one place takes its extent from the points' median distance."""
+    if scene.extent > 0 or len(scene.points) == 0:
+        return scene
+    distance = offsets_from(scene.points.positions, scene.train[0].camera.centre).norm(dim=1)
+    extent = 1.1 * float(distance.median())
+    note = f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance"
+    return replace(scene, extent=extent, notes=[*scene.notes, note])
+
+
+def hidden_share(scene: Scene) -> float:
+    """Share of the points in front of training cameras that their near planes hide."""
+    front = hidden = 0
+    for view in scene.train:
+        depth = view.camera.project(scene.points.positions)[1]
+        front += int((depth > 0).sum())
+        hidden += int(((depth > 0) & (depth <= view.camera.near)).sum())
+    return hidden / max(1, front)
+
+
+def warned_of_units(scene: Scene) -> Scene:
+    """The scene, with a note if its units are far from those that published constants expect."""
+    share = hidden_share(scene)
+    if share <= HIDDEN_SHARE and scene.extent <= LARGEST_EXTENT:
+        return scene
+    odd = f"the extent is {scene.extent:.3g} scene units, and near planes hide {share:.0%} of the points before cameras"
+    better = 10.0 ** -math.floor(math.log10(scene.extent)) if scene.extent > 0 else 1.0
+    return replace(
+        scene, notes=[*scene.notes, f"{odd}: published constants expect a few units, try scene.unit={better:g}"]
+    )
+
+
+def unit_of(run: Run) -> float:
+    """What the scene's positions were multiplied by."""
+    return float(run.config["scene"].get("unit", 1.0))

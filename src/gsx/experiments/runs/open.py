@@ -1,0 +1,200 @@
+"""A run's folder: made for a new run, opened again, gone on with."""
+
+import logging
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from gsx.core.cache import source_revision
+from gsx.core.data.scene import Scene
+from gsx.core.errors import CheckpointError, ConfigError, InputError
+from gsx.core.files import write_json
+from gsx.core.plugins import Plugins
+from gsx.core.quality.lpips import load_lpips
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.run_folder import checkpoint
+from gsx.core.run_folder.files import RunFiles, read_run
+from gsx.core.run_folder.run_key import (
+    composition_key,
+    finished,
+    other_revision,
+    place_of,
+    scene_stamp,
+    trained_on,
+)
+from gsx.core.training.distributed import ranks_here, refuse_uneven
+from gsx.core.training.run import Run
+from gsx.experiments.runs import warm_start
+from gsx.experiments.runs.build import build, choose_device
+from gsx.experiments.runs.config import Settings, read_config, write_config
+from gsx.experiments.runs.environment import environment
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.tracking import build_trackers
+
+logger = logging.getLogger(__name__)
+
+
+def refuse_used(folder: str) -> None:
+    """Raise InputError if the run folder asked for exists and holds something."""
+    if folder and Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
+        raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
+
+
+def new_folder(settings: Settings, scene: Scene) -> Path:
+    """A fresh run folder.
+
+    Raises:
+        InputError: no free name was found.
+    """
+    if settings.general.folder:
+        folder = Path(settings.general.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    parent = Path(settings.general.output) / scene.name / settings.backbone.component.name
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    for suffix in ("", *(f"_{n}" for n in range(2, 1000))):
+        try:
+            (parent / (stamp + suffix)).mkdir(parents=True)
+            return parent / (stamp + suffix)
+        except FileExistsError:  # another run began in the same second
+            continue
+    raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
+
+
+def start(settings: Settings, plugins: Plugins) -> Run:
+    """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
+
+    Of several processes the first does what concerns the folder.
+
+    Raises:
+        ConfigError, InputError: something is wrong; no folder was made.
+    """
+    ranks = ranks_here()
+    if settings.general.iterations < 1:
+        raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
+    choose_device(settings.general.device)
+    ranks.broadcast(lambda: refuse_used(settings.general.folder))
+    refuse_uneven(settings.training.batch, ranks)
+    load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
+    build_trackers(settings.trackers)  # the same: a missing package
+    run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
+    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins))
+    if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of a trunk
+        checkpoint.restore(run)
+    return run
+
+
+def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
+    """The folder of a new run, with what is known before its first step; `init=trunk`: at a state it branches from."""
+    run.folder = new_folder(settings, run.scene)
+    try:
+        write_config(run.folder / "config.yaml", settings.resolved)
+        write_json(run.folder / "environment.json", environment(run, plugins))
+        if settings.general.init == "trunk":
+            run.trunk = warm_start.trunk_folder(run, plugins.versions)
+            warm_start.adopt(run, run.trunk)
+            run.curves = read_curves(run.folder)
+    except OSError:
+        shutil.rmtree(run.folder, ignore_errors=True)
+        raise
+    return run.folder
+
+
+def open_run(
+    folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False
+) -> tuple[Run, Settings]:
+    """A run as its newest checkpoint left it; `training`: it is about to go on.
+
+    Raises:
+        InputError: the folder is no run.
+        CheckpointError: there is no usable checkpoint.
+    """
+    if not (folder / "config.yaml").is_file():
+        raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
+    settings = read_config(folder / "config.yaml", plugins, overrides)
+    return restored(settings, folder, training), settings
+
+
+def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
+    """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
+    run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
+    checkpoint.restore(run)
+    run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
+    return run
+
+
+def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[Path, Run | None]:
+    """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
+
+    `stamp`: of its scene.
+
+    What was finished is not done again, what was interrupted goes on where it stopped, and what was judged otherwise is
+    judged anew. To be called with the folder `claimed`.
+
+    Raises:
+        ConfigError, InputError: something is wrong; no folder was made.
+    """
+    folder = place_of(settings.resolved, stamp)
+    files = read_run(folder)
+    if finished(files, settings.resolved, stamp):
+        logger.info("finished earlier%s: %s", by_another(files), folder)
+        return folder, None
+    at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
+    try:
+        if not checkpoint.sidecars(folder / "checkpoints"):
+            raise CheckpointError(f"{folder} holds no checkpoint")
+        if composition_key(files.config, trained_on(files)) != folder.name:
+            raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
+        run = restored(settings, folder, training=True)
+    except CheckpointError as error:
+        set_aside(folder, str(error))
+        return folder, start(at_hand, plugins)
+    logger.info("going on with %s at step %d", folder, run.step)
+    write_config(folder / "config.yaml", settings.resolved)
+    if settings.general.init == "trunk":
+        run.trunk = warm_start.trunk_folder(run, plugins.versions)
+    return folder, run
+
+
+def by_another(files: RunFiles) -> str:
+    """Words for what another revision of the source has trained; none for what this one has."""
+    revision = other_revision(files, this := source_revision())
+    return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
+
+
+def say_what_changed(run: Run) -> None:
+    """Warn of a run that goes on with other files or another revision of the source than it began with.
+
+    environment.json then names this revision, too.
+    """
+    files = read_run(run.folder)
+    if trained_on(files) not in ("", scene_stamp(run.config)):
+        logger.warning("files of scene %s are not those that the run began with", run.scene.name)
+    revisions = str(files.environment.get("source", "")).split("+")
+    if files.environment and revisions[-1] != source_revision():
+        logger.warning("the run was begun%s", by_another(files))
+        write_json(
+            run.folder / "environment.json", files.environment | {"source": "+".join([*revisions, source_revision()])}
+        )
+
+
+def set_aside(folder: Path, reason: str) -> None:
+    """Make room for a run in a folder without a checkpoint that it could use; what has results is kept beside it."""
+    if not folder.exists():
+        return
+    results = [folder / "evaluation.json", folder / "point_cloud.ply", *checkpoint.sidecars(folder / "checkpoints")]
+    if not any(path.exists() for path in results):
+        shutil.rmtree(folder)
+        return
+    kept = next(p for n in range(1, 1000) if not (p := folder.parent / f".{folder.name}_set_aside_{n}").exists())
+    folder.rename(kept)
+    logger.warning("%s; kept as %s, training anew", reason, kept)
+
+
+def as_trained(run: Run) -> RasterSettings:
+    """The rules a run is drawn by, with path=auto as its training decided it, so that times are those of one path."""
+    path = read_run(run.folder).environment.get("rasterizer")
+    return replace(run.raster, path=path) if run.raster.path == "auto" and path == "compiled" else run.raster
