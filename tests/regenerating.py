@@ -15,7 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.regenerator import Checks, RegeneratorContext, Request
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import typed
+from gsx.experiments.runs.settings import typed
 
 EDGE = 48
 

@@ -12,7 +12,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import BackboneContext
-from gsx.experiments.runs.config import typed
+from gsx.experiments.runs.settings import typed
 
 
 class Grey:

@@ -361,7 +361,7 @@ def test_an_unwritable_output_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
 
 def test_points_that_are_not_numbers_are_dropped_and_counted(tmp_path: Path) -> None:
     from gsx.cli import plugins
-    from gsx.experiments.runs.config import compose
+    from gsx.experiments.runs.compose import compose
     from gsx.experiments.runs.load_scene import load_scene
 
     path = synthetic(tmp_path / "s") / "sparse" / "0" / "points3D.bin"

@@ -33,7 +33,7 @@ def test_source_files_named_in_backticks_exist(page: Path) -> None:
 
 def test_commands_of_the_readme_are_accepted() -> None:
     from gsx.cli import VERBS, plugins
-    from gsx.experiments.runs.config import compose
+    from gsx.experiments.runs.compose import compose
 
     text = (ROOT / "README.md").read_text()
     blocks = re.findall(r"```sh\n(.*?)```", text, re.S)

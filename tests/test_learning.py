@@ -45,7 +45,7 @@ def test_a_short_run_learns_the_scene_and_zoom_truth_is_finer(tmp_path: Path) ->
 @pytest.mark.parametrize(("name", "train", "test"), [("fox", 43, 7), ("desk_bottle", 88, 13)])
 def test_real_captures_load(name: str, train: int, test: int) -> None:
     from gsx.cli import plugins
-    from gsx.experiments.runs.config import compose
+    from gsx.experiments.runs.compose import compose
     from gsx.experiments.runs.load_scene import load_scene
 
     scene = load_scene(compose(["scene=colmap", f"scene.path={real(name)}", "scene.downscale=4"], plugins()))

@@ -6,9 +6,10 @@ from pathlib import Path
 from gsx.cli import plugins
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import Settings, compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import start
+from gsx.experiments.runs.settings import Settings
 
 OVERRIDES = (
     "scene.width=48",

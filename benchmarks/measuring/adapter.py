@@ -12,7 +12,7 @@ from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import Pairs, pair
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 
 
 def settings_of(path: str, *overrides: str) -> RasterSettings:

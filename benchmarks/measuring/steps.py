@@ -10,7 +10,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import take_step
 from gsx.experiments.runs.build import build
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 from measuring.adapter import settings_of

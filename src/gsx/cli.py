@@ -18,7 +18,7 @@ from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
     from gsx.core.training.run import Run
-    from gsx.experiments.runs.config import Settings
+    from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger("gsx.cli")
 
@@ -251,7 +251,7 @@ def verb_train(words: list[str]) -> int:
 
     if is_table(words):
         return fill_table(words)
-    from gsx.experiments.runs.config import compose
+    from gsx.experiments.runs.compose import compose
 
     return train(compose(words, loaded := plugins()), loaded)
 
@@ -267,7 +267,7 @@ def fill_table(words: list[str]) -> int:
 
 def hand_to_hydra(words: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
-    from gsx.experiments.runs.config import check_overrides, hydra_main, quoted
+    from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
     from gsx.experiments.tables.sweep import is_table
 
     if is_table(words) and {"-m", "--multirun"} & set(words):
@@ -314,7 +314,8 @@ def sweep_job(config: Any) -> int:
     An error is shown and does not end the others; Ctrl-C does.
     """
     from gsx.core.files import write_json
-    from gsx.experiments.runs.config import job_place, settings_from
+    from gsx.experiments.runs.compose import job_place
+    from gsx.experiments.runs.settings import settings_from
 
     set_up_logging()
     folders: list[Path] = []
@@ -406,8 +407,8 @@ def verb_resume(words: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...]"""
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
     folder, overrides = run_words("resume", words, told)
-    from gsx.experiments.runs.config import write_config
     from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.settings import write_config
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides, training=True)
@@ -526,7 +527,7 @@ def verb_datasets(words: list[str]) -> int:
     )
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
     words = parser.parse_args(words).words
-    from gsx.experiments.runs.config import Compositions
+    from gsx.experiments.runs.compose import Compositions
     from gsx.experiments.tables.datasets import described
 
     overrides = [word for word in words if "=" in word]

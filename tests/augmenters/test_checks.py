@@ -18,7 +18,7 @@ from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.training.regenerator import Request
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import start
 
 LATENT = ("regenerator/upscale=sd_x2_latent", "regenerator/restore=sdxl_turbo")

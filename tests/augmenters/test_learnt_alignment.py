@@ -16,7 +16,7 @@ from gsx.core.training.regenerator import RegeneratorContext, Request, displacem
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import start
 
 CONTROL = (

@@ -25,7 +25,7 @@ from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 

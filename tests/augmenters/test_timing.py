@@ -7,7 +7,7 @@ import pytest
 from gsx.augmenters.timing import Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.cli import plugins
 from gsx.core.training.schedule import Schedule
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 
 B = Timing(published_iterations=40000, start=20000, stop=38000, every=2000, span=750, stop_inclusive=True)
 UP = Timing(published_iterations=40000, start=22000, stop=38000, every=2000, span=1000, stop_inclusive=True)

@@ -22,9 +22,10 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, touches
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.experiments.runs.config import Settings, compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import Settings
 
 NAMES = ("scaffold", "octree_scaffold", "octree_gs3d")
 NEURAL = ("scaffold", "octree_scaffold")

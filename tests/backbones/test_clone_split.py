@@ -33,9 +33,10 @@ from gsx.core.gaussians.splat_files import splats_of, write_columns
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import within_room
-from gsx.experiments.runs.config import compose, read_config, write_config
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import read_config, write_config
 
 WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
 CONTROL = LevelDensityOptions(update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, volume_weight=0.01)

@@ -13,7 +13,7 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import in_units, measured, warned_of_units
 
 BACKBONES = {

@@ -34,7 +34,7 @@ from gsx.core.training.density import Statistics
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.build import build
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.load_scene import load_scene

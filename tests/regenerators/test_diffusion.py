@@ -22,7 +22,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
 from gsx.regenerators.diffusion.cascade import Cascade
 from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, ModelSpec, steps_for

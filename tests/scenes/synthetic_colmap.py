@@ -10,7 +10,8 @@ import torch
 
 from gsx.core.data.images import write_image
 from gsx.core.plugins import load_plugins
-from gsx.experiments.runs.config import compose_raw, hydra_session, typed
+from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.settings import typed
 from gsx.scenes.colmap import ColmapOptions
 
 WIDTH, HEIGHT = 64, 48

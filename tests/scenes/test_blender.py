@@ -17,7 +17,7 @@ from gsx.core.data.images import resize, write_image
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.gaussians.ply import write_ply
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.scenes.blender import BlenderOptions, box_averaged, load

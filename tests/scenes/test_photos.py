@@ -16,7 +16,7 @@ from synthetic_colmap import shipped
 from gsx.core.data.images import image_size, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
-from gsx.experiments.runs.config import typed
+from gsx.experiments.runs.settings import typed
 from gsx.scenes import photos, sfm
 from gsx.scenes.photos import PhotosOptions, find_photos, load, reconstruct
 

@@ -7,7 +7,8 @@ from omegaconf import OmegaConf
 
 from gsx.cli import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.runs.config import Compositions, compose, read_config, typed, write_config
+from gsx.experiments.runs.compose import Compositions, compose
+from gsx.experiments.runs.settings import read_config, typed, write_config
 from gsx.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[3] / "conf"

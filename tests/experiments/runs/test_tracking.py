@@ -22,9 +22,10 @@ from gsx.core.run_folder.files import read_run
 from gsx.core.training.run import Run
 from gsx.experiments.reports.baselines import key_of
 from gsx.experiments.reports.overview import flattened
-from gsx.experiments.runs.config import compose, read_config, write_config
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
+from gsx.experiments.runs.settings import read_config, write_config
 from gsx.experiments.runs.tracking import Tracking, build_trackers
 from gsx.experiments.runs.warm_start import trunk_folder
 from gsx.trackers.figures import evaluation_figures, line_figures

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsx.cli import main, plugins
-from gsx.experiments.runs.config import Compositions
+from gsx.experiments.runs.compose import Compositions
 
 VARIANTS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "variant").glob("*.yaml"))
 SMALL = ["dataset=demo", "budget=smoke", "iterations=60", "scene.train_views=8", "scene.test_views=2",

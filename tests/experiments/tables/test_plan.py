@@ -10,7 +10,8 @@ import pytest
 from gsx.cli import plugins
 from gsx.core.run_folder.files import read_run
 from gsx.core.run_folder.run_key import claimed, composition_key, finished, judging, place_of, scene_stamp
-from gsx.experiments.runs.config import Compositions, write_config
+from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.settings import write_config
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, planned, told
 from gsx.experiments.tables.sweep import run_table
 

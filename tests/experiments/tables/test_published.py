@@ -7,7 +7,7 @@ import pytest
 
 from gsx.cli import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.runs.config import Compositions
+from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.tables.published import METRICS, Published, read_table, tables
 
 TRANSCRIBED = Path(__file__).parents[4] / "shared" / "specs" / "paper_tables"

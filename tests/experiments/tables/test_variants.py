@@ -11,8 +11,9 @@ from gsx.cli import plugins
 from gsx.core.run_folder.run_key import composition_key
 from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import Compositions, Settings
+from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.open import start
+from gsx.experiments.runs.settings import Settings
 
 UP = "augmenter.upscale."
 BOOT = "augmenter.bootstrap."

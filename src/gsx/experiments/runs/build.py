@@ -15,7 +15,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
-from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.settings import Settings
 
 
 def choose_device(name: str) -> torch.device:

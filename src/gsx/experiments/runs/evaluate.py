@@ -13,9 +13,9 @@ from gsx.core.run_folder.run_key import (
 from gsx.core.training.remarks import remarks_of
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import Pictures
-from gsx.experiments.runs.config import Settings
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
+from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
 

@@ -13,12 +13,12 @@ from gsx.core.training.run import Run, Step
 from gsx.core.training.trainer import train
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.runs import warm_start
-from gsx.experiments.runs.config import Settings
 from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.open import say_what_changed
 from gsx.experiments.runs.progress import MetricsLog, Progress
+from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.tracking import build_trackers, telling_of_failure
 
 

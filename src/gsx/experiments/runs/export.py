@@ -11,8 +11,8 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import Settings
 from gsx.experiments.runs.load_scene import unit_of
+from gsx.experiments.runs.settings import Settings
 
 
 def export(run: Run, path: Path, camera: Camera | None = None) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 from gsx.core.data.scene import Scene
 from gsx.core.errors import GsxError, InputError
 from gsx.core.plugins import load_plugins
-from gsx.experiments.runs.config import compose_raw, hydra_session, typed
+from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.settings import typed
 from gsx.scenes import blender, bungee, colmap, photos, transforms
 from gsx.scenes.colmap_model import Model, find_model, model_folders, read_model
 from gsx.scenes.posed import find_photo, named, read_frames

@@ -7,7 +7,7 @@ from gsx.core.data.camera import offsets_from
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.training.run import Run
-from gsx.experiments.runs.config import Settings
+from gsx.experiments.runs.settings import Settings
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 """If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""

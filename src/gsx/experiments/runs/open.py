@@ -28,10 +28,10 @@ from gsx.core.training.distributed import ranks_here, refuse_uneven
 from gsx.core.training.run import Run
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device
-from gsx.experiments.runs.config import Settings, read_config, write_config
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.settings import Settings, read_config, write_config
 from gsx.experiments.runs.tracking import build_trackers
 
 logger = logging.getLogger(__name__)

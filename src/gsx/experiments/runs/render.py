@@ -8,8 +8,8 @@ from gsx.core.errors import InputError, nearest
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import file_names
-from gsx.experiments.runs.config import Settings
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
+from gsx.experiments.runs.settings import Settings
 
 
 def view_named(run: Run, name: str) -> View:

@@ -14,7 +14,7 @@ import pluggy
 from gsx.core.errors import TrainingError, first_line
 from gsx.core.plugins import GROUP, Hooks, Plugins, hookimpl, refuse_unmarked
 from gsx.core.training.run import Run, Step
-from gsx.experiments.runs.config import Chosen
+from gsx.experiments.runs.settings import Chosen
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,8 @@ from gsx.core.files import replace_file
 from gsx.core.plugins import Plugins
 from gsx.core.run_folder.run_key import sorted_items
 from gsx.experiments.reports.overview import write_overview
-from gsx.experiments.runs.config import Compositions, parse_overrides, typed
+from gsx.experiments.runs.compose import Compositions, parse_overrides
+from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
 from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, planned, told
 from gsx.experiments.tables.published import read_table

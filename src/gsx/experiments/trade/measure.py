@@ -19,7 +19,7 @@ from gsx.core.rasterizer.available import available, complaint
 from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.trade.knobs import (
     Row,
     Trial,

@@ -20,7 +20,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.render import splats_for
 from gsx.experiments.runs.build import choose_device
-from gsx.experiments.runs.config import compose
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 

@@ -1,0 +1,266 @@
+"""From overrides to a composition: the only module that speaks to Hydra."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.plugins import Plugins
+from gsx.experiments.runs.settings import Settings, dotted, settings_from
+
+OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
+OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
+
+MODULE = "gsx.conf"
+
+
+LAUNCHERS = {
+    "processes": ("hydra-joblib-launcher", "sweep"),
+    "joblib": ("hydra-joblib-launcher", "sweep"),
+    "slurm": ("hydra-submitit-launcher", "slurm"),
+    "submitit_slurm": ("hydra-submitit-launcher", "slurm"),
+    "submitit_local": ("hydra-submitit-launcher", "slurm"),
+}
+"""Package and extra of each launcher beside Hydra's own."""
+
+
+@contextmanager
+def hydra_session(plugins: Plugins) -> Iterator[None]:
+    """Hydra initialised on the packaged configuration and the plugins' search paths, and cleared afterwards."""
+    from hydra import initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+
+    register_search_paths(plugins)
+    GlobalHydra.instance().clear()
+    with initialize_config_module(MODULE, version_base="1.3"):
+        yield
+
+
+def register_search_paths(plugins: Plugins) -> None:
+    """Let Hydra search the configuration packages of plugins."""
+    from hydra.core.config_search_path import ConfigSearchPath
+    from hydra.core.plugins import Plugins as HydraPlugins
+    from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+    paths = plugins.config_paths
+
+    class PluginPaths(SearchPathPlugin):
+        def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+            for path in paths:
+                search_path.append(provider="gsx", path=path)
+
+    if paths:
+        HydraPlugins.instance().register(PluginPaths)
+
+
+class Compositions:
+    """Many compositions in one session of Hydra: `with Compositions(plugins) as compositions`."""
+
+    def __init__(self, plugins: Plugins) -> None:
+        self.plugins, self.session = plugins, hydra_session(plugins)
+
+    def __enter__(self) -> "Compositions":
+        self.session.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.session.__exit__(*error)
+
+    def settings(self, overrides: Sequence[str]) -> Settings:
+        """One composition, checked; see `compose`."""
+        return settings_from(compose_raw(overrides), self.plugins)
+
+    def node(self, overrides: Sequence[str], key: str) -> dict[str, Any]:
+        """One node of a composition as plain values, unchecked; empty where there is none."""
+        found = OmegaConf.select(compose_raw(overrides), key)
+        return OmegaConf.to_container(found, resolve=True) if isinstance(found, DictConfig) else {}  # type: ignore
+
+    def keys(self, overrides: Sequence[str]) -> list[str]:
+        """Dotted keys of a composition."""
+        return list(dotted(OmegaConf.to_container(compose_raw(overrides), resolve=False)))
+
+    def value(self, overrides: Sequence[str], key: str) -> Any:
+        """One value of a composition."""
+        return OmegaConf.select(compose_raw(overrides), key)
+
+    def choices(self, group: str) -> list[str]:
+        """Options of a group."""
+        from hydra.core.global_hydra import GlobalHydra
+
+        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+
+    def launch(
+        self,
+        overrides: Sequence[str],
+        folder: Path,
+        jobs: Sequence[Sequence[str]],
+        job: Callable[[DictConfig], Any],
+    ) -> None:
+        """Carry out jobs, each given by its overrides, by the launcher that `overrides` choose (hydra/launcher=...).
+
+        What the launcher writes goes to `folder`.
+        """
+        from hydra import compose as hydra_compose
+        from hydra._internal.callbacks import Callbacks
+        from hydra.core.global_hydra import GlobalHydra
+        from hydra.core.plugins import Plugins as HydraPlugins
+        from hydra.types import HydraContext
+
+        config = hydra_compose(
+            "config", overrides=[*overrides, f"hydra.sweep.dir={quoted(str(folder))}"], return_hydra_config=True
+        )
+        context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
+        launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
+        for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
+            _ = result.return_value  # raises what a job raised
+
+
+def quoted(text: str) -> str:
+    """A text as the value of an override, whatever characters it has."""
+    return "'" + text.replace("'", "\\'") + "'"
+
+
+def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
+    """Compose and check an experiment.
+
+    Raises:
+        ConfigError: a group, option, key or value is wrong; the nearest right one is named.
+    """
+    with hydra_session(plugins):
+        return settings_from(compose_raw(overrides), plugins)
+
+
+def compose_raw(overrides: Sequence[str]) -> DictConfig:
+    """Hydra's composition inside a `hydra_session`, with its errors turned into ours."""
+    from hydra import compose as hydra_compose
+    from hydra.errors import HydraException
+
+    check_groups(overrides)
+    try:
+        return hydra_compose("config", overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error, overrides)) from error
+
+
+def parse_overrides(overrides: Sequence[str]) -> list[Any]:
+    """Hydra's Override objects, or ConfigError."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        return OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError(f"override cannot be read: {first_line(error)} (quote it for the shell)") from error
+
+
+def check_groups(overrides: Sequence[str]) -> None:
+    """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    groups = known_groups()
+    for override in parse_overrides(overrides):
+        if override.key_or_group == "hydra/launcher":
+            refuse_absent_launcher(str(override.value()))
+        if override.key_or_group not in groups or override.is_sweep_override():
+            continue
+        options = loader.get_group_options(override.key_or_group)
+        if not options:
+            inner = ", ".join(group for group in groups if group.startswith(f"{override.key_or_group}/"))
+            raise ConfigError(f"{override.key_or_group} is chosen by role: {inner}")
+        value = override.value()
+        for name in value if isinstance(value, list) else [value]:
+            if str(name) not in options:
+                raise ConfigError(
+                    f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
+                    f"choose from {', '.join(options)}.{nearest(str(name), options)}"
+                )
+
+
+def refuse_absent_launcher(name: str) -> None:
+    """Raise ConfigError if a launcher's package is not installed."""
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    package, extra = LAUNCHERS.get(name, ("", ""))
+    try:
+        if package:
+            distribution(package)
+    except PackageNotFoundError as error:
+        raise ConfigError(f"hydra/launcher={name} needs the package {package}: pip install 'gsx[{extra}]'") from error
+
+
+def known_groups() -> list[str]:
+    """Configuration groups, nested ones included: `regenerator/upscale`."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    outer = [group for group in loader.list_groups("") if not group.startswith("hydra")]
+    return outer + [f"{group}/{inner}" for group in outer for inner in loader.list_groups(group)]
+
+
+def explain(error: Exception, overrides: Sequence[str]) -> str:
+    """One sentence for an error of composition, with the nearest key where a key is unknown."""
+    found = re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", str(error))
+    if not found:
+        return f"the configuration cannot be composed: {first_line(error)}"
+    key = (found.group(1) or found.group(2)).lstrip("+~")
+    known = known_keys(overrides)
+    if key in known:  # a mapping that is open, such as arguments of a function
+        return f"'{key}' takes its entries one by one: '+{key}.NAME=VALUE'"
+    return f"'{key}' is no configuration key.{nearest(key, known) or ' `gsx --cfg job` lists all keys.'}"
+
+
+def known_keys(overrides: Sequence[str]) -> list[str]:
+    """Dotted keys of the composition made from the group choices alone."""
+    from hydra import compose as hydra_compose
+
+    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],]+$", o) and is_group(o.split("=")[0])]
+    return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
+
+
+def is_group(key: str) -> bool:
+    """Whether a key names a configuration group."""
+    return key in known_groups()
+
+
+def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
+    """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed.
+
+    Returns the folder that its runs go to.
+    """
+    with hydra_session(plugins):
+        parsed = parse_overrides(overrides)
+        composed = compose_raw([first_of(override) for override in parsed if override.input_line])
+        return Path(str(composed.output))
+
+
+def first_of(override: Any) -> str:
+    """An override with its first value where it is swept."""
+    if not override.is_sweep_override():
+        return str(override.input_line)
+    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
+
+
+def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
+    """Hydra's own command line on our configuration; `job` must be importable, for launchers that start processes."""
+    import sys
+
+    import hydra
+
+    register_search_paths(plugins)
+    sys.argv = ["gsx", *arguments]
+    hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")(job)()
+
+
+def job_place() -> tuple[Path, int] | None:
+    """(folder of the multirun, number in it) of the job that runs in this process; None outside of one."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized() or OmegaConf.is_missing(HydraConfig.get().job, "num"):
+        return None
+    return Path(HydraConfig.get().sweep.dir), int(HydraConfig.get().job.num)
