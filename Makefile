@@ -30,6 +30,7 @@ lint: $(READY_DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 wheel: $(READY_DEV)
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .

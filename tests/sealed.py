@@ -9,7 +9,7 @@ import torch
 from tiny import tiny_settings
 from torch import Tensor
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import ImageSource, Scene, View
 from gsx.core.training.run import Run

@@ -390,7 +390,7 @@ TINY += ["scene.samples=1", "iterations=2", "rasterizer=eager", "device=cpu"]
 
 def test_whole_commands_are_run_once_and_told_by_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import commands
-    from gsx.cli import main
+    from gsx.cli.dispatch import main
     from measuring import runs
 
     asked: list[list[str]] = []

@@ -17,7 +17,7 @@ import torch
 from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
-from gsx.cli import VERBS, main
+from gsx.cli.dispatch import VERBS, main
 from gsx.core.data.images import write_image
 from gsx.core.rasterizer import RasterSettings
 
@@ -360,7 +360,7 @@ def test_an_unwritable_output_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_points_that_are_not_numbers_are_dropped_and_counted(tmp_path: Path) -> None:
-    from gsx.cli import plugins
+    from gsx.builtin import plugins
     from gsx.experiments.runs.compose import compose
     from gsx.experiments.runs.load_scene import load_scene
 

@@ -32,7 +32,8 @@ def test_source_files_named_in_backticks_exist(page: Path) -> None:
 
 
 def test_commands_of_the_readme_are_accepted() -> None:
-    from gsx.cli import VERBS, plugins
+    from gsx.builtin import plugins
+    from gsx.cli.dispatch import VERBS
     from gsx.experiments.runs.compose import compose
 
     text = (ROOT / "README.md").read_text()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 
 SCENES = Path(os.environ.get("GSX_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
 """Real captures, used where they are present; the tests never need them."""
@@ -44,7 +44,7 @@ def test_a_short_run_learns_the_scene_and_zoom_truth_is_finer(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("name", "train", "test"), [("fox", 43, 7), ("desk_bottle", 88, 13)])
 def test_real_captures_load(name: str, train: int, test: int) -> None:
-    from gsx.cli import plugins
+    from gsx.builtin import plugins
     from gsx.experiments.runs.compose import compose
     from gsx.experiments.runs.load_scene import load_scene
 

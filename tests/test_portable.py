@@ -46,7 +46,7 @@ from pathlib import Path
 import torch
 from gsx.core.evaluation.evaluator import peak_memory_mb
 print(peak_memory_mb(torch.device("cpu")))
-from gsx.cli import main
+from gsx.cli.dispatch import main
 sys.path.insert(0, {tests})
 from tiny import words
 assert main(words(Path(sys.argv[1]) / "run", "iterations=1")) == 0

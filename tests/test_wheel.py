@@ -16,7 +16,7 @@ OFFLINE = """
 import socket, sys
 def refuse(*a, **k): raise OSError("no network in this test")
 socket.socket.connect = refuse
-from gsx.cli import main
+from gsx.cli.dispatch import main
 import gsx
 assert {target!r} in gsx.__file__, gsx.__file__
 sys.exit(main(sys.argv[1:]))

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
 from gsx.experiments.runs.compose import compose

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.compiled import composite_compiled

@@ -4,7 +4,7 @@ from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.run import Run

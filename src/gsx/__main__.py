@@ -1,6 +1,6 @@
 """`python -m gsx`."""
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

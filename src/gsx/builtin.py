@@ -1,8 +1,9 @@
 """The built-in plugin: what ships with gsx enters through the same hooks as third parties."""
 
+import sys
 from functools import partial
 
-from gsx.core.plugins import Registry, hookimpl
+from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 
 
 @hookimpl
@@ -53,3 +54,8 @@ def gsx_register(registry: Registry) -> None:
     registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)
     registry.add("tracker", "tensorboard", TensorBoard, TensorBoardOptions)
     registry.add("tracker", "mlflow", MLflow, MLflowOptions)
+
+
+def plugins() -> Plugins:
+    """Built-in and installed plugins."""
+    return load_plugins([("gsx", sys.modules[__name__])])

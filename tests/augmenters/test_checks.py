@@ -13,7 +13,7 @@ from tiny import tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.training.regenerator import Request

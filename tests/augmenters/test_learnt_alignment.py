@@ -10,7 +10,8 @@ from torch import Tensor
 
 import gsx.augmenters.pseudo_details as pseudo_details
 from gsx.augmenters.pseudo_details import PseudoDetails
-from gsx.cli import main, plugins
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
 from gsx.core.training.render import render

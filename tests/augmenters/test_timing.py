@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from gsx.augmenters.timing import Timing, event_at, events_of, progress, ramp, span_of, stepped
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.training.schedule import Schedule
 from gsx.experiments.runs.compose import compose
 

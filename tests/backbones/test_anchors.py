@@ -14,7 +14,7 @@ from tiny import tiny_run
 from torch import Tensor
 
 from gsx.backbones.anchors import Anchors, Decay, DrawnAnchors, automatic_voxel, voxel_nodes
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError

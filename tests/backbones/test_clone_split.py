@@ -24,7 +24,7 @@ from gsx.backbones.clone_split import (
 from gsx.backbones.gs3d import GS3D, DrawnGaussians
 from gsx.backbones.levels import Levels, initial_nodes, kept
 from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError

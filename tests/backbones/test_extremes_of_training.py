@@ -7,7 +7,7 @@ import torch
 from small_scene import small_scene, spread
 from torch import Tensor
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import Scene, View
 from gsx.core.quality.losses import photometric

@@ -10,7 +10,7 @@ import torch
 from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.regenerators.called import Called, CalledOptions

@@ -17,7 +17,8 @@ from small_scene import small_scene, spread
 from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 
-from gsx.cli import main, plugins
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError

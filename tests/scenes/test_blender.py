@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 from synthetic_colmap import shipped
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.images import resize, write_image
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.evaluation.evaluator import Evaluator

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from tiny import tiny_run, tiny_settings
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run

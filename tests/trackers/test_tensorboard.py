@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.summary.writer.record_writer import RecordWriter
 from tiny import StopAfter, tiny_run, tiny_settings
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run

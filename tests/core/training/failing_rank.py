@@ -6,7 +6,7 @@ import sys
 
 import torch
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
 from gsx.core.training import trainer
 

@@ -10,7 +10,7 @@ from tiny import tiny_run
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError

@@ -12,7 +12,7 @@ from tiny import tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.data.images import to_uint8
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.quality.losses import photometric

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import pytest
 import torch
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
 from gsx.core.run_folder.files import read_run, runs_below

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.compose import Compositions, compose
 from gsx.experiments.runs.settings import read_config, typed, write_config

@@ -10,7 +10,8 @@ import torch
 from safetensors.torch import load_file
 from tiny import tiny_run, tiny_settings
 
-from gsx.cli import main, plugins
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.experiments.runs.evaluate import remedies

@@ -15,7 +15,8 @@ from safetensors.torch import load_file
 from tiny import StopAfter, tiny_run, tiny_settings, words
 
 from gsx import builtin
-from gsx.cli import main, plugins
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.run_folder.files import read_run
@@ -308,7 +309,8 @@ def refuse(*words, **more):
     asked.append(words)
     raise OSError("no network in this test")
 socket.socket.connect = socket.getaddrinfo = refuse
-from gsx.cli import main, plugins
+from gsx.cli.dispatch import main
+from gsx.builtin import plugins
 plugins()
 assert not {"tensorboard", "mlflow"} & set(sys.modules), "imported before they were chosen"
 code = main(sys.argv[1:])

@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from tiny import tiny_run
 from torch import Tensor
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.warm_start import trunk_folder

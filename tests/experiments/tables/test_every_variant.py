@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from gsx.cli import main, plugins
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
 from gsx.experiments.runs.compose import Compositions
 
 VARIANTS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "variant").glob("*.yaml"))

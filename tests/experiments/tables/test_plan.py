@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.run_folder.files import read_run
 from gsx.core.run_folder.run_key import claimed, composition_key, finished, judging, place_of, scene_stamp
 from gsx.experiments.runs.compose import Compositions

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.tables.published import METRICS, Published, read_table, tables

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from gsx.cli import main
+from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 
 SMALL = ["scene.width=48", "scene.height=36", "scene.train_views=6", "scene.test_views=2", "scene.points=300",

@@ -7,7 +7,7 @@ from regenerating import noisy
 from tiny import tiny_settings
 
 from gsx.augmenters.pseudo_details import PseudoOptions
-from gsx.cli import plugins
+from gsx.builtin import plugins
 from gsx.core.run_folder.run_key import composition_key
 from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run

@@ -448,7 +448,7 @@ def test_a_file_without_finite_splats_is_refused() -> None:
 
 
 def test_a_splat_file_becomes_a_subject(tmp_path: Path) -> None:
-    from gsx.cli import plugins
+    from gsx.builtin import plugins
 
     g = torch.Generator().manual_seed(0)
     gaussians = Gaussians(

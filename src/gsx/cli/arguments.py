@@ -1,0 +1,66 @@
+"""Parsers of verbs, whose mistakes are errors of ours."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from gsx.core.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    pass
+
+
+def run_words(verb: str, words: list[str], description: str) -> tuple[Path, list[str]]:
+    """The run folder and the overrides after it."""
+    parser = Parser(prog=f"gsx {verb}", usage="%(prog)s RUN [KEY=VALUE ...]", description=description)
+    parser.add_argument("run", metavar="RUN", help="run folder")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
+    given = parser.parse_args(words)
+    if "=" in given.run and not Path(given.run).exists():
+        raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
+    return Path(given.run), given.overrides
+
+
+class Parser(argparse.ArgumentParser):
+    """Mistakes become errors of ours: one sentence, without the usage text."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ConfigError."""
+        raise ConfigError(f"{self.prog}: {message}. See {self.prog} --help")
+
+
+def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
+    """What reads a finite number above 0 from a word."""
+
+    def read(word: str) -> int | float:
+        try:
+            number = kind(word)
+        except ValueError:
+            number = kind(0)
+        if not 0 < number < float("inf"):
+            what, example = ("whole number of 1 or more", "3") if kind is int else ("number above 0", "1e-3")
+            raise argparse.ArgumentTypeError(f"'{word}' is no {what}: give one, for example {example}")
+        return number
+
+    return read
+
+
+def whole(word: str) -> int:
+    """A whole number of 0 or more."""
+    if not word.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{word}' is no whole number of 0 or more: give one, for example 4")
+    return int(word)
+
+
+def new_folder(folder: Path) -> Path:
+    """The folder, made where it is missing.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made ({error.strerror}): choose another with --to FOLDER") from error
+    return folder

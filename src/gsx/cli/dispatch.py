@@ -1,0 +1,103 @@
+"""The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from gsx import __version__
+from gsx.core.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    pass
+from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
+from gsx.cli.messages import explained, set_up_logging
+from gsx.cli.runs import verb_eval, verb_export, verb_render
+from gsx.cli.trade import verb_trade
+from gsx.cli.train import verb_resume, verb_train
+from gsx.core.processes import processes
+
+HELP = """\
+gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.
+
+  gsx                                            train the built-in scene (start here; a few minutes on a laptop)
+  gsx scene=photos scene.path=FOLDER             train from nothing but photos
+  gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
+
+  gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
+  gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
+  gsx eval RUN [K=V ...]    evaluate a run again, for example with 'eval.zoom=[1,2,4]'
+  gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif (.webp, .mp4: gsx[video])
+  gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
+  gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
+  gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
+  gsx scenes PATH           what is this folder: format, cameras, images, points, problems
+  gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
+  gsx plugins               what is installed, from where, and what failed to load
+
+  gsx --cfg job --resolve   print the configuration instead of training
+  gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
+  gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
+  gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
+  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/clusters.md)
+  gsx --version, gsx --help, gsx VERB --help
+
+Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if processes() > 1:
+        from gsx.core.training.distributed import as_one
+
+        return as_one(lambda: dispatch_together(words), explained)
+    try:
+        return dispatch(words)
+    except BaseException as error:
+        return explained(error)
+
+
+def dispatch_together(words: list[str]) -> int:
+    """Train or resume on several processes.
+
+    Raises:
+        ConfigError: anything else is asked for.
+    """
+    if any(word.startswith("-") for word in words) or (words[:1] and words[0] in VERBS and words[0] != "resume"):
+        asked = " ".join(words[:2])
+        raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
+    from gsx.experiments.tables.sweep import is_table
+
+    if is_table(words):
+        raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
+    return dispatch(words)
+
+
+def dispatch(words: list[str]) -> int:
+    """Find the verb and run it."""
+    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in VERBS):
+        sys.stdout.write(HELP)
+        return 0
+    if words == ["--version"]:
+        sys.stdout.write(f"gsx {__version__}\n")
+        return 0
+    if not words or words[0].startswith(("-", "+", "~")) or "=" in words[0]:
+        return verb_train(words)
+    if words[0] not in VERBS:
+        raise ConfigError(f"'{words[0]}' is no verb of gsx.{nearest(words[0], VERBS)} See gsx --help")
+    set_up_logging()
+    return VERBS[words[0]](words[1:])
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {
+    "resume": verb_resume,
+    "eval": verb_eval,
+    "render": verb_render,
+    "export": verb_export,
+    "report": verb_report,
+    "trade": verb_trade,
+    "scenes": verb_scenes,
+    "datasets": verb_datasets,
+    "plugins": verb_plugins,
+}

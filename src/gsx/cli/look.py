@@ -1,0 +1,77 @@
+"""Verbs that look: report, scenes, datasets, plugins."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsx.core.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    pass
+from gsx.builtin import plugins
+from gsx.cli.arguments import Parser, new_folder
+
+
+def verb_report(words: list[str]) -> int:
+    """gsx report DIR [DIR ...] [--to FOLDER]"""
+    parser = Parser(prog="gsx report", description="Report of a run, or one page over all runs of some folders.")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
+    given = parser.parse_args(words)
+    from gsx.experiments.reports.report import report_on
+
+    sys.stdout.write(f"{report_on(given.folders, new_folder(given.to) if given.to else None)}\n")
+    return 0
+
+
+def verb_scenes(words: list[str]) -> int:
+    """gsx scenes PATH"""
+    parser = Parser(prog="gsx scenes", description="What a folder is: format, cameras, images, points, problems.")
+    parser.add_argument("path", type=Path, metavar="PATH", help="folder of a scene")
+    given = parser.parse_args(words)
+    from gsx.experiments.runs.inspect import describe
+
+    lines = describe(given.path)
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 2 if any(line.startswith("problem") for line in lines) else 0
+
+
+def verb_datasets(words: list[str]) -> int:
+    """gsx datasets [NAME ...] [data_root=FOLDER]"""
+    parser = Parser(
+        prog="gsx datasets",
+        usage="%(prog)s [NAME ...] [data_root=FOLDER]",
+        description="The paper's datasets: what is expected below data_root=FOLDER, what is found, what is missing.",
+    )
+    parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
+    words = parser.parse_args(words).words
+    from gsx.experiments.runs.compose import Compositions
+    from gsx.experiments.tables.datasets import described
+
+    overrides = [word for word in words if "=" in word]
+    with Compositions(plugins()) as compositions:
+        known = [name for name in compositions.choices("dataset") if name != "own"]
+        names = [word for word in words if word not in overrides] or known
+        for name in names:
+            if name not in known:
+                raise InputError(f"'{name}' is no dataset; there are {', '.join(known)}.{nearest(name, known)}")
+            asked = [f"dataset={name}", *overrides]
+            root = Path(str(compositions.value(asked, "data_root")))
+            sys.stdout.write("\n".join(described(compositions.node(asked, "dataset"), root)) + "\n")
+    return 0
+
+
+def verb_plugins(words: list[str]) -> int:
+    """gsx plugins"""
+    Parser(prog="gsx plugins", description="What is installed, from where, and what failed to load.").parse_args(words)
+    from gsx.core.plugins import KINDS
+
+    loaded = plugins()
+    for kind in KINDS:
+        parts = [f"{name} ({loaded.registry.find(kind, name).provider})" for name in loaded.registry.names(kind)]
+        sys.stdout.write(f"{kind + ':':13} {', '.join(parts) or '-'}\n")
+    for name, plugin_version in loaded.versions.items():
+        sys.stdout.write(f"plugin {name} {plugin_version}\n")
+    for failure in loaded.failures:
+        sys.stdout.write(f"failed to load: {failure.plugin}: {failure.reason}\n")
+    return 0

@@ -1,0 +1,54 @@
+"""What people read: errors as one sentence, messages of the log."""
+
+import errno
+import logging
+import sys
+from typing import TYPE_CHECKING
+
+from gsx.core.errors import GsxError
+
+if TYPE_CHECKING:
+    pass
+from gsx.core.processes import say, speaks
+from gsx.experiments.runs.job import INTERRUPTED
+
+
+def explained(error: BaseException) -> int:
+    """The exit code of an error that people can mend, which is shown; others are raised again."""
+    if isinstance(error, GsxError):
+        return complain(str(error))
+    if isinstance(error, OSError):
+        return complain(os_sentence(error))
+    if isinstance(error, KeyboardInterrupt):
+        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", sys.stderr)
+        return INTERRUPTED
+    raise error
+
+
+def complain(sentence: str) -> int:
+    """Show an error as one sentence."""
+    say(f"gsx: {sentence}\n", sys.stderr)
+    return 2
+
+
+def os_sentence(error: OSError) -> str:
+    """A failure of the file system with its remedy."""
+    where = f" ({error.filename})" if error.filename else ""
+    remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
+    return f"{error.strerror or error}{where}: {remedy}, or choose a writable place, for example output=FOLDER"
+
+
+def set_up_logging() -> None:
+    """Plain messages of gsx on standard error, warnings marked."""
+
+    class Plain(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            mark = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
+            return mark + record.getMessage()
+
+    root = logging.getLogger("gsx")
+    root.setLevel(logging.INFO)
+    root.propagate = False
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(Plain())
+    root.handlers = [handler] if speaks() else [logging.NullHandler()]

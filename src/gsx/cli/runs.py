@@ -1,0 +1,90 @@
+"""Verbs on a finished run: eval, render, export."""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsx.core.errors import InputError
+
+if TYPE_CHECKING:
+    pass
+from gsx.builtin import plugins
+from gsx.cli.arguments import run_words
+
+logger = logging.getLogger("gsx.cli")
+
+
+def verb_eval(words: list[str]) -> int:
+    """gsx eval RUN [KEY=VALUE ...]"""
+    told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
+    folder, overrides = run_words("eval", words, told)
+    from gsx.core.rasterizer.prepare import warm
+    from gsx.experiments.reports.report import write_report
+    from gsx.experiments.runs.evaluate import evaluate
+    from gsx.experiments.runs.execute import finish
+    from gsx.experiments.runs.open import as_trained, open_run
+
+    loaded = plugins()
+    run, settings = open_run(folder, loaded, overrides)
+    run.raster = as_trained(run)
+    warm(run.raster, run.device)
+    if run.complete:
+        finish(run, settings, loaded)
+    else:
+        loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
+        write_report(folder)
+    sys.stdout.write(f"{folder / 'report.html'}\n")
+    return 0
+
+
+def verb_render(words: list[str]) -> int:
+    """gsx render RUN [--orbit FILE] ..."""
+    parser = argparse.ArgumentParser(prog="gsx render", description="Render test views, or an orbit as an animation.")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("--orbit", type=Path, metavar="FILE", help="animate a closed orbit: .gif, .webp or .mp4")
+    parser.add_argument("--frames", type=int, default=60, help="frames of the orbit (60)")
+    parser.add_argument("--fps", type=float, default=20, help="frames per second (20)")
+    parser.add_argument("--zoom", type=float, default=1, help="times the training resolution (1)")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for test views (RUN/renders/test)")
+    given = parser.parse_args(words)
+    if given.zoom <= 0 or given.frames < 1:
+        raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.render import render_orbit, render_test_views
+
+    run, settings = open_run(given.run, plugins())
+    if given.orbit:
+        render_orbit(run, settings, given.orbit, given.frames, given.fps, given.zoom)
+        sys.stdout.write(f"{given.orbit}\n")
+    else:
+        folder = given.to or given.run / "renders" / "test"
+        render_test_views(run, settings, folder, given.zoom)
+        sys.stdout.write(f"{folder}\n")
+    return 0
+
+
+def verb_export(words: list[str]) -> int:
+    """gsx export RUN [FILE.ply] [--view NAME]"""
+    parser = argparse.ArgumentParser(prog="gsx export", description="Write a splat file (PLY), read back and compared.")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
+    parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
+    given = parser.parse_args(words)
+    from gsx.core.gaussians.splat_files import refuse_suffix
+    from gsx.experiments.runs.export import export, reimport_psnr
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.render import view_named
+
+    if given.file:
+        refuse_suffix(given.file)
+    run, settings = open_run(given.run, plugins())
+    view = view_named(run, given.view) if given.view else None
+    path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
+    export(run, path, view.camera if view else None)
+    if view is not None or run.backbone.standard_file:
+        views = [view] if view else run.scene.test
+        logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views))
+    sys.stdout.write(f"{path}\n")
+    return 0

@@ -1,0 +1,149 @@
+"""gsx OVERRIDES, multiruns, tables, and gsx resume."""
+
+import logging
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsx.core.errors import ConfigError, GsxError, InputError, nearest
+
+if TYPE_CHECKING:
+    pass
+from gsx.builtin import plugins
+from gsx.cli.arguments import run_words
+from gsx.cli.messages import complain, os_sentence, set_up_logging
+from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
+
+logger = logging.getLogger("gsx.cli")
+HYDRA_FLAGS = (
+    "-m",
+    "--multirun",
+    "-sc",
+    "--shell-completion",
+    "--info",
+    "--hydra-help",
+    "--cfg",
+    "-c",
+    "-p",
+    "--package",
+    "--resolve",
+)
+"""Flags that are handed to Hydra as they are."""
+
+
+def verb_train(words: list[str]) -> int:
+    """gsx OVERRIDES..."""
+    set_up_logging()
+    flags = [word for word in words if word.startswith("-")]
+    for flag in flags:
+        if flag.split("=")[0] not in HYDRA_FLAGS:
+            raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
+    if flags:
+        return hand_to_hydra(words)
+    from gsx.experiments.tables.sweep import is_table
+
+    if is_table(words):
+        return fill_table(words)
+    from gsx.experiments.runs.compose import compose
+
+    return train(compose(words, loaded := plugins()), loaded)
+
+
+def fill_table(words: list[str]) -> int:
+    """gsx +experiment=TABLE ..."""
+    from gsx.experiments.tables.sweep import run_table
+
+    text, code = run_table(words, plugins(), sweep_job)
+    sys.stdout.write(text)
+    return code
+
+
+def hand_to_hydra(words: list[str]) -> int:
+    """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
+    from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
+    from gsx.experiments.tables.sweep import is_table
+
+    if is_table(words) and {"-m", "--multirun"} & set(words):
+        raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
+    loaded = plugins()
+    if not {"-m", "--multirun"} & set(words):
+        hydra_main(words, loaded, sweep_job)
+        return 0
+    given = [word for word in words if not word.startswith("-")]
+    sweep = new_sweep(check_overrides(given, loaded))
+    try:
+        hydra_main([*words, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+    finally:
+        code = close_sweep(sweep)
+    return code
+
+
+def new_sweep(output: Path) -> Path:
+    """A new folder for the record of a multirun."""
+    for number in range(1, 1000):
+        stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        folder = output / "sweeps" / (stamp if number == 1 else f"{stamp}_{number}")
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            return folder
+    raise InputError(f"no free folder below {output / 'sweeps'}: clean it up")
+
+
+def close_sweep(sweep: Path) -> int:
+    """Report on the runs that a multirun has made; returns the worst exit code of its jobs."""
+    from gsx.core.files import read_json
+    from gsx.experiments.reports.overview import write_overview
+
+    records = [read_json(path) for path in sorted((sweep / "jobs").glob("*.json"))]
+    folders = [folder for record in records if record["folder"] and (folder := Path(record["folder"])).is_dir()]
+    if folders:
+        sys.stdout.write(f"{write_overview(sweep, folders)}\n")
+    return max((record["code"] for record in records), default=0)
+
+
+def sweep_job(config: Any) -> int:
+    """One job of a multirun or of a table, in this process or in one of a launcher's; its record stays with the sweep.
+
+    An error is shown and does not end the others; Ctrl-C does.
+    """
+    from gsx.core.files import write_json
+    from gsx.experiments.runs.compose import job_place
+    from gsx.experiments.runs.settings import settings_from
+
+    set_up_logging()
+    folders: list[Path] = []
+    try:
+        code = train(settings_from(config, loaded := plugins()), loaded, folders)
+    except GsxError as error:
+        code = complain(str(error))
+    except OSError as error:
+        code = complain(os_sentence(error))
+    except Exception:  # a defect, perhaps a plugin's: the other jobs are worth no less
+        logger.exception("this job failed")
+        code = 1
+    place = job_place()
+    if place is not None:
+        (place[0] / "jobs").mkdir(parents=True, exist_ok=True)
+        record = {"folder": str(folders[0].resolve()) if folders else "", "code": code}
+        write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code
+
+
+def verb_resume(words: list[str]) -> int:
+    """gsx resume RUN [KEY=VALUE ...]"""
+    told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
+    folder, overrides = run_words("resume", words, told)
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.settings import write_config
+
+    loaded = plugins()
+    run, settings = open_run(folder, loaded, overrides, training=True)
+    if run.complete and (folder / "evaluation.json").is_file():
+        raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
+    if run.ranks.first:
+        write_config(folder / "config.yaml", settings.resolved)
+    logger.info("resuming %s at step %d", folder, run.step)
+    return carry_out(run, settings, loaded)

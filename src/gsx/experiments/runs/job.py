@@ -1,0 +1,135 @@
+"""A run from settings to its end as a program carries it out: signals, log file, what is said at the end."""
+
+import logging
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsx.core.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    from gsx.core.plugins import Plugins
+    from gsx.core.training.run import Run
+    from gsx.experiments.runs.settings import Settings
+from gsx.core.processes import processes, say, speaks
+
+logger = logging.getLogger("gsx.cli")
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells report it."""
+
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2") if hasattr(signal, name))
+"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for the latter)."""
+
+
+@contextmanager
+def logged_to(folder: Path) -> Iterator[None]:
+    """Also write messages to the run's log.txt."""
+    if not speaks():
+        yield
+        return
+    handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
+    logging.getLogger("gsx").addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger("gsx").removeHandler(handler)
+        handler.close()
+
+
+@contextmanager
+def interruptible(run: "Run") -> Iterator[object]:
+    """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
+
+    So do the signals by which a cluster takes a machine back (STOPPING): with a checkpoint at hand they are sent again,
+    to whoever waited for them before.
+
+    Yields a listener that takes the handlers away when training is over.
+    """
+    from gsx.core.plugins import hookimpl
+
+    received: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        run.stopping = True
+        received.append(number)
+        give_back()
+
+    def give_back() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    class UntilTrained:
+        @hookimpl
+        def gsx_training_finished(self) -> None:
+            give_back()
+
+    alone = STOPPING if processes() == 1 else ()  # torchrun ends its processes itself, some while they wait for others
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *alone)}
+    try:
+        yield UntilTrained()
+    finally:
+        give_back()
+    if received and received[0] in STOPPING and not run.complete:
+        logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
+        signal.raise_signal(received[0])
+        raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
+
+
+def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
+    """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which."""
+    from gsx.experiments.runs.open import start
+
+    if settings.general.reuse:
+        return reused(settings, loaded, [] if folders is None else folders)
+    run = start(settings, loaded)
+    if folders is not None:
+        folders.append(run.folder)
+    return carry_out(run, settings, loaded)
+
+
+def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
+    """Train what is left of a composition in its own folder."""
+    from gsx.core.run_folder.run_key import claimed, place_of, scene_stamp
+    from gsx.experiments.runs.open import resume_or_start
+
+    if processes() > 1:
+        raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
+    stamp = scene_stamp(settings.resolved)
+    folder = place_of(settings.resolved, stamp)
+    folders.append(folder)
+    with claimed(folder) as alone:
+        if not alone:
+            raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
+        _, run = resume_or_start(settings, loaded, stamp)
+        if run is None:
+            sys.stdout.write(f"{folder / 'report.html'}\n")
+            return 0
+        return carry_out(run, settings, loaded)
+
+
+def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
+    """Train to the end or to Ctrl-C, and say where things are."""
+    from gsx.experiments.runs.execute import execute
+
+    try:
+        with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
+            execute(run, settings, loaded)
+    except KeyboardInterrupt:
+        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
+        return INTERRUPTED
+    if not run.complete:
+        say(f"gsx: stopped at step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
+        return INTERRUPTED
+    say(f"{run.folder / 'report.html'}\n", sys.stdout)
+    return 0
+
+
+def onwards(run: "Run") -> str:
+    """The command that goes on with a run; one that is named by its composition is found again by it."""
+    return "the same command" if run.config.get("reuse") else f"gsx resume {run.folder}"
