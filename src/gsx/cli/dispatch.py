@@ -5,16 +5,16 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from gsx import __version__
-from gsx.core.errors import ConfigError, nearest
-
-if TYPE_CHECKING:
-    pass
 from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging
 from gsx.cli.runs import verb_eval, verb_export, verb_render
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
+from gsx.core.errors import ConfigError, nearest
 from gsx.core.processes import processes
+
+if TYPE_CHECKING:
+    pass
 
 HELP = """\
 gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.

@@ -6,11 +6,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from gsx.core.errors import GsxError
+from gsx.core.processes import say, speaks
+from gsx.experiments.runs.job import INTERRUPTED
 
 if TYPE_CHECKING:
     pass
-from gsx.core.processes import say, speaks
-from gsx.experiments.runs.job import INTERRUPTED
 
 
 def explained(error: BaseException) -> int:

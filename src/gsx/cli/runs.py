@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gsx.builtin import plugins
+from gsx.cli.arguments import run_words
 from gsx.core.errors import InputError
 
 if TYPE_CHECKING:
     pass
-from gsx.builtin import plugins
-from gsx.cli.arguments import run_words
 
 logger = logging.getLogger("gsx.cli")
 

@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gsx.builtin import plugins
+from gsx.cli.arguments import Parser, new_folder, positive, whole
 from gsx.core.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
     pass
-from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, new_folder, positive, whole
 
 logger = logging.getLogger("gsx.cli")
 

@@ -6,14 +6,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsx.core.errors import ConfigError, GsxError, InputError, nearest
-
-if TYPE_CHECKING:
-    pass
 from gsx.builtin import plugins
 from gsx.cli.arguments import run_words
 from gsx.cli.messages import complain, os_sentence, set_up_logging
+from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
+
+if TYPE_CHECKING:
+    pass
 
 logger = logging.getLogger("gsx.cli")
 HYDRA_FLAGS = (

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.processes import processes, say, speaks
 
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
     from gsx.core.training.run import Run
     from gsx.experiments.runs.settings import Settings
-from gsx.core.processes import processes, say, speaks
 
 logger = logging.getLogger("gsx.cli")
 INTERRUPTED = 130
