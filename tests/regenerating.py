@@ -9,8 +9,8 @@ from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import to_uint8
 from gsx.core.data.reduction import as_blocks, box_average
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.regenerator import Checks, RegeneratorContext, Request

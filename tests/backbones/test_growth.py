@@ -15,9 +15,6 @@ from torch.nn import Parameter
 from gsx.backbones import growth
 from gsx.backbones.decoding import Explicit, Neural
 from gsx.backbones.growth import (
-    CHOICES,
-    GrowthOptions,
-    Quirks,
     clamp_scales,
     eligible,
     fresh_statistics,
@@ -27,8 +24,8 @@ from gsx.backbones.growth import (
     observe,
     prune,
     reset_offsets,
-    resolved,
 )
+from gsx.backbones.growth_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
 from gsx.core.training.density import ParameterTable
 

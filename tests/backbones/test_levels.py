@@ -11,13 +11,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsx.backbones.cells import pooled_max
+from gsx.backbones.level_options import MODES, LevelOptions, checked_end
 from gsx.backbones.levels import (
-    MODES,
-    LevelOptions,
     Levels,
     all_levels_from,
     box_of,
-    checked_end,
     derive,
     distance_range,
     drawn,

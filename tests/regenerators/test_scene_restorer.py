@@ -8,7 +8,7 @@ import torch
 from regenerating import Photo, camera, request, stripes
 from torch import Tensor
 
-from gsx.core.data.images import to_uint8
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext

@@ -8,8 +8,8 @@ import torch
 from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
-from gsx.core.data.images import resize, to_uint8
 from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext, strayed, unusable

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from synthetic_colmap import shipped
 
 from gsx.builtin import plugins
-from gsx.core.data.images import resize, write_image
+from gsx.core.data.images import write_image
+from gsx.core.data.resize import resize
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.gaussians.ply import write_ply

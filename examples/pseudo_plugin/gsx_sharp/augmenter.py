@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from gsx.core.data.images import to_uint8
+from gsx.core.data.resize import to_uint8
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Request

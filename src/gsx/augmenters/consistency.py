@@ -4,8 +4,8 @@ averages."""
 import torch
 from torch import Tensor
 
-from gsx.core.data.images import to_uint8
 from gsx.core.data.reduction import Reduction, projected
+from gsx.core.data.resize import to_uint8
 from gsx.core.shapes import Bool, Float, Int, UInt8
 
 BOX = Reduction()

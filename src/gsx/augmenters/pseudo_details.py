@@ -31,8 +31,9 @@ from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.pixel_weights import WeightMap, agreeing, in_bytes, sampled_better, seen_alike
 from gsx.augmenters.timing import SPLITS, Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import to_uint8, write_image
+from gsx.core.data.images import write_image
 from gsx.core.data.reduction import Reduction, as_blocks, projected
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.run_folder.checkpoint import sidecars, step_of

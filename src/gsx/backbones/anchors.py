@@ -18,8 +18,6 @@ from torch.nn import Parameter
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
 from gsx.backbones.growth import (
-    GrowthOptions,
-    Quirks,
     clamp_scales,
     eligible,
     fresh_statistics,
@@ -29,22 +27,11 @@ from gsx.backbones.growth import (
     observe,
     prune,
     reset_offsets,
-    resolved,
 )
+from gsx.backbones.growth_options import GrowthOptions, Quirks, resolved
 from gsx.backbones.heads import HeadOptions, Heads
-from gsx.backbones.levels import (
-    LevelOptions,
-    Levels,
-    all_levels_from,
-    checked_end,
-    derive,
-    drawn,
-    facts_of,
-    faithful,
-    initial_nodes,
-    note_of,
-    warnings_of,
-)
+from gsx.backbones.level_options import LevelOptions, checked_end, faithful
+from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, initial_nodes, note_of, warnings_of
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud

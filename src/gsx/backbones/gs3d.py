@@ -20,20 +20,9 @@ from gsx.backbones.clone_split import (
     stacked,
     starting_points,
 )
-from gsx.backbones.growth import Quirks
-from gsx.backbones.levels import (
-    LevelOptions,
-    Levels,
-    all_levels_from,
-    checked_end,
-    derive,
-    drawn,
-    facts_of,
-    kept,
-    note_of,
-    quantile,
-    warnings_of,
-)
+from gsx.backbones.growth_options import Quirks
+from gsx.backbones.level_options import LevelOptions, checked_end
+from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, kept, note_of, quantile, warnings_of
 from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
 from gsx.backbones.sampling import sampled_means
 from gsx.core.data.camera import Camera, offsets_from

@@ -15,98 +15,34 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import new_cells
+from gsx.backbones.level_options import LevelOptions
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
 
-MODES = ("round", "floor", "ceil", "progressive")
-EXTEND_RULES = ("reference", "sane")
-ZOOM_RULES = ("finer", "training")
 BELOW_ONE = 0.9999
 """Largest fading weight and largest fraction of a level in progressive mode (spec 3.7); largest adaptive threshold."""
+
+
 LEAST_DISTANCE = 1e-8
 """Distances are held above this fraction of the farthest: the logarithm of a camera at a primitive is finite."""
+
+
 MANY_LEVELS = 12
+
+
 NEAR_RATIO = 1e-3
 """A nearest distance below this fraction of the farthest comes from points at cameras."""
+
+
 FEW_ANCHORS = 100
+
+
 MANY_ANCHORS = 5_000_000
+
+
 FLOAT_STEP = 2.0**-23
 """Neighbouring float32 numbers differ by up to this fraction."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LevelOptions:
-    """Options of the levels; values in conf/backbone, with their sources."""
-
-    fork: int
-    count: int
-    """Number of levels; -1: from the range of distances in the scene (spec 3.1)."""
-    first: int
-    """Highest level at the start; -1: half of them (spec 3.1)."""
-    base_layer: int
-    """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel` (spec 3.2)."""
-    voxel: float
-    """Cell of the middle level where base_layer is -1, scene units."""
-    distance_quantile: float
-    """Distances between this quantile and its mirror count, per camera and over cameras (spec 3.1)."""
-    extend: float
-    """The box is the points' range of coordinates times this (spec 3.2)."""
-    extend_rule: str
-    """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
-    box grows on both sides wherever it lies, to the same length (spec 3.2); '': as backbone.fidelity says."""
-    visible_threshold: float
-    """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
-    fraction (spec 3.4)."""
-    mode: str
-    """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (spec 3.7)."""
-    half_cell: bool | None
-    """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5); None: as
-    backbone.fidelity says."""
-    zoom: str
-    """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
-    reference does, trained there or not; training: none that the finest training camera would not draw."""
-    coarse_until: int
-    """Published step at which all levels take part in training (spec 3.6); 0: from the start."""
-    coarse_factor: float
-    """Each interval between two levels is this much shorter than the one before (spec 3.6)."""
-
-    def __post_init__(self) -> None:
-        threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES) + ", or '' for backbone.fidelity's"
-        self.demand("mode", self.mode in MODES, f"choose {', '.join(MODES)}")
-        self.demand("extend_rule", self.extend_rule in ("", *EXTEND_RULES), f"choose {rules}")
-        self.demand("zoom", self.zoom in ZOOM_RULES, f"choose {', '.join(ZOOM_RULES)}")
-        self.demand("fork", self.fork >= 2, "give at least 2")
-        self.demand("count", self.count == -1 or self.count >= 1, "give at least 1, or -1 to take it from the scene")
-        self.demand("first", self.first >= -1, "give a level from 0, or -1 for half of them")
-        self.demand("base_layer", self.base_layer >= -1, "give at least 0, or -1 to take it from voxel")
-        self.demand("voxel", self.voxel > 0, "give a length above 0")
-        self.demand("distance_quantile", 0.5 < self.distance_quantile <= 1, "give a value above 0.5, at most 1")
-        self.demand("extend", self.extend >= 1, "give at least 1")
-        self.demand("visible_threshold", threshold == -1 or 0 <= threshold < 1, "give -1, or from 0 to below 1")
-        self.demand("coarse_factor", self.coarse_factor >= 1, "give at least 1")
-
-    def demand(self, name: str, met: bool, advice: str) -> None:
-        """Refuse a value that does not meet a condition."""
-        if not met:
-            raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
-
-
-def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None:
-    """The options, with the switches of the reference's quirks that they leave open as the fidelity has them."""
-    if options is None:
-        return None
-    half_cell = fidelity == "reference" if options.half_cell is None else options.half_cell
-    return replace(options, extend_rule=options.extend_rule or fidelity, half_cell=half_cell)
-
-
-def checked_end(options: LevelOptions | None, published: int) -> None:
-    """Refuse a schedule that ends with levels that never took part in training."""
-    if options is not None and options.coarse_until >= published:
-        raise ValueError(
-            f"backbone.levels.coarse_until is {options.coarse_until}, and the published run "
-            f"(backbone.published_iterations) ends at {published}: the finest level would never train; give less"
-        )
 
 
 def all_levels_from(options: LevelOptions, schedule: Schedule) -> int:
@@ -205,9 +141,6 @@ class Levels:
         return nearness.log2() / math.log2(self.fork)
 
 
-# -- deriving levels from a scene ------------------------------------------------------------------------------------
-
-
 def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: LevelOptions, until: int) -> Levels:
     """The levels of a scene from its points and training cameras (spec 3.1, 3.2, 3.4, 3.6).
 
@@ -292,9 +225,6 @@ def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
     return min(float(seen_fraction(levels, positions, of).double().mean()), BELOW_ONE)
 
 
-# -- nodes -----------------------------------------------------------------------------------------------------------
-
-
 def all_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "C 3"], Int[Tensor, "C"], Int[Tensor, "K P"]]:
@@ -321,9 +251,6 @@ def initial_nodes(
     chosen = kept(levels, positions, of)
     number = torch.where(chosen, chosen.cumsum(0) - 1, -1)
     return positions[chosen], of[chosen], number[group]
-
-
-# -- which levels a camera draws -------------------------------------------------------------------------------------
 
 
 def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int[Tensor, "M"], Float[Tensor, "M"]]:
@@ -372,9 +299,6 @@ def drawn(
     return (of <= top) | ~known, torch.where((of == top) & known, weight, 1.0)
 
 
-# -- schedules over levels -------------------------------------------------------------------------------------------
-
-
 def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
     """Steps at which the levels above `first` join, each interval shorter than the last (spec 3.6)."""
     intervals = count - 1 - first
@@ -390,9 +314,6 @@ def unlocked(switches: Sequence[int], first: int, step: int) -> int:
 def thresholds(base: float, fork: int, update_ratio: float, count: int) -> tuple[float, ...]:
     """Gradient at which a primitive of each level grows: tau_L = base f^(update_ratio L) (spec 3.8)."""
     return tuple(base * fork ** (update_ratio * level) for level in range(count))
-
-
-# -- what to tell ----------------------------------------------------------------------------------------------------
 
 
 def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, Any]:

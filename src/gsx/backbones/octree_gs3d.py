@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
 from gsx.backbones.clone_split import LevelDensityOptions
 from gsx.backbones.gs3d import GS3D, Density, GS3DOptions, Rates
-from gsx.backbones.levels import faithful
+from gsx.backbones.level_options import faithful
 from gsx.core.training.backbone import BackboneContext
 
 FORMS = ("anchors", "clone_split")

@@ -3,12 +3,9 @@
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from gsx.core.errors import ConfigError, InputError
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_words(verb: str, words: list[str], description: str) -> tuple[Path, list[str]]:

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from gsx import __version__
 from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
@@ -12,9 +11,6 @@ from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.processes import processes
-
-if TYPE_CHECKING:
-    pass
 
 HELP = """\
 gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.

@@ -2,14 +2,10 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, new_folder
 from gsx.core.errors import InputError, nearest
-
-if TYPE_CHECKING:
-    pass
 
 
 def verb_report(words: list[str]) -> int:

@@ -3,14 +3,10 @@
 import errno
 import logging
 import sys
-from typing import TYPE_CHECKING
 
 from gsx.core.errors import GsxError
 from gsx.core.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED
-
-if TYPE_CHECKING:
-    pass
 
 
 def explained(error: BaseException) -> int:

@@ -4,14 +4,10 @@ import argparse
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import run_words
 from gsx.core.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 logger = logging.getLogger("gsx.cli")
 

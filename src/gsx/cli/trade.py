@@ -4,14 +4,10 @@ import argparse
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, new_folder, positive, whole
 from gsx.core.errors import ConfigError, InputError, nearest
-
-if TYPE_CHECKING:
-    pass
 
 logger = logging.getLogger("gsx.cli")
 
@@ -59,7 +55,8 @@ def verb_trade(words: list[str]) -> int:
         remedy = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...]"
         raise ConfigError(f"'{words[0]}' is nothing gsx can trade.{nearest(words[0], ['rasterizer'])} Type {remedy}")
     given = trade_arguments(words[1:])
-    from gsx.experiments.trade.knobs import advice_lines, check_knobs, table
+    from gsx.experiments.trade.advice import advice_lines, table
+    from gsx.experiments.trade.knobs import check_knobs
     from gsx.experiments.trade.measure import sweep, usable_paths
     from gsx.experiments.trade.page import write_trade
     from gsx.experiments.trade.subject import open_subject

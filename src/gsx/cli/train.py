@@ -4,16 +4,13 @@ import logging
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import run_words
 from gsx.cli.messages import complain, os_sentence, set_up_logging
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
-
-if TYPE_CHECKING:
-    pass
 
 logger = logging.getLogger("gsx.cli")
 HYDRA_FLAGS = (

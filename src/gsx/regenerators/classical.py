@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from gsx.core.data.images import resize, to_uint8
+from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, centred
-from gsx.core.data.images import ImageCache, PhotoSource, ResizeRule, Size, checked_size, training_size
+from gsx.core.data.images import ImageCache, PhotoSource, checked_size
 from gsx.core.data.reduction import Reduction
+from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.shapes import Float

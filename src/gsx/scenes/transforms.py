@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from gsx.core.data.images import Size, image_size
+from gsx.core.data.images import image_size
+from gsx.core.data.resize import Size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import InputError, nearest
 from gsx.scenes.options import SceneOptions

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import read_image, to_uint8, write_image
+from gsx.core.data.images import read_image, write_image
+from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
 

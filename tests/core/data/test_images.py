@@ -10,21 +10,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, centred
-from gsx.core.data.images import (
-    ImageCache,
-    PhotoSource,
-    ResizeRule,
-    checked_size,
-    composite,
-    display_from_linear,
-    image_size,
-    linear_from_display,
-    read_image,
-    resize,
-    to_uint8,
-    training_size,
-    write_image,
-)
+from gsx.core.data.images import ImageCache, PhotoSource, checked_size, composite, image_size, read_image, write_image
+from gsx.core.data.resize import ResizeRule, display_from_linear, linear_from_display, resize, to_uint8, training_size
 from gsx.core.errors import ConfigError, InputError
 
 RULE = ResizeRule(filter="bicubic", light="display", background=(1.0, 1.0, 1.0))

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
-from gsx.core.data.images import display_from_linear, resize, to_uint8
 from gsx.core.data.reduction import ENOUGH, Reduction, projected
+from gsx.core.data.resize import display_from_linear, resize, to_uint8
 from gsx.core.quality.metrics import psnr
 
 FILTERS = ["area", "bicubic", "lanczos"]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.builtin import plugins
-from gsx.core.data.images import to_uint8
+from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize

@@ -7,8 +7,8 @@ import torch
 from regenerating import request, strict_checks
 from torch import Tensor
 
-from gsx.core.data.images import resize, to_uint8
 from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.data.resize import resize, to_uint8
 from gsx.core.training.regenerator import Check, Request, colour_matched, displacement, strayed, unusable
 
 STRICT = strict_checks()

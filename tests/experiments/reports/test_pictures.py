@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import image_size, linear_from_display, read_image
+from gsx.core.data.images import image_size, read_image
+from gsx.core.data.resize import linear_from_display
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.window import Window
 from gsx.core.evaluation import evaluator

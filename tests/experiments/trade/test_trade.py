@@ -18,38 +18,23 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
 from gsx.experiments.reports.charts import Axis, Dot, scatter
+from gsx.experiments.trade.advice import advice_lines, front_of, most_exact, recommended, rounded_up, table
+from gsx.experiments.trade.bench import EXACT, Bench, Times, check_truth, fell_back
 from gsx.experiments.trade.knobs import (
     KNOBS,
     Row,
     Trial,
-    advice_lines,
     check_knobs,
     combinations,
     evenly,
-    front_of,
     gradient_error,
     image_errors,
-    most_exact,
     ordered,
     overrides,
     pooled_psnr,
-    recommended,
-    rounded_up,
     single_changes,
-    table,
 )
-from gsx.experiments.trade.measure import (
-    EXACT,
-    Bench,
-    Times,
-    at_pace,
-    check_truth,
-    fell_back,
-    resolved,
-    sweep,
-    timed,
-    unsteady,
-)
+from gsx.experiments.trade.measure import at_pace, resolved, sweep, timed, unsteady
 from gsx.experiments.trade.page import write_trade
 from gsx.experiments.trade.subject import Shot, Subject, framing_cameras, open_subject
 

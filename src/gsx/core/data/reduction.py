@@ -1,6 +1,6 @@
 """How a coarse picture comes from a finer one: the one image formation that a scene declares, and its adjoint.
 
-Photographs become training pictures by a filter (`core.images.resize`). What is known of a finer picture is that the
+Photographs become training pictures by a filter (`resize.resize`). What is known of a finer picture is that the
 same filter takes it to the training picture, without the 8 bits in between.
 """
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, conv_transpose2d
 
-from gsx.core.data.images import FILTERS, KERNELS, LIGHTS, REACH, display_from_linear, linear_from_display
+from gsx.core.data.resize import FILTERS, KERNELS, LIGHTS, REACH, display_from_linear, linear_from_display
 from gsx.core.shapes import Float
 
 ROUNDS = 15
@@ -23,7 +23,7 @@ PACE, MEMORY = 1.73, 0.139
 
 @dataclass(frozen=True, kw_only=True)
 class Reduction:
-    """A filter that widens with the factor, as of `core.images.resize`, on display values or on light."""
+    """A filter that widens with the factor, as of `resize.resize`, on display values or on light."""
 
     filter: str = "area"
     light: str = "display"

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsx.core.data.images import to_uint8
+from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.plugins import load_plugins

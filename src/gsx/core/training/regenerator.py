@@ -98,7 +98,7 @@ class RegeneratorContext:
     """The model as it is now."""
     held_out: Callable[[float], list[Float[Tensor, "3 h w"]]]
     """The views, in order, as models show them that were fitted to the other half of the views alone, each for that
-    share of the steps that the run has taken (`core.halves`): what to learn repair from. Costs that training, once."""
+    share of the steps that the run has taken (`halves`): what to learn repair from. Costs that training, once."""
     step: int
     seed: int
     device: torch.device

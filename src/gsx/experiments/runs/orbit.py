@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import to_uint8
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import replacing

@@ -36,7 +36,7 @@ class GeneralOptions:
     data_root: str = ""
     """Where datasets lie."""
     reuse: bool = False
-    """The run's folder is named by its composition; what is finished there is not trained again (`core.identity`)."""
+    """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
     init: str = "scratch"
     """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
     trunk_at: list[int] = field(default_factory=list)

@@ -14,8 +14,10 @@ from gsx.core.files import replace_file, write_json
 from gsx.core.run_folder.files import is_number
 from gsx.experiments.reports.charts import Dot, scatter
 from gsx.experiments.reports.page import NONE, fixed, template
-from gsx.experiments.trade.knobs import COSTS, KNOBS, OUTLIERS, Row, advice, advice_lines, front_of, overrides, shown
-from gsx.experiments.trade.measure import EXACT, UNBOUNDED, Trade
+from gsx.experiments.trade.advice import advice, advice_lines, front_of, shown
+from gsx.experiments.trade.bench import EXACT, UNBOUNDED
+from gsx.experiments.trade.knobs import COSTS, KNOBS, OUTLIERS, Row, overrides
+from gsx.experiments.trade.measure import Trade
 
 ERRORS = {"max_error": "max error", "most_error": f"error of all but {OUTLIERS:.2%} of the pixels"}
 """Errors that are drawn against time."""

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, make_folder, make_room
-from gsx.core.data.images import read_image, resize, to_uint8, write_image
+from gsx.core.data.images import read_image, write_image
+from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp

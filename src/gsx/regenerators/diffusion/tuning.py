@@ -5,7 +5,6 @@ become the photograph's in the one step that image-to-image executes.
 """
 
 import hashlib
-import json
 import logging
 import math
 import time
@@ -14,19 +13,29 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key, make_folder, make_room
+from gsx.core.cache import cache_folder, content_key
 from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
-from gsx.core.errors import InputError, TrainingError
+from gsx.core.errors import TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.shapes import Float, Int
 from gsx.core.training.regenerator import RegeneratorContext
+from gsx.regenerators.diffusion.adapters import (
+    ADAPTERS,
+    FACTS,
+    WEIGHTS,
+    adapter_bytes,
+    add_adapter,
+    adopted,
+    merge,
+    read_facts,
+    share,
+)
 from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, steps_for
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
@@ -35,16 +44,16 @@ from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 
 logger = logging.getLogger(__name__)
-
-ADAPTERS = "lora"
-"""Kind of the adapters in the cache."""
-WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
 REASONS = {
     "raw": "tuning does not help on held-out renders",
     "renders": "held-out renders are closest to their photographs as they are (regenerator/restore=identity)",
 }
 """Why an adapter is not merged, by what is closest to the photographs."""
+
+
 WEIGHT_DECAY = 1e-2
+
+
 LARGEST_NORM = 1.0
 """To which gradients are clipped (spec 5.1)."""
 
@@ -164,9 +173,6 @@ def closest(figures: dict[str, float]) -> str:
     return min(errors, key=lambda name: errors[name] if math.isfinite(errors[name]) else math.inf)
 
 
-# -- pairs -------------------------------------------------------------------------------------------------------------
-
-
 def divided(context: RegeneratorContext, options: TuningOptions) -> Pairs:
     """Held-out renders of most training views, and of others, spread evenly over the views, to measure on."""
     pairs = held_out_pairs(context, options.halves)
@@ -217,9 +223,6 @@ def cropped(
     return renders, photos
 
 
-# -- learning ----------------------------------------------------------------------------------------------------------
-
-
 def learn(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair], seed: int) -> bool:
     """Give the model an adapter and train it; whether all steps were taken."""
     generator, tuning = torch.Generator().manual_seed(seed), options.tuning
@@ -247,28 +250,6 @@ def learn(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[
             rates.step()
             progress.more(1)
     return True
-
-
-def add_adapter(pipe: Any, tuning: TuningOptions, seed: int) -> list[torch.nn.Parameter]:
-    """What is trained: low-rank changes of some layers, zero at first, in float32; everything else is frozen."""
-    from peft import LoraConfig
-
-    for network in (pipe.unet, pipe.vae, pipe.text_encoder, pipe.text_encoder_2):
-        network.requires_grad_(False)
-    with torch.random.fork_rng():  # peft draws from the global generator
-        torch.manual_seed(seed)
-        pipe.unet.add_adapter(
-            LoraConfig(
-                r=tuning.rank,
-                lora_alpha=tuning.rank,
-                init_lora_weights="gaussian",
-                target_modules=list(tuning.layers),
-            )
-        )
-    adapted = [parameter for parameter in pipe.unet.parameters() if parameter.requires_grad]
-    for parameter in adapted:
-        parameter.data = parameter.data.float()
-    return adapted
 
 
 def rate_at(step: int, tuning: TuningOptions) -> float:
@@ -351,69 +332,3 @@ def as_trained(unet: Any, checkpointing: bool) -> Iterator[None]:
         if checkpointing:
             unet.disable_gradient_checkpointing()
         unet.eval()
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
-def adapter_bytes(pipe: Any) -> bytes:
-    """The adapter as `diffusers` writes it."""
-    from peft.utils import get_peft_model_state_dict
-
-    with TemporaryDirectory() as folder:
-        pipe.save_lora_weights(folder, unet_lora_layers=get_peft_model_state_dict(pipe.unet), weight_name=WEIGHTS)
-        return (Path(folder) / WEIGHTS).read_bytes()
-
-
-def adopted(shared: Path, own: Path) -> bool:
-    """Whether the cache had the adapter; it is then in the run's folder too."""
-    if not (shared / FACTS).is_file():
-        return False
-    try:
-        read_facts(shared)
-        copy_adapter(shared, own)
-    except (OSError, TrainingError) as error:
-        logger.warning("%s; it is learnt again", error)
-        return False
-    return True
-
-
-def share(own: Path, shared: Path, cache_gb: float) -> None:
-    """Let later runs have the adapter; a cache that cannot be written is no error."""
-    if not cache_gb:
-        return
-    try:
-        copy_adapter(own, make_folder(shared))
-        make_room(ADAPTERS, cache_gb)
-    except (OSError, InputError) as error:
-        logger.warning("%s: later runs will learn again", error)
-
-
-def copy_adapter(source: Path, target: Path) -> None:
-    """From folder to folder; what tells that it is whole comes last."""
-    target.mkdir(parents=True, exist_ok=True)
-    for name in (WEIGHTS, FACTS):
-        replace_file(target / name, (source / name).read_bytes())
-
-
-def read_facts(folder: Path) -> dict[str, Any]:
-    """What is known of the adapter in a folder.
-
-    Raises:
-        TrainingError: it is damaged.
-    """
-    try:
-        facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
-        if hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest() == facts["sha256"]:
-            return facts
-        problem = f"{WEIGHTS} is not the file that was written"
-    except (OSError, ValueError, KeyError) as error:
-        problem = str(error)
-    raise TrainingError(f"the adapter in {folder} is damaged ({problem}): remove the folder, and it is learnt again")
-
-
-def merge(pipe: Any, folder: Path) -> None:
-    """Add an adapter to the weights of a model."""
-    pipe.load_lora_weights(folder, weight_name=WEIGHTS, local_files_only=True)
-    pipe.fuse_lora()
-    pipe.unload_lora_weights()

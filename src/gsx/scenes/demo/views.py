@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import ImageCache, read_image, training_size, write_image
+from gsx.core.data.images import ImageCache, read_image, write_image
+from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.shapes import Float, UInt8

@@ -1,0 +1,152 @@
+"""Pictures made smaller or larger: kernels, the light they are averaged in, sizes in training."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.errors import ConfigError, nearest
+from gsx.core.shapes import Float, UInt8
+
+Size = tuple[int, int]
+"""(width, height) in pixels."""
+FILTERS = ("bicubic", "area", "lanczos")
+
+
+LIGHTS = ("display", "linear")
+
+
+def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Light of display values in [0, 1] (IEC 61966-2-1, sRGB)."""
+    return torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+def display_from_linear(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Display values of light, clamped to [0, 1] (IEC 61966-2-1, sRGB)."""
+    light = light.clamp(0, 1)
+    bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
+
+
+def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:
+    """Size to train at (spec 8.1): divided by `downscale` and rounded; else limited to `max_width` (0: no limit).
+
+    Raises:
+        ConfigError: downscale is below 1 or max_width below 0.
+    """
+    if downscale < 1 or max_width < 0:
+        raise ConfigError(
+            f"scene.downscale is {downscale} and scene.max_width {max_width}, they must be at least 1 and 0."
+        )
+    if downscale > 1:
+        return max(1, round(width / downscale)), max(1, round(height / downscale))
+    if max_width and width > max_width:
+        scale = width / max_width
+        return int(width / scale), max(1, int(height / scale))
+    return width, height
+
+
+def resize(
+    image: UInt8[Tensor, "C H W"], width: int, height: int, filter: str = "bicubic", light: str = "display"
+) -> UInt8[Tensor, "C height width"]:
+    """The image on another raster, each channel on its own: composite alpha first.
+
+    All filters widen with the reduction, so nothing aliases: Keys' cubic with a = -0.5, which on display values is
+    the published filter; the coverage of pixels by pixels (area); Lanczos with 3 lobes.
+
+    Raises:
+        ConfigError: an unknown filter or light.
+    """
+    _refuse_unknown("scene.resize_filter", filter, FILTERS)
+    _refuse_unknown("scene.resize_light", light, LIGHTS)
+    if image.shape[1:] == (height, width):
+        return image
+    across, down = _weights(image.shape[2], width, filter), _weights(image.shape[1], height, filter)
+    if light == "linear":
+        values = _down(_across(linear_from_display(image.float() / 255), across), down)
+        return to_uint8(display_from_linear(values))
+    values = _across(image.float(), across)
+    if filter == "bicubic":  # Pillow, whose result is the published one, keeps 8 bits between its two passes
+        values = _rounded(values).float()
+    return _rounded(_down(values, down))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResizeRule:
+    """How photographs become training images."""
+
+    filter: str
+    light: str
+    background: tuple[float, float, float]
+    """Display RGB in [0, 1] behind images with alpha."""
+
+    def __post_init__(self) -> None:
+        _refuse_unknown("scene.resize_filter", self.filter, FILTERS)
+        _refuse_unknown("scene.resize_light", self.light, LIGHTS)
+        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
+            raise ConfigError(f"scene.background is {list(self.background)}, give red, green and blue in [0, 1].")
+
+
+def _refuse_unknown(key: str, value: str, options: tuple[str, ...]) -> None:
+    if value not in options:
+        raise ConfigError(f"{key} is '{value}', use one of {', '.join(options)}.{nearest(value, options)}")
+
+
+def _across(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new W"]) -> Float[Tensor, "C H new"]:
+    return _down(values.transpose(1, 2), weights).transpose(1, 2)
+
+
+def _down(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new H"]) -> Float[Tensor, "C new W"]:
+    return torch.stack([weights @ channel.contiguous() for channel in values])
+
+
+def _rounded(levels: Float[Tensor, "C H W"]) -> UInt8[Tensor, "C H W"]:
+    """Values already in 0..255 to 8 bits; ties, which are exact on this scale, go up."""
+    return (levels + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size size"]:
+    """The filter as a sparse matrix whose rows add up to 1: what each new pixel takes from the old ones."""
+    ratio = size / new_size
+    stretch = max(ratio, 1.0)
+    reach = (1 + ratio) / 2 if filter == "area" else REACH[filter] * stretch
+    centre = ((torch.arange(new_size, dtype=torch.float64) + 0.5) * ratio)[:, None]
+    old = (centre - reach - 0.5).ceil().long() + torch.arange(math.floor(2 * reach) + 1)
+    distance = old + 0.5 - centre
+    weights = _overlap(distance, ratio) if filter == "area" else KERNELS[filter](distance / stretch)
+    weights = torch.where((distance.abs() <= reach) & (old >= 0) & (old < size), weights, 0)
+    weights /= weights.sum(1, keepdim=True)
+    new = torch.arange(new_size)[:, None].expand_as(old)
+    places = torch.stack([new.flatten(), old.clamp(0, size - 1).flatten()])
+    return torch.sparse_coo_tensor(
+        places, weights.flatten().float(), (new_size, size), check_invariants=False
+    ).coalesce()
+
+
+def _overlap(distance: Tensor, ratio: float) -> Tensor:
+    """Length shared by an old pixel (length 1) and a new one (length `ratio`), centres `distance` apart."""
+    return ((1 + ratio) / 2 - distance.abs()).clamp(0, min(1, ratio))
+
+
+def _keys(x: Tensor) -> Tensor:
+    """Keys (1981) with a = -0.5, for |x| <= 2."""
+    x = x.abs()
+    inner = (1.5 * x - 2.5) * x * x + 1
+    return torch.where(x < 1, inner, ((-0.5 * x + 2.5) * x - 4) * x + 2)
+
+
+def _lanczos(x: Tensor) -> Tensor:
+    """sinc windowed by its own central lobe, three times as wide, for |x| <= 3."""
+    return torch.sinc(x) * torch.sinc(x / 3)
+
+
+KERNELS = {"bicubic": _keys, "lanczos": _lanczos}
+
+
+REACH = {"bicubic": 2, "lanczos": 3}
+
+
+def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    """Display values in [0, 1] rounded to 8 bits: x 255 + 0.5, clamped (spec 8.2)."""
+    return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
