@@ -7,7 +7,8 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
+from gsx.augmenters.pseudo_details import PseudoDetails
+from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import as_blocks, box_average
 from gsx.core.data.resize import to_uint8

@@ -9,7 +9,8 @@ from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 @hookimpl
 def gsx_register(registry: Registry) -> None:
     """Scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
-    from gsx.augmenters.pseudo_details import PseudoDetails, PseudoOptions
+    from gsx.augmenters.pseudo_details import PseudoDetails
+    from gsx.augmenters.pseudo_options import PseudoOptions
     from gsx.backbones.anchors import NeuralOptions, neural_anchors
     from gsx.backbones.gs3d import GS3D, GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 from torch import Tensor
 
-import gsx.augmenters.pseudo_details as pseudo_details
+import gsx.augmenters.redraw as redraw
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
@@ -98,7 +98,7 @@ def test_on_training_views_true_pixels_help_the_more_the_closer_and_displaced_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half a pixel of displacement, let through: the checks that would drop it have tests of their own."""
-    monkeypatch.setattr(pseudo_details, "strayed", lambda request, result, checks: {})
+    monkeypatch.setattr(redraw, "strayed", lambda request, result, checks: {})
     control, perfect, displaced = (
         trained(tmp_path / name, pixels) for name, pixels in (("control", None), ("perfect", 0.0), ("displaced", 0.5))
     )

@@ -13,7 +13,7 @@ from gsx.augmenters.pixel_weights import (
     sampling_ratios,
     seen_alike,
 )
-from gsx.augmenters.pseudo_details import WEIGHT_MAPS
+from gsx.augmenters.pseudo_options import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.gaussians.splats import Splats

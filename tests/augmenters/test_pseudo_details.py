@@ -370,7 +370,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     spot = (own.centre + distance * own.rotation[2]).float()
     table.columns["anchors"] = spot.expand(len(table), 3).clone()
     table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)
-    cameras = [own, *(augmenter_of(run).spec(run, 44, 0, scale, 0).camera for scale in (2, 4))]
+    cameras = [own, *(augmenter_of(run).planner.spec(run, 44, 0, scale, 0).camera for scale in (2, 4))]
     drawn = [table["level"][backbone.visible(camera, 80).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
     assert drawn == [[0, 1], [0, 1, 2], [0, 1, 2, 3]]
 
@@ -443,7 +443,7 @@ def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
             kept = table["opacity_logits"].detach().clone()
             table["opacity_logits"].data.copy_(torch.where(places[:, :1] > 16, -30.0, 0.0).view_as(kept))
             augmenter = by_options(run, least_alpha=wanted)
-            spec = augmenter.spec(run, 44, parent, 4, 0)
+            spec = augmenter.planner.spec(run, 44, parent, 4, 0)
             alphas.append(float(render(run, spec.inside.of(spec.seen)).alpha.mean()))
             table["opacity_logits"].data.copy_(kept)
         least[wanted] = min(alphas)
@@ -459,7 +459,7 @@ def test_the_share_of_consistent_pixels_is_told(
     caplog.set_level("INFO")
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *words)
     augmenter_of(run).term(run, 45, 0)
-    share = load_views(augmenter_of(run).path(run, 44))[1]["consistent"]
+    share = load_views(augmenter_of(run).store.path(run, 44))[1]["consistent"]
     assert share == 1.0 if least else 0.0 < share < 0.9
     assert f"{100 * share:.1f}% consistent pixels" in caplog.text
 

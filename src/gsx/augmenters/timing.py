@@ -1,5 +1,6 @@
 """When pseudo views are made, how long they count, and how much (spec 1.2)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gsx.core.training.schedule import Schedule
@@ -42,13 +43,13 @@ def span_of(timing: Timing, schedule: Schedule) -> int:
     return max(1, schedule.step(timing.span))
 
 
-def event_at(step: int, events: list[int], span: int) -> int | None:
+def event_at(step: int, events: Sequence[int], span: int) -> int | None:
     """The event whose window a step (1-based) lies in; windows never outlast the next event."""
     begun = [event for event in events if event < step]
     return begun[-1] if begun and step <= begun[-1] + span else None
 
 
-def progress(step: int, event: int, events: list[int], span: int, split: str) -> float:
+def progress(step: int, event: int, events: Sequence[int], span: int, split: str) -> float:
     """How far along a step is, 0 to 1: in its window, or in the run from the first event to the last window's end."""
     if split == "run":
         return (step - events[0] - 1) / max(1, events[-1] + span - events[0] - 1)

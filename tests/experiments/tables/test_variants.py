@@ -6,7 +6,7 @@ import pytest
 from regenerating import noisy
 from tiny import tiny_settings
 
-from gsx.augmenters.pseudo_details import PseudoOptions
+from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.builtin import plugins
 from gsx.core.run_folder.run_key import composition_key
 from gsx.core.training.augmenter import Foretold
