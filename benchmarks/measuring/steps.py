@@ -8,7 +8,7 @@ from gsx.builtin import plugins
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.run import Run
-from gsx.core.training.trainer import take_step
+from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
@@ -49,7 +49,7 @@ def stepping(run: Run, loaded: Plugins, raster: RasterSettings) -> Job:
         run.raster = raster
         run.sampler.order.append(next(views))
         watch.begin()
-        take_step(run, loaded)
+        train_step(run, loaded)
         watch.lap("step")
 
     return job

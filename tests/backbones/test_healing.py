@@ -20,7 +20,7 @@ from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import RasterSettings, rasterize, touches
 from gsx.core.training.guard import Guard
 from gsx.core.training.run import Run, Sampler, TrainingOptions
-from gsx.core.training.trainer import backward, take_step
+from gsx.core.training.trainer import backward, train_step
 
 NEURAL = ("scaffold", "octree_scaffold")
 WITH_QUATS = ("gs3d", "mip_splatting", "octree_gs3d", "octree_gs3d, clone_split")
@@ -71,11 +71,11 @@ def assert_removed(run: Run, plugins: Plugins, caplog: pytest.LogCaptureFixture,
     before = run.backbone.size()[0]
     caplog.clear()
     with caplog.at_level(logging.WARNING, "gsx.core.training.trainer"):
-        step = take_step(run, plugins)
+        step = train_step(run, plugins)
     assert "removed 1 primitives" in step.skipped, what
     assert f"step {step.number}: removed 1 primitives with values that are not finite" in caplog.text, what
     assert run.backbone.size()[0] == before - 1, what
-    after = take_step(run, plugins)
+    after = train_step(run, plugins)
     assert not after.skipped, what
     assert after.dropped == 0, what
     for name, value in run.backbone.tensors().items():
@@ -137,9 +137,9 @@ def test_anchors_are_not_blamed_for_their_networks(name: str, tmp_path: Path) ->
     count = len(backbone.table)
     with guarded() as plugins:
         for _ in range(2):
-            assert "removed" not in take_step(run, plugins).skipped
+            assert "removed" not in train_step(run, plugins).skipped
         with pytest.raises(TrainingError, match="3 steps in a row"):
-            take_step(run, plugins)
+            train_step(run, plugins)
     assert len(backbone.table) == count
 
 
@@ -208,7 +208,7 @@ def test_zero_quaternions_become_the_identity_and_turn_again(name: str, tmp_path
         table["quats"][row] = 0.0
         table["log_scales"][row] += torch.linspace(-0.5, 0.5, table["log_scales"].shape[1])
     with guarded() as plugins:
-        take_step(run, plugins)
+        train_step(run, plugins)
         assert table["quats"][row].tolist() == [1.0, 0.0, 0.0, 0.0]
-        take_step(run, plugins)
+        train_step(run, plugins)
     assert table["quats"][row, 1:].any()

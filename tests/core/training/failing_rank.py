@@ -10,7 +10,7 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
 from gsx.core.training import trainer
 
-whole = trainer.backward_of
+whole = trainer.view_loss
 
 
 def broken(run, number, *rest):
@@ -28,5 +28,5 @@ def broken(run, number, *rest):
     return whole(run, number, *rest)
 
 
-trainer.backward_of = broken
+trainer.view_loss = broken
 sys.exit(main())

@@ -22,7 +22,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.distributed import Ranks, placed, ranks_here, refuse_uneven
 from gsx.core.training.guard import Agreement
 from gsx.core.training.run import Run, Sampler, TrainingOptions
-from gsx.core.training.trainer import take_step
+from gsx.core.training.trainer import train_step
 
 COMMON = ("rasterizer=eager", "iterations=30", "training.batch=2", "training.checkpoint_every=12")
 GS3D = (*COMMON, "backbone.density.every=400", "backbone.density.reset_passes=1", "backbone.density.gradient=1e-6",
@@ -249,7 +249,7 @@ def test_ranks_that_disagree_are_stopped_where_checkpoints_are_due(tmp_path: Pat
         generator=torch.Generator(),
         sampler=Sampler(4, 0),
     )
-    step = take_step(run, load_plugins([], points=[]))
+    step = train_step(run, load_plugins([], points=[]))
     agreed, apart = replace(run, ranks=Two(size=2)), replace(run, ranks=Two(size=2, other="another digest"))
     for apart.step in (1, 2, 4, 5):
         Agreement().gsx_step_finished(apart, step)

@@ -16,7 +16,7 @@ from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.guard import Guard
 from gsx.core.training.run import Run, Sampler, Step, TrainingOptions
-from gsx.core.training.trainer import take_step, train
+from gsx.core.training.trainer import train, train_step
 
 
 class Poisoned(GS3D):
@@ -95,10 +95,10 @@ def test_a_poisoned_step_changes_nothing_and_names_the_culprit(
 ) -> None:
     run, plugins = run_with({2: kind}, tmp_path), load_plugins([], points=[])
     with plugins.listening([Guard()]):
-        assert take_step(run, plugins).skipped == ""
+        assert train_step(run, plugins).skipped == ""
         before = state(run)
         with caplog.at_level(logging.WARNING, "gsx.core.training.guard"):
-            bad = take_step(run, plugins)
+            bad = train_step(run, plugins)
         assert bad.skipped == reason
         assert f"step 2 on view {bad.view.name} skipped: {reason}" in caplog.text
         assert run.step == 2
@@ -106,15 +106,15 @@ def test_a_poisoned_step_changes_nothing_and_names_the_culprit(
         assert after.keys() == before.keys()
         assert all(torch.equal(after[name], before[name]) for name in before)
         assert list(run.backbone.gradients()) == []
-        assert take_step(run, plugins).skipped == ""
+        assert train_step(run, plugins).skipped == ""
         assert not torch.equal(state(run)["parameters.means"], before["parameters.means"])
         assert all(torch.isfinite(value).all() for value in state(run).values())
 
 
 def test_unguarded_the_same_step_spoils_the_run(tmp_path: Path) -> None:
     run, plugins = run_with({2: "gradient"}, tmp_path), load_plugins([], points=[])
-    take_step(run, plugins)
-    take_step(run, plugins)
+    train_step(run, plugins)
+    train_step(run, plugins)
     assert not torch.isfinite(state(run)["parameters.means"]).all()
 
 
@@ -134,7 +134,7 @@ def test_a_good_step_between_starts_the_count_anew(tmp_path: Path) -> None:
 
 def test_finite_gradients_of_any_shape_pass_and_others_are_counted_by_row(tmp_path: Path) -> None:
     run = run_with({}, tmp_path)
-    step = take_step(run, load_plugins([], points=[]))
+    step = train_step(run, load_plugins([], points=[]))
     odd = torch.ones(3, 4, 2).transpose(0, 1)  # rows that do not lie one after the other in memory
     run.backbone.gradients = lambda: [("weights", odd)]
     assert Guard().gsx_gradients_ready(run, step) is None
@@ -151,7 +151,7 @@ def test_primitives_that_are_not_finite_are_removed_and_the_run_goes_on(
     with plugins.listening([Guard()]), caplog.at_level(logging.WARNING, "gsx.core.training.trainer"):
         with torch.no_grad():
             run.backbone.table["log_scales"][1] = torch.nan
-        skipped, after = take_step(run, plugins), take_step(run, plugins)
+        skipped, after = train_step(run, plugins), train_step(run, plugins)
     assert skipped.skipped == "removed 1 primitives"
     assert not after.skipped
     assert after.rendering.dropped == 0

@@ -19,7 +19,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.halves import held_out_renders
 from gsx.core.training.run import Run, Sampler, TrainingOptions
-from gsx.core.training.trainer import take_step
+from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -75,7 +75,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
         anew=anew,
     )
     for _ in range(steps):
-        take_step(run, load_plugins([], points=[]))
+        train_step(run, load_plugins([], points=[]))
     seen.clear()
     return run, seen
 
@@ -107,7 +107,7 @@ def test_the_run_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
     undisturbed, _ = begun(tmp_path)
     undisturbed.training = run.training
     for each in (run, undisturbed):
-        take_step(each, load_plugins([], points=[]))
+        train_step(each, load_plugins([], points=[]))
     assert all(torch.equal(a, b) for a, b in zip(state_of(undisturbed), state_of(run), strict=True))
 
 

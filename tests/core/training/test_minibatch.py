@@ -19,7 +19,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Sampler
-from gsx.core.training.trainer import backward, take_step
+from gsx.core.training.trainer import backward, train_step
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 
@@ -162,7 +162,7 @@ def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) ->
         sums[screen.ids[screen.radii > 0]] += norms[screen.radii > 0]
         seen[screen.ids[screen.radii > 0]] += 1
         gradients(run)
-    take_step(run, plugins())
+    train_step(run, plugins())
     statistics = run.backbone.statistics  # type: ignore[attr-defined]
     assert torch.equal(statistics.count, seen / 2)
     torch.testing.assert_close(statistics.mean_gradient(), sums / seen.clamp_min(1), rtol=1e-6, atol=0)
@@ -258,11 +258,11 @@ def test_a_primitive_that_any_view_left_out_is_healed_and_the_step_skipped(tmp_p
     with torch.no_grad():
         run.backbone.table["log_scales"][1] = torch.nan  # type: ignore[attr-defined]
     count = run.backbone.size()[0]
-    step = take_step(run, plugins())
+    step = train_step(run, plugins())
     assert step.skipped == "removed 1 primitives"
     assert run.backbone.size()[0] == count - 1
     assert not run.backbone.statistics.count.any()  # type: ignore[attr-defined]
-    assert not take_step(run, plugins()).skipped
+    assert not train_step(run, plugins()).skipped
 
 
 # -- the order of views ------------------------------------------------------------------------------------------------

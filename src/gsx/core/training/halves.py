@@ -22,7 +22,7 @@ from gsx.core.shapes import Float, UInt8
 from gsx.core.training.guard import Guard
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
-from gsx.core.training.trainer import take_step
+from gsx.core.training.trainer import train_step
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def trained(run: Run) -> Run:
     plugins = load_plugins([], points=[])
     with plugins.listening([Guard()]):
         while not run.complete:
-            take_step(run, plugins)
+            train_step(run, plugins)
     return run
 
 

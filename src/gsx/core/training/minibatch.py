@@ -16,7 +16,7 @@ from gsx.core.training.run import Run, Step
 
 
 @contextmanager
-def views_of_step(run: Run) -> Iterator[list[int]]:
+def next_views(run: Run) -> Iterator[list[int]]:
     """Numbers of the views of the next step.
 
     A step that fails has not been taken: a checkpoint written then begins with the same views and colours again.
@@ -31,7 +31,7 @@ def views_of_step(run: Run) -> Iterator[list[int]]:
 
 
 @contextmanager
-def added_up(backbone: Backbone[Any]) -> Iterator[None]:
+def gradients_added(backbone: Backbone[Any]) -> Iterator[None]:
     """A view begins without gradients, because its terms may forget some, and ends with the sums of all so far."""
     before = dict(backbone.gradients())
     for _, parameter in backbone.parameters():
@@ -63,7 +63,7 @@ def account_of(run: Run, steps: Sequence[Step]) -> Account:
     )
 
 
-def merged(run: Run, steps: Sequence[Step]) -> Step:
+def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
     """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
     accounts = run.ranks.all_gather(account_of(run, steps))
     average(run, set().union(*(account.learnt for account in accounts)))

@@ -18,7 +18,7 @@ from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
 from gsx.core.training.augmenter import Telling
 from gsx.core.training.backbone import Drawn, Observation
-from gsx.core.training.minibatch import added_up, merged, views_of_step
+from gsx.core.training.minibatch import gradients_added, merge_gradients, next_views
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
 
@@ -30,13 +30,13 @@ def train(run: Run, plugins: Plugins) -> None:
     plugins.emit.gsx_run_started(run=run)
     while not (run.complete or any(run.ranks.all_gather(run.stopping))):
         begun = time.perf_counter()
-        step = take_step(run, plugins)
+        step = train_step(run, plugins)
         run.seconds += time.perf_counter() - begun
         plugins.emit.gsx_step_finished(run=run, step=step)
     plugins.emit.gsx_training_finished(run=run)
 
 
-def take_step(run: Run, plugins: Plugins) -> Step:
+def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (spec 7): render, backward, statistics, density, Adam."""
     step = backward(run)
     reason = veto(run, step, plugins)
@@ -75,12 +75,15 @@ def remove_lost(run: Run, step: Step) -> str:
 def backward(run: Run) -> Step:
     """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
     number = run.step + 1
-    with views_of_step(run) as batch:
+    with next_views(run) as batch:
         picked = run.ranks.share(batch)
         terms = [terms_of(run, number, view) for view in picked]
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
-        steps = [of_view(run, number, *each) for each in zip(picked, terms, colours, strict=True)]
-        step = steps[0] if len(batch) == 1 else merged(run, steps)
+        steps = []
+        for view, added, colour in zip(picked, terms, colours, strict=True):
+            with gradients_added(run.backbone):
+                steps.append(view_loss(run, number, run.scene.train[view], added, colour))
+        step = steps[0] if len(batch) == 1 else merge_gradients(run, steps)
         return replace(step, pseudo=asked_for(run, number))
 
 
@@ -96,13 +99,7 @@ def terms_of(run: Run, number: int, picked: int) -> list[Term]:
     return [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
 
 
-def of_view(run: Run, number: int, picked: int, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
-    """The step of one view; its gradients are added to those of the views before it."""
-    with added_up(run.backbone):
-        return backward_of(run, number, run.scene.train[picked], terms, colour)
-
-
-def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
     """Render a view, and the pseudo views that go with it, and send the loss back (spec 1.3).
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
@@ -110,9 +107,9 @@ def backward_of(run: Run, number: int, view: View, terms: Sequence[Term], colour
     compared with its own render.
     """
     target, seen = view.image().to(run.device), list[Observation]()
-    divided = [divide(run, term, view.camera) for term in terms]
+    divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
-    parts = {term.name: add_term(run, term, number, seen) for term, _ in ordered}
+    parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
     drawn = run.backbone.draw(view.camera, number)
     rendering = rasterize(
@@ -153,7 +150,7 @@ def without_graph(rendering: Rendering) -> Rendering:
     return replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach())
 
 
-def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
+def served_by_view(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
     """(the term without them, its parts that need no render of their own): the camera draws just what these see.
 
     Terms that density control is not to learn from have none: it could not tell their gradients from the view's own.
@@ -164,7 +161,7 @@ def divide(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[P
     return replace(term, parts=[part for part in term.parts if part not in here]), here
 
 
-def add_term(run: Run, term: Term, number: int, seen: list[Observation]) -> float:
+def pseudo_term(run: Run, term: Term, number: int, seen: list[Observation]) -> float:
     """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
     total = 0.0
     for view, weight in term.parts:
