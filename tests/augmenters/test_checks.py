@@ -1,4 +1,4 @@
-"""Checks of redrawn pictures: what each regenerator is held to, and what is lost is told scale by scale (spec 6.4)."""
+"""Checks of redrawn pictures: what each regenerator is held to, and what is lost is told scale by scale."""
 
 from collections.abc import Callable
 from dataclasses import replace

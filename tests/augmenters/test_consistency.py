@@ -1,4 +1,4 @@
-"""Exact consistency with a low-resolution picture, against counting and brute force (spec 5.3)."""
+"""Exact consistency with a low-resolution picture, against counting and brute force."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Cameras of pseudo views against the worked example and identities (spec 1.5)."""
+"""Cameras of pseudo views against the worked example and identities."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Augmenters in the training loop: the hybrid loss by hand, provenance, resume, and what goes wrong (spec 1.1-1.7)."""
+"""Augmenters in the training loop: the hybrid loss by hand, provenance, resume, and what goes wrong."""
 
 import json
 from dataclasses import replace
@@ -112,7 +112,7 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
 
 
 def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Path) -> None:
-    """(1 - lambda_b) L_o + L_b + sum L1 / M: only the upscaling term is added (spec 1.3)."""
+    """(1 - lambda_b) L_o + L_b + sum L1 / M: only the upscaling term is added."""
     run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
@@ -121,7 +121,7 @@ def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Pa
 
 
 def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
-    """Of the window's render, not of the whole zoomed canvas that it is cut from (spec 1.4, 28)."""
+    """Of the window's render, not of the whole zoomed canvas that it is cut from."""
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     view = run.scene.train[0].camera.crop(18, 13, 12, 9).zoom(2)
     rendering = rasterize(run.backbone.draw(view, run.step + 1).splats, view, run.raster)
@@ -144,7 +144,7 @@ def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
 
 
 def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_path: Path) -> None:
-    """de-MLP: its gradient is that of (1 - lambda) L_o alone, while anchors feel the pseudo views (spec 1.4)."""
+    """de-MLP: its gradient is that of (1 - lambda) L_o alone, while anchors feel the pseudo views."""
     words = ("backbone=octree_scaffold", "augmenter=bootstrap", "augmenter.bootstrap.freeze_shared=active")
     run = run_at(tmp_path / "run", 40, *words)
     run.sampler.order = [1]

@@ -1,4 +1,4 @@
-"""Events, windows and weights against the tables of the paper (spec 1.2)."""
+"""Events, windows and weights against the tables of the paper."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The anchor backbones as the trainer sees them, against the published rules (spec 1.2, 1.3, 2, 3.8-4A)."""
+"""The anchor backbones as the trainer sees them, against the published rules."""
 
 import json
 import math
@@ -211,7 +211,7 @@ def test_unused_harmonics_count_their_steps() -> None:
 
 
 def published_box(place: list[float], lengths: list[float], camera: Camera) -> bool:
-    """Whether an upright ellipsoid is before the camera and its 3-sigma square touches a 16 px tile (spec 1.1)."""
+    """Whether an upright ellipsoid is before the camera and its 3-sigma square touches a 16 px tile."""
     rotation, shift = camera.rotation.tolist(), camera.translation.tolist()
     x, y, z = (sum(r * p for r, p in zip(row, place, strict=True)) + t for row, t in zip(rotation, shift, strict=True))
     if not z > 0.2:

@@ -1,4 +1,4 @@
-"""Octree-GS on free Gaussians: clone and split across levels, by hand and against loops (spec 4B)."""
+"""Octree-GS on free Gaussians: clone and split across levels, by hand and against loops."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Anchors into Gaussians, against loops over anchors and offsets in float64 and finite differences (spec 2.4, 4A)."""
+"""Anchors into Gaussians, against loops over anchors and offsets in float64 and finite differences."""
 
 import math
 from dataclasses import replace

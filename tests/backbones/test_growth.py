@@ -1,4 +1,4 @@
-"""Growing and pruning on clouds worked by hand and against loops in plain Python (spec 2.8-2.10, 3.8, 3.9, 9).
+"""Growing and pruning on clouds worked by hand and against loops in plain Python.
 
 All lengths are powers of two and all positions their multiples, so that loops and tensors agree to the bit.
 """

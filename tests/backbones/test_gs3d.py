@@ -1,4 +1,4 @@
-"""gs3d against the published rules, on tables made by hand (spec 1, 5-7)."""
+"""gs3d against the published rules, on tables made by hand."""
 
 import math
 from dataclasses import replace

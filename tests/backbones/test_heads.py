@@ -1,4 +1,4 @@
-"""The networks of Scaffold-GS against the table of their sizes and against sums written out (spec 2.3, 2.11)."""
+"""The networks of Scaffold-GS against the table of their sizes and against sums written out."""
 
 import math
 from dataclasses import replace

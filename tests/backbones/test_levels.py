@@ -1,4 +1,4 @@
-"""Levels of detail against loops in plain Python and the tables of the specification (spec 3, 9)."""
+"""Levels of detail against loops in plain Python and tables worked out from the published code."""
 
 import json
 import math
@@ -82,7 +82,7 @@ def at(*distances: float) -> Tensor:
 
 
 def level_by_hand(farthest: float, distance: float, mode: str, highest: int, fork: int = 2) -> int:
-    """dist2level of one primitive (spec 3.5 and 3.7)."""
+    """dist2level of one primitive."""
     if distance == 0:
         return highest
     ideal = math.log(farthest / distance) / math.log(fork)
@@ -216,7 +216,7 @@ def test_positions_of_nodes_give_back_their_cells(level):
 
 @pytest.mark.parametrize(("mode", "shift"), [("round", 0.5), ("floor", 0.0), ("ceil", 1.0), ("progressive", 1.0)])
 def test_levels_end_at_their_distances(mode, shift):
-    """Level L counts up to s d = D f^(shift - L), level 0 always (spec 3.4, closed form)."""
+    """Level L counts up to s d = D f^(shift - L), level 0 always."""
     cases = [(3, 1.0), (2, 1.0), (3, 2.0)]
     for fork, coarseness in cases:
         finest, view = 60.0 * coarseness, camera_at(0, 0, 0, focal=60.0)
@@ -275,7 +275,7 @@ def test_adaptive_threshold_keeps_what_every_camera_draws():
 
 
 def test_far_cameras_draw_level_0_and_near_ones_more():
-    """Check (h) of spec 9."""
+    """A camera at twice D draws level 0 alone, one at a quarter of D three levels."""
     levels = single(count=6)
     assert tops(levels, camera_at(0, 0, 0), [16.0, 2.0]) == [0, 2]
 
@@ -337,7 +337,7 @@ def test_half_cell_moves_the_point_whose_distance_counts():
 
 
 def test_fading_levels():
-    """The examples of spec 3.7."""
+    """Levels as map_to_int_level of Octree-GS has them."""
     ideal = torch.tensor([-2.0, 0.25, 1.7, 9.0])
     level, weight = whole_level(ideal, "progressive", 3)
     assert level.tolist() == [0, 1, 2, 3]
@@ -413,7 +413,7 @@ def test_units_do_not_matter(scale, mode):
     ],
 )
 def test_switch_points(count, switches):
-    """The table of spec 3.6; K = 3 starts with level 1 of 0..2."""
+    """The switch points of set_coarse_interval (Octree-GS); K = 3 starts with level 1 of 0..2."""
     levels = derive(spread(9), cameras(), replace(PUBLISHED, count=count), 10000)
     assert (levels.first, levels.switches) == (min(count // 2, count - 1), switches)
     assert unlocked(levels.switches, levels.first, 1) == levels.first
@@ -440,7 +440,7 @@ def test_a_level_joins_after_its_switch_point():
 
 
 def test_thresholds_of_levels():
-    """The list of spec 3.8."""
+    """Thresholds of anchor_growing (Octree-GS)."""
     wanted = [2.00e-4, 2.30e-4, 2.64e-4, 3.03e-4, 3.48e-4, 4.00e-4, 4.59e-4, 5.28e-4]
     assert thresholds(2e-4, 2, 0.2, 8) == pytest.approx(wanted, abs=0.5e-6)
 

@@ -1,4 +1,4 @@
-"""Mip-Splatting's filters on gs3d against the published rules (spec 10)."""
+"""Mip-Splatting's filters on gs3d against the published rules."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Splat files of the anchor backbones: the published columns, and one view as a standard file (spec 5.1)."""
+"""Splat files of the anchor backbones: the published columns, and one view as a standard file."""
 
 from pathlib import Path
 

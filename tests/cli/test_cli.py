@@ -257,7 +257,7 @@ def strange_camera(folder: Path) -> Path:
     """The first camera has a model number that no COLMAP knows."""
     path = folder / "sparse" / "0" / "cameras.bin"
     data = bytearray(path.read_bytes())
-    data[12:16] = (77).to_bytes(4, "little")  # count u64, id i32, then the model i32 (spec 2.1)
+    data[12:16] = (77).to_bytes(4, "little")  # count u64, id i32, then the model i32
     path.write_bytes(bytes(data))
     return folder
 
@@ -366,7 +366,7 @@ def test_points_that_are_not_numbers_are_dropped_and_counted(tmp_path: Path) -> 
 
     path = synthetic(tmp_path / "s") / "sparse" / "0" / "points3D.bin"
     data = bytearray(path.read_bytes())
-    data[16:24] = b"\xff" * 8  # count u64, id u64, then x as f64: all ones is a NaN (spec 2.1)
+    data[16:24] = b"\xff" * 8  # count u64, id u64, then x as f64: all ones is a NaN
     path.write_bytes(bytes(data))
     scene = load_scene(compose(["scene=colmap", f"scene.path={tmp_path / 's'}"], plugins()))
     assert len(scene.points) == 49

@@ -1,4 +1,4 @@
-"""Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random (spec 1.5)."""
+"""Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random (the paper)."""
 
 from dataclasses import replace
 
@@ -64,7 +64,7 @@ def noise(shape: tuple[int, ...], kind: str, scale: float, generator: torch.Gene
 
 
 def moved(camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], kept: str = "t") -> Camera:
-    """The camera with noise added to its pose, R' = polar(R + e_R), t' = t + e_t (spec 1.5).
+    """The camera with noise added to its pose, R' = polar(R + e_R), t' = t + e_t (the paper, Implementation details).
 
     With `kept` = t the centre swings around the world's origin with the rotation; with center it stays, but for e_t.
     """

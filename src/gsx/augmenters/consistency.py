@@ -1,4 +1,4 @@
-"""Pictures that reduce to a given one in 8 bits (spec 5.3): the paper's interpolation flexibility, guaranteed for box
+"""Pictures that reduce to a given one in 8 bits: the paper's interpolation flexibility, guaranteed for box
 averages."""
 
 import torch

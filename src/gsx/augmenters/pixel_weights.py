@@ -35,7 +35,7 @@ def sampling_ratios(splats: Splats, photographs: Sequence[Camera], raster: Raste
 def seen_alike(
     splats: Splats, camera: Camera, photographs: Sequence[Camera], raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
-    """SplatSuRe's weights (spec 6.1): low where some photograph shows a surface more finely than another does, since
+    """SplatSuRe's weights: low where some photograph shows a surface more finely than another does, since
     it gives the detail; high where all show it alike; blended like colour.
     """
     score = torch.sigmoid((sampling_ratios(splats, photographs, raster) - BETTER) / SOFTNESS)

@@ -1,4 +1,4 @@
-"""Which pseudo views an event makes: cameras, windows, seeds (spec 1.1, 1.2, 1.7)."""
+"""Which pseudo views an event makes: cameras, windows, seeds (the paper)."""
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
 MOST_TRIES = 10
-"""Times that a place is drawn for a window until it shows enough of the scene (spec 1.7)."""
+"""Times that a place is drawn for a window until it shows enough of the scene (the paper, Cropped Upscaling)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,7 +147,7 @@ class Planner:
         variant: int,
         generator: torch.Generator,
     ) -> Window:
-        """Where the window lies on the raster (spec 1.7)."""
+        """Where the window lies on the raster (the paper, Cropped Upscaling)."""
         width, height = pose.size
         kind = self.options.window
         if kind == "random" or (kind == "error" and variant > 0):

@@ -1,6 +1,6 @@
 """Pseudo details from training views: zoomed in and redrawn (upscale), moved aside and redrawn (bootstrap).
 
-Both are one procedure (spec 1.1-1.7): take windows of training cameras, some of them moved at random; zoom in; have a
+Both are one procedure (the paper): take windows of training cameras, some of them moved at random; zoom in; have a
 regenerator redraw what is cut from the photograph or rendered there; compare with that for a while.
 """
 
@@ -94,7 +94,7 @@ class PseudoDetails:
         return {"events": self.events, "span": self.span, "share": share}
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
-        """The pseudo views of the training view picked at this step, with their weights (spec 1.3)."""
+        """The pseudo views of the training view picked at this step, with their weights (the paper)."""
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event, self.facts = {}, 0, {}

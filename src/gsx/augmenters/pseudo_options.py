@@ -42,7 +42,7 @@ CHOICES = {
 
 @dataclass(frozen=True, kw_only=True)
 class PseudoOptions:
-    """Options; values in conf/augmenter, with their sources. Row numbers are those of the specification, 1.10."""
+    """Options; values in conf/augmenter, with their sources."""
 
     name: str
     role: str
@@ -53,70 +53,70 @@ class PseudoOptions:
     base: bool
     """Whether the training camera itself is zoomed in."""
     base_source: str
-    """photo: its window of the photograph is redrawn; render: what the model shows there (row 2)."""
+    """photo: its window of the photograph is redrawn; render: what the model shows there."""
     variants: int
     """Cameras moved at random per training camera and scale."""
     first_cameras: int
-    """Training cameras, in order, that pseudo views are made from; 0: all (row 22)."""
+    """Training cameras, in order, that pseudo views are made from; 0: all."""
     narrow: float
     """Width of the window in training as a fraction of the raster; 1: uncropped."""
     window: str
     """center, random, grid (one after the other over the events), or error (where the model is worst)."""
     zoom: str
     """intrinsics: the result is seen at a times the focal length; none: rendered at 1/a of the density and compared at
-    the training density, the other reading of the paper (row 3)."""
+    the training density, the other reading of the paper."""
     rotation_noise: float
     translation_noise: float
     translation_unit: str
-    """world, or extent: of the scene (row 10)."""
+    """world, or extent: of the scene."""
     noise: str
-    """uniform or normal (row 8)."""
+    """uniform or normal."""
     kept: str
-    """What a turned camera keeps: t, or its center (row 9)."""
+    """What a turned camera keeps: t, or its center."""
     relative_noise: bool
-    """Turn less where the field of view is small: times min(1, 2 FOV'/FOV) (row 11)."""
+    """Turn less where the field of view is small: times min(1, 2 FOV'/FOV)."""
     mode: str
     """hybrid: the term takes its share of the backbone's loss; direct: it is added; auto: hybrid with shared
-    parameters, such as colour networks, direct without (spec 1.4)."""
+    parameters, such as colour networks, direct without (the paper, Further Details)."""
     weights: list[float]
     """lambda: first and last."""
     weight_split: str
-    """window: the first weight holds for half of each window; run: for half of the run; linear: in between (row 4)."""
+    """window: the first weight holds for half of each window; run: for half of the run; linear: in between."""
     direct_weight: float
-    """In direct mode, in place of lambda (row 25)."""
+    """In direct mode, in place of lambda."""
     loss: str
     """l1: mean |difference|, as in the paper; l2: mean square. Squares weigh the gaps that open between small splats;
     |difference| weighs a softer enlargement everywhere as much."""
     gain: float
-    """Of the pseudo loss, before it is weighted (row 29)."""
+    """Of the pseudo loss, before it is weighted."""
     per_pixel: bool
     """Ours: weigh a pixel of a window like one of a whole picture, so that small windows do not outweigh the photos."""
     reduce: str
-    """all: mean over all cameras; per_scale: mean over scales of the sum over cameras (row 6)."""
+    """all: mean over all cameras; per_scale: mean over scales of the sum over cameras."""
     densify: bool
-    """Renders of pseudo views count in density control (row 28)."""
+    """Renders of pseudo views count in density control."""
     freeze_shared: str
     """none; half, active: pseudo views do not move shared parameters, in the first half of a window or all of it
-    (de-MLP, row 26)."""
+    (de-MLP)."""
     strength: list[float]
     """How much may change: at the first event and at the last."""
     prompt: str
     """For regenerators that read; {scene} is the name of the scene."""
     seeds: str
-    """fixed: `seed` for every picture; per_view: another for each (row 21)."""
+    """fixed: `seed` for every picture; per_view: another for each."""
     seed: int
     samples: int
-    """Results averaged for each picture (row 34)."""
+    """Results averaged for each picture."""
     context: int
     """Pixels around the window that the regenerator also sees."""
     least_alpha: float
     """Windows at random places, or of cameras moved at random, are drawn again, ten times at most, while the model's
-    mean alpha in them is lower: objects fill little of their pictures (spec 1.7). 0: the first is taken."""
+    mean alpha in them is lower: objects fill little of their pictures (the paper). 0: the first is taken."""
     project: str
     """exact: the nearest picture that reduces to its input as the scene's pictures do, of photographs in 8 bits: every
-    pixel where they are box averages, else nearly every one; the share is logged (spec 5.3)."""
+    pixel where they are box averages, else nearly every one; the share is logged."""
     weight_map: str
-    """none; splatsure: surfaces count that no photograph shows more finely than another (spec 6.1); finer, ours: those
+    """none; splatsure: surfaces count that no photograph shows more finely than another; finer, ours: those
     that no photograph shows as finely as the pseudo view does."""
     gate: float
     """Blocks do not count that reduce to what is further than this from the known photograph, in 8-bit levels; 0: all

@@ -1,4 +1,4 @@
-"""Pictures of pseudo views: requested, redrawn, checked, weighed (spec 1.3, 6)."""
+"""Pictures of pseudo views: requested, redrawn, checked, weighed (the paper, Practical Implementation)."""
 
 import hashlib
 import logging
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 BATCH = 64
 """Pictures redrawn between two lines of progress."""
 MOST_DROPPED = 0.5
-"""An event that loses more than this share of its pictures at one scale is an error (spec 6.4)."""
+"""An event that loses more than this share of its pictures at one scale is an error."""
 SHOWN = 3
 """Training views of an event whose pictures are kept to be looked at."""
 

@@ -1,4 +1,4 @@
-"""When pseudo views are made, how long they count, and how much (spec 1.2)."""
+"""When pseudo views are made, how long they count, and how much (the paper, Practical Implementation)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def stepped(values: list[float], place: float, split: str) -> float:
 
 
 def ramp(values: list[float], event: int, timing: Timing, schedule: Schedule) -> float:
-    """A value that goes linearly from its first at `start` to its last at `stop` (spec 1.2)."""
+    """A value that goes linearly from its first at `start` to its last at `stop` (the paper)."""
     first, last = values
     start, stop = schedule.step(timing.start), schedule.step(timing.stop)
     return first + (last - first) * min(1.0, max(0, event - start) / max(1, stop - start))

@@ -58,7 +58,7 @@ from gsx.core.training.schedule import log_linear
 logger = logging.getLogger(__name__)
 
 LEAST_SQUARE_DISTANCE = 1e-7
-"""Lower bound of the squared neighbour distance that sets the initial lengths (spec 2.2)."""
+"""Lower bound of the squared neighbour distance that sets the initial lengths (Scaffold-GS, create_from_pcd)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class Decay:
 
 @dataclass(frozen=True, kw_only=True)
 class NeuralRates:
-    """Learning rates by parameter; `offsets` in units of the extent (spec 2.7)."""
+    """Learning rates by parameter; `offsets` in units of the extent (Scaffold-GS, training_setup)."""
 
     offsets: Decay
     features: Decay
@@ -90,7 +90,7 @@ class NeuralRates:
 
 @dataclass(frozen=True, kw_only=True)
 class HeadRates:
-    """Learning rates of the networks (spec 2.7)."""
+    """Learning rates of the networks (Scaffold-GS, training_setup)."""
 
     opacity: Decay
     covariance: Decay
@@ -101,7 +101,7 @@ class HeadRates:
 
 @dataclass(frozen=True, kw_only=True)
 class ExplicitRates:
-    """Learning rates by parameter; `offsets` in units of the extent (spec 4A)."""
+    """Learning rates by parameter; `offsets` in units of the extent (Octree-AnyGS)."""
 
     offsets: Decay
     log_scales: Decay
@@ -123,9 +123,9 @@ class AnchorOptions:
     max_primitives: int
     """No anchor is added beyond this number; 0: none is withheld."""
     volume_weight: float
-    """Of the mean volume of the Gaussians drawn, in the loss (spec 1.3)."""
+    """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
     voxel: float
-    """Edge of the initial grid's cells without levels, world units; 0: from the points (spec 2.1)."""
+    """Edge of the initial grid's cells without levels, world units; 0: from the points (Scaffold-GS)."""
     growth: GrowthOptions
     quirks: Quirks
     mip: MipOptions
@@ -195,14 +195,14 @@ def explicit_anchors(options: ExplicitOptions, context: BackboneContext) -> "Anc
 
 
 def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:
-    """Median over points of the mean squared distance to three neighbours, or its root (spec 2.1)."""
+    """Median over points of the mean squared distance to three neighbours, or its root (Scaffold-GS)."""
     squares = mean_square_distance(points)
     median = float(squares.kthvalue(max(1, len(points) // 2)).values.clamp_min(LEAST_SQUARE_DISTANCE))
     return median if squared else math.sqrt(median)
 
 
 def voxel_nodes(points: Float[Tensor, "P 3"], voxel: float) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "P"]]:
-    """(grid nodes with a point next to them, node of each point) (spec 2.1)."""
+    """(grid nodes with a point next to them, node of each point) (Scaffold-GS, voxelize_sample)."""
     cells, inverse = torch.unique(nodes_of(points, voxel), dim=0, return_inverse=True)
     return (cells.double() * voxel).float(), inverse
 
@@ -260,7 +260,7 @@ class Anchors:
     # -- the beginning -----------------------------------------------------------------------------------------
 
     def initial_table(self, points: PointCloud) -> ParameterTable:
-        """Anchors on the grid nodes next to the points (spec 2.1 and 3.3)."""
+        """Anchors on the grid nodes next to the points (Scaffold-GS, voxelize_sample; Octree-GS, octree_sample)."""
         positions, columns, owner, source = self.initial_anchors(points.positions.float())
         colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
         squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
@@ -299,7 +299,7 @@ class Anchors:
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def set_rates(self, step: int) -> None:
-        """Learning rates of a step (spec 2.7)."""
+        """Learning rates of a step (Scaffold-GS, training_setup)."""
         steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         for name in self.table.parameters:
             unit = self.extent if name == "offsets" else 1.0
@@ -314,7 +314,7 @@ class Anchors:
         return DrawnAnchors(decoded=decoded, anchors=anchors)
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
-        """Anchors of the levels that the camera draws, of which those in view (spec 3.5, 2.5)."""
+        """Anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
         anchors = self.table["anchors"]
         weights = torch.ones_like(anchors[:, 0])
         rows = torch.arange(len(anchors), device=anchors.device)
@@ -333,14 +333,14 @@ class Anchors:
         )
 
     def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:
-        """Mean volume of the Gaussians drawn; 0 for none (spec 1.3)."""
+        """Mean volume of the Gaussians drawn; 0 for none (Scaffold-GS, train.py)."""
         if not self.options.volume_weight:
             return None
         volumes = drawn.splats.scales.prod(1)
         return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
 
     def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Visits, opacities and screen gradients while anchors are judged (spec 2.8)."""
+        """Visits, opacities and screen gradients while anchors are judged (Scaffold-GS, training_statis)."""
         growth = self.options.growth
         if not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
             return {}
@@ -360,7 +360,7 @@ class Anchors:
             observe(self.table, **seen)
 
     def densify_and_prune(self, step: int) -> dict[str, int]:
-        """Grow and prune when due (spec 2.6)."""
+        """Grow and prune when due (Scaffold-GS, train.py)."""
         if self.growth_due(step):
             done = self.adapt_now(step)
             self.refresh_filter()
@@ -436,7 +436,7 @@ class Anchors:
         return start < step < stop and step % self.schedule.interval(growth.every) == 0
 
     def adapt_now(self, step: int) -> dict[str, int]:
-        """Grow, forget what was judged, prune, clamp: the order of the reference (spec 2.9, 2.10)."""
+        """Grow, forget what was judged, prune, clamp: the order of the reference (Scaffold-GS)."""
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
         enough, _ = eligible(self.table, visits / 2)
@@ -457,7 +457,7 @@ class Anchors:
         return grow_by_level(*shared, self.levels, least, self.quirks, gate, most)
 
     def refresh_filter(self) -> None:
-        """Filter sizes of the anchors, which their Gaussians share; anchors stay where they are (spec 10.1)."""
+        """Filter sizes of the anchors, which their Gaussians share; anchors stay where they are (Mip-Splatting)."""
         if self.options.filter == "mip":
             self.table.columns["filter"] = filter_sizes(self.table["anchors"], self.cameras, self.options.mip)
 
@@ -497,7 +497,7 @@ class Anchors:
         return self.table["filter"][rows] if self.options.filter == "mip" else None
 
     def file(self) -> dict[str, Tensor]:
-        """Columns of the published files of each form (spec 5.1): one row per anchor, raw values.
+        """Columns of the published files of each form (Octree-GS, save_ply): one row per anchor, raw values.
 
         With a 3D filter its sizes follow, under the name that they have in files of Mip-Splatting.
         """
@@ -508,7 +508,7 @@ class Anchors:
         return columns | ({"filter_3D": self.table["filter"]} if "filter" in self.table.columns else {})
 
     def export_notes(self) -> list[str]:
-        """Where the 3D filter is, and what chooses the levels at a distance (spec 5.1)."""
+        """Where the 3D filter is, and what chooses the levels at a distance (Octree-GS, save_ply)."""
         notes = ["no 3D filter"]
         if self.options.filter == "mip":
             notes = ["3D filter fused into scales and opacities of Gaussians; anchors have its size in filter_3D"]

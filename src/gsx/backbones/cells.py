@@ -1,4 +1,4 @@
-"""Cells of a grid as rows of integers: which are new, and what falls into each (spec 1.7 and 2.9)."""
+"""Cells of a grid as rows of integers: which are new, and what falls into each (Scaffold-GS, anchor_growing)."""
 
 import math
 

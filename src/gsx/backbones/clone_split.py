@@ -1,4 +1,4 @@
-"""Clone and split across levels of detail: Octree-GS on free Gaussians (GSOctree, spec 4B).
+"""Clone and split across levels of detail: Octree-GS on free Gaussians (GSOctree).
 
 Small Gaussians with large gradients get a copy on their own level. Large ones get one smaller child on the next level
 and stay as they are. Without pointers between levels, a Gaussian's level is all that ties it to the octree.
@@ -54,7 +54,7 @@ class DensifyMasks:
 def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dict[str, Tensor]]:
     """(points, columns) to start from: the nodes of the levels, half a cell beyond, with their cells' largest colours.
 
-    Source: spec 3.3, 3.4, 4B.
+    Source: Octree-GS, octree_sample and weed_out; GSOctree.
     """
     positions, of, group = initial_nodes(points.positions.float(), levels)
     colours = pooled_max(points.colours.repeat(levels.count, 1).float(), group.flatten(), len(positions))
@@ -64,7 +64,7 @@ def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dic
 
 
 def relative_sizes(scales: Float[Tensor, "N 3"], of: Int[Tensor, "N"], count: int) -> Float[Tensor, "K"]:
-    """Mean scale of each level over that of level 0 (spec 4B); 1 where one of them is empty: nothing to compare."""
+    """Mean scale of each level over that of level 0 (GSOctree); 1 where one of them is empty: nothing to compare."""
     sizes = scales.double().mean(1)  # a mean for each level by itself: sums by index have no fixed order on a GPU
     means = torch.stack([sizes[of == level].sum() / (of == level).sum().clamp_min(1) for level in range(count)])
     known = (means > 0) & (means[0] > 0)
@@ -82,7 +82,7 @@ def densify_masks(
     large: float,
     splitting: bool,
 ) -> DensifyMasks:
-    """Who is cloned, split and drawn from farther: each by the threshold and the size of its own level (spec 4B).
+    """Who is cloned, split and drawn from farther: each by the threshold and the size of its own level (GSOctree).
 
     `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` nothing happens to large
     ones. Ours: never a Gaussian without any gradient.

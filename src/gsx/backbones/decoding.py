@@ -23,7 +23,7 @@ LARGEST_LOG_SCALE = 30.0
 LEAST = 1e-37
 """A length (world units) or weight of 0 counts as this: its logarithm is finite."""
 INERT_LOGIT = math.log(0.1 / 0.9)
-"""Opacity of an anchor in published files; nothing uses it (spec 2.2)."""
+"""Opacity of an anchor in published files; nothing uses it (Scaffold-GS, create_from_pcd)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,7 +68,7 @@ class Representation(Protocol):
         ...
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """Rotations of the anchors as ellipsoids, for the pre-filter (spec 2.5)."""
+        """Rotations of the anchors as ellipsoids, for the pre-filter (Scaffold-GS, prefilter_voxel)."""
         ...
 
     def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
@@ -76,7 +76,7 @@ class Representation(Protocol):
         ...
 
     def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
-        """What follows positions and levels in the published file of this representation (spec 5.1)."""
+        """What follows positions and levels in the published file of this representation (Octree-GS, save_ply)."""
         ...
 
 
@@ -108,7 +108,7 @@ def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M
 
 
 class Neural:
-    """Features decoded by networks into k Gaussians, of which those with positive opacity are drawn (spec 2.2-2.4)."""
+    """Features decoded by networks into k Gaussians, of which those with positive opacity are drawn (Scaffold-GS)."""
 
     pooled: tuple[str, ...] = ("features",)
 
@@ -126,7 +126,7 @@ class Neural:
         }
 
     def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
-        """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (spec 2.4)."""
+        """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (Scaffold-GS)."""
         rows, k = drawn.rows, self.offsets
         anchors = table["anchors"][rows]
         raw, shapes, colours = self.heads(
@@ -154,7 +154,7 @@ class Neural:
         return Decoded(splats=splats, slots=rows[owner] * k + chosen % k, opacities=opacities.detach().clamp_min(0))
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """An anchor's own rotation never learns in the reference, so it is the identity (spec 2.2)."""
+        """An anchor's own rotation never learns in the reference, so it is the identity (Scaffold-GS)."""
         return identity_quats(table["anchors"])
 
     def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
@@ -163,7 +163,7 @@ class Neural:
         return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
 
     def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
-        """79 floats a row with the position; what never learns has its initial value (spec 2.2)."""
+        """79 floats a row with the position; what never learns has its initial value (Scaffold-GS, create_from_pcd)."""
         zeros = torch.zeros_like(table["anchors"][:, 0])
         if levels is None:
             head = dict.fromkeys(("nx", "ny", "nz"), zeros)
@@ -180,7 +180,7 @@ class Neural:
 
 
 class Explicit:
-    """One Gaussian per anchor with spherical harmonics of its own, all of them drawn (spec 4A)."""
+    """One Gaussian per anchor with spherical harmonics of its own, all of them drawn (Octree-AnyGS)."""
 
     offsets = 1
     pooled: tuple[str, ...] = ("sh_constant", "sh_rest")

@@ -1,4 +1,4 @@
-"""How anchors come and go (Scaffold-GS, spec 2.8-2.10; Octree-GS, spec 3.8-3.9). Pure functions over a table.
+"""How anchors come and go (Scaffold-GS, adjust_anchor; Octree-GS, anchor_growing). Pure functions over a table.
 
 Growing looks at offsets: where an offset's Gaussian has a large screen gradient, the empty grid cell that it lies in
 gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells of the anchor's own level and the next.
@@ -41,7 +41,7 @@ def observe(
     gradients: Float[Tensor, "M"],
     weight: Float[Tensor, "1"],
 ) -> None:
-    """Count one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (spec 2.8).
+    """Count one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (Scaffold-GS).
 
     `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets. All
     but gradients, which carry it already, are counted by the picture's weight in the step's loss (see
@@ -54,7 +54,7 @@ def observe(
 
 
 def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
-    """(offsets seen in more than `least` steps, their mean gradients; 0 for the others) (spec 2.9)."""
+    """(offsets seen in more than `least` steps, their mean gradients; 0 for the others) (Scaffold-GS)."""
     count = table["gradient_count"]
     enough = count > least
     return enough, torch.where(enough, mean_of(table["gradient_sum"], count), 0.0)
@@ -160,7 +160,7 @@ def grow_by_depth(
     generator: torch.Generator,
     most: int,
 ) -> tuple[int, int]:
-    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (spec 2.9).
+    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (Scaffold-GS, anchor_growing).
 
     Returns how many grew, and how many did not for want of room.
     """
@@ -169,7 +169,7 @@ def grow_by_depth(
     enough = enough & on_grid(means, voxel)
     for depth in range(options.depths):
         multiple = options.coarsest // options.hierarchy**depth
-        if multiple == 0:  # the reference divides by it (spec 2.9)
+        if multiple == 0:  # the reference divides by it (Scaffold-GS, anchor_growing)
             continue
         chance = torch.rand(enough.shape, generator=generator).to(enough.device)
         threshold = options.gradient * (options.hierarchy // 2) ** depth
@@ -190,7 +190,7 @@ def on_grid(means: Float[Tensor, "N k 3"], size: float) -> Bool[Tensor, "N k"]:
 
 
 def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
-    """Nearest node of a grid through the world's origin, halves to even (spec 1.7)."""
+    """Nearest node of a grid through the world's origin, halves to even."""
     return (positions.double() / size).round().long()
 
 
@@ -204,7 +204,7 @@ def grow_by_level(
     gate: bool,
     most: int,
 ) -> tuple[int, int]:
-    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (spec 3.8).
+    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (Octree-GS, anchor_growing).
 
     `gate`: whether promotion and bias take place. Returns how many grew, and how many did not for want of room.
     """
@@ -236,7 +236,7 @@ def bias_anchors(
     threshold: float,
     quirks: Quirks,
 ) -> None:
-    """Let anchors with larger gradients be drawn from a little farther (spec 3.8, 1)."""
+    """Let anchors with larger gradients be drawn from a little farther (Octree-GS, anchor_growing)."""
     bias, count = table["bias"], len(gradient)
     chosen = gradient >= options.bias_gradient * threshold
     if quirks.bias != "all":
@@ -258,7 +258,7 @@ def candidates_of_level(
     quirks: Quirks,
     gate: bool,
 ) -> Iterator[CandidateAnchors]:
-    """Anchors on the same level, then promotions to the next (spec 3.8, 2 and 3)."""
+    """Anchors on the same level, then promotions to the next (Octree-GS, anchor_growing)."""
     last = level == levels.count - 1
     below = gradient < taus[level + 1]
     if last and quirks.finest == "open":
@@ -296,20 +296,20 @@ def at_level(
 
 
 def filtered(new: CandidateAnchors, levels: Levels) -> CandidateAnchors:
-    """Without those that too few cameras would draw (spec 3.4)."""
+    """Without those that too few cameras would draw (Octree-GS, weed_out)."""
     positions = new.positions
     of = torch.full((len(positions),), new.level, dtype=torch.int16, device=positions.device)
     return selected(new, kept(levels, positions, of))
 
 
 def reset_offsets(table: ParameterTable, enough: Bool[Tensor, "N k"]) -> None:
-    """Forget the gradients of the offsets that were judged; the others keep theirs over later intervals (spec 2.9)."""
+    """Forget the gradients of the offsets that were judged; the others keep theirs over later intervals."""
     for name in ("gradient_sum", "gradient_count"):
         table[name][: len(enough)][enough] = 0
 
 
 def prune(table: ParameterTable, options: GrowthOptions, least: float) -> int:
-    """Remove anchors that were visited often and stayed faint; returns how many (spec 2.10)."""
+    """Remove anchors that were visited often and stayed faint; returns how many (Scaffold-GS, adjust_anchor)."""
     ready = table["visits"] > least
     doomed = ready & (table["opacity_sum"] < options.prune_opacity * table["visits"])
     for name in ("opacity_sum", "visits"):
@@ -321,6 +321,6 @@ def prune(table: ParameterTable, options: GrowthOptions, least: float) -> int:
 
 
 def clamp_scales(table: ParameterTable, largest: float) -> None:
-    """Hold the log-scales of the Gaussians, not the reach of the offsets, below a limit (spec 2.10)."""
+    """Hold the log-scales of the Gaussians, not the reach of the offsets, below a limit (Scaffold-GS)."""
     with torch.no_grad():
         table["log_scales"][:, 3:].clamp_(max=largest)

@@ -46,7 +46,7 @@ class GrowthOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Quirks:
-    """Behaviour of the reference code that published numbers depend on; '' takes the value of `fidelity` (spec 10)."""
+    """Behaviour of the reference code that published numbers depend on; '' takes the value of `fidelity`."""
 
     early_stop: str
     """yes: if the coarsest cells grow nothing, finer ones are not tried (Scaffold-GS)."""

@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (spec 1, 5-7)."""
+"""3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import logging
 import math
@@ -55,16 +55,16 @@ from gsx.core.training.schedule import log_linear
 logger = logging.getLogger(__name__)
 
 LARGEST_LOG_SCALE = 30.0
-"""Scales are held below e^30 world units, so that their squares stay finite in float32 (DESIGN: clamp log-scales)."""
+"""Scales are held below e^30 world units, so that their squares stay finite in float32."""
 LEAST_WEIGHT = 1e-37
 """A level that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
 LEAST_SQUARE_DISTANCE = 1e-7
-"""Lower bound of the squared neighbour distance that sets the initial scale (spec 1.4)."""
+"""Lower bound of the squared neighbour distance that sets the initial scale (3D-GS, simple-knn)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rates:
-    """Adam learning rates (spec 6)."""
+    """Adam learning rates (3D-GS, arguments)."""
 
     means_first: float
     means_last: float
@@ -77,7 +77,7 @@ class Rates:
 
 @dataclass(frozen=True, kw_only=True)
 class Density:
-    """Adaptive density control in steps of the published run (spec 7)."""
+    """Adaptive density control in steps of the published run (3D-GS, train.py)."""
 
     start: int
     stop: int
@@ -85,7 +85,7 @@ class Density:
     gradient: float
     """Mean NDC gradient at or above which a primitive is cloned or split."""
     absolute: bool
-    """Also clone or split as many again by the mean of absolute gradients (Mip-Splatting of 2024, spec 10.5)."""
+    """Also clone or split as many again by the mean of absolute gradients (Mip-Splatting, densify_and_prune)."""
     split_extent: float
     """Primitives larger than this fraction of the extent are split, smaller ones cloned."""
     split_shrink: float
@@ -143,7 +143,7 @@ class GS3DOptions:
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
-    """Raw parameters of one Gaussian per point (spec 1.1 and 1.4)."""
+    """Raw parameters of one Gaussian per point (3D-GS, create_from_pcd and simple-knn)."""
     positions, count = points.positions.float(), len(points)
     distance = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
     return {
@@ -157,7 +157,7 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
 
 
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
-    """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (spec 7, split)."""
+    """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (3D-GS, train.py)."""
     return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
 
 
@@ -188,7 +188,7 @@ class DrawnGaussians:
 
 
 class GS3D:
-    """Explicit Gaussians, N rows in every parameter; at several levels of detail if asked for (spec 4B)."""
+    """Explicit Gaussians, N rows in every parameter; at several levels of detail if asked for (GSOctree)."""
 
     def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
         scene = context.scene
@@ -232,7 +232,7 @@ class GS3D:
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def active_degree(self, step: int) -> int:
-        """SH degree at a step (spec 1.3)."""
+        """SH degree at a step (3D-GS, sh_utils.py)."""
         return min(self.options.sh_degree, step // max(1, self.schedule.step(self.options.sh_every)))
 
     def draw(self, camera: Camera, step: int) -> DrawnGaussians:
@@ -255,7 +255,7 @@ class GS3D:
         return Shown(values={**self.table.parameters, **self.table.columns})
 
     def shown(self, camera: Camera, step: int) -> Shown:
-        """All Gaussians, or those of the levels that the camera draws (spec 3.5)."""
+        """All Gaussians, or those of the levels that the camera draws (Octree-GS, set_anchor_mask)."""
         if self.levels is None:
             return self.everything()
         means, level, bias = (self.table[name] for name in ("means", "level", "bias"))
@@ -276,7 +276,7 @@ class GS3D:
         return smoothed(scales, log_opacities, shown.values["filter"])
 
     def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
-        """3D-GS has none (spec 5); across levels the mean volume of what was drawn, 0 for nothing (spec 4B)."""
+        """3D-GS has none; across levels the mean volume of what was drawn, 0 for nothing (GSOctree)."""
         control = self.options.level_density
         if control is None or not control.volume_weight:
             return None
@@ -284,7 +284,7 @@ class GS3D:
         return control.volume_weight * volumes.sum() / max(1, len(volumes))
 
     def observe(self, drawn: DrawnGaussians, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Screen gradients, which count until density control ends (spec 7, cadence)."""
+        """Screen gradients, which count until density control ends (3D-GS, train.py)."""
         if step >= self.schedule.step(self.options.density.stop):
             return {}
         return densification_statistics(rendering.screen, drawn.rows, weight)
@@ -307,7 +307,7 @@ class GS3D:
         return done
 
     def set_rates(self, step: int) -> None:
-        """Learning rates of a step (spec 6)."""
+        """Learning rates of a step (3D-GS, arguments)."""
         rates = self.options.rates
         steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         self.table.set_rate("means", self.extent * log_linear(step, steps, rates.means_first, rates.means_last))
@@ -315,7 +315,7 @@ class GS3D:
             self.table.set_rate(name, getattr(rates, name))
 
     def update(self, step: int) -> None:
-        """One Adam step. Unused SH bands take part with zero gradients, as in the published code (spec 1.3)."""
+        """One Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
         rest = self.table["sh_rest"]
         if rest.grad is None and self.table["sh_constant"].grad is not None:
             rest.grad = torch.zeros_like(rest)
@@ -376,7 +376,7 @@ class GS3D:
     def reset_due(self, step: int) -> bool:
         """Every reset interval while density control runs, and once early on a white background.
 
-        Never across levels: the published schedule does not reach one (spec 4B).
+        Never across levels: the published schedule does not reach one (GSOctree).
         """
         if self.levels is not None:
             return False
@@ -385,7 +385,7 @@ class GS3D:
         return regular or (self.white and step == max(1, self.schedule.step(density.white_reset)))
 
     def densify(self, step: int) -> dict[str, int]:
-        """Clone small and split large primitives with large gradients, then prune (spec 7, order in one event)."""
+        """Clone small and split large primitives with large gradients, then prune (3D-GS, train.py)."""
         density = self.options.density
         gradient = self.statistics.mean_gradient()
         wanted = self.candidates(gradient)
@@ -399,7 +399,7 @@ class GS3D:
         return done | withheld(wanted, chosen)
 
     def densify_levels(self, step: int, levels: Levels) -> dict[str, int]:
-        """Copies of small Gaussians on their level, children of large ones a level finer, then prune (spec 4B)."""
+        """Copies of small Gaussians on their level, children of large ones a level finer, then prune (GSOctree)."""
         density, control, quirks = self.options.density, self.options.level_density, self.options.quirks
         assert control is not None
         assert quirks is not None
@@ -428,7 +428,7 @@ class GS3D:
         return done | withheld(seen, keep)
 
     def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (spec 10.5).
+        """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (Mip-Splatting).
 
         Ours: never those without any gradient. Where none has one the published rule would choose all.
         """
@@ -460,13 +460,13 @@ class GS3D:
         doomed = self.table["opacity_logits"].sigmoid() < density.prune_opacity
         if step > self.reset_interval():
             doomed |= self.largest_scales() > density.prune_extent * self.extent
-        if bool(doomed.all()):  # a cloud about to vanish keeps what it has (spec 13, GS #482)
+        if bool(doomed.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
             return 0
         keep_rows(self.table, ~doomed)
         return int(doomed.sum())
 
     def reset_opacities(self) -> None:
-        """o <- min(o, reset_opacity), moments zeroed (spec 7); with a 3D filter o is what is drawn (spec 10.5)."""
+        """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting)."""
         highest, logits = self.options.density.reset_opacity, self.table["opacity_logits"].detach()
         excess = (self.extents(self.everything())[1].detach() - math.log(highest)).clamp_min(0)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
@@ -475,12 +475,12 @@ class GS3D:
     # -- the 3D filter -----------------------------------------------------------------------------------------
 
     def filter_due(self, step: int) -> bool:
-        """Every interval between the end of density control and the freezing of the filter (spec 10.2)."""
+        """Every interval between the end of density control and the freezing of the filter (Mip-Splatting)."""
         mip, begun = self.options.mip, self.schedule.step(self.options.density.stop)
         return begun < step < self.schedule.step(mip.stop) and step % self.schedule.interval(mip.every) == 0
 
     def refresh_filter(self) -> None:
-        """Filter sizes from where the primitives are now (spec 10.1)."""
+        """Filter sizes from where the primitives are now (Mip-Splatting, compute_3D_filter)."""
         if self.options.filter == "mip":
             means = self.table["means"].detach()
             self.table.columns["filter"] = filter_sizes(means, self.cameras, self.options.mip)
@@ -502,7 +502,7 @@ class GS3D:
         return self.gaussians(self.everything() if camera is None else self.shown(camera, step))
 
     def gaussians(self, shown: Shown) -> Gaussians:
-        """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (spec 10.9)."""
+        """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (Mip-Splatting)."""
         raw = {name: shown.values[name].detach() for name in self.table.parameters}
         if self.options.filter == "mip" or shown.weights is not None:
             scales, log_opacities = self.extents(shown)
@@ -512,7 +512,7 @@ class GS3D:
         return Gaussians(**raw)
 
     def file(self) -> dict[str, Tensor]:
-        """The standard 62 properties (spec 8.3); levels stand where normals would be (spec 5.1)."""
+        """The standard 62 properties (3D-GS, save_ply); levels stand where normals would be (Octree-GS, save_ply)."""
         columns = columns_of(self.gaussians(self.everything()))
         if self.levels is None:
             return columns

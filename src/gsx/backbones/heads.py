@@ -1,4 +1,4 @@
-"""The small networks that turn an anchor, seen from a camera, into Gaussians (Scaffold-GS; spec 2.3, 2.4, 2.11)."""
+"""The small networks that turn an anchor, seen from a camera, into Gaussians (Scaffold-GS)."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 
 LEAST_DISTANCE = 1e-8
-"""World units; a camera exactly at an anchor has no direction to it (spec 7, item 2)."""
+"""World units; a camera exactly at an anchor has no direction to it (Scaffold-GS, generate_neural_gaussians)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class HeadOptions:
     features: int
     """C: width of an anchor's feature and of the one hidden layer of every head."""
     bank: bool
-    """Mix the feature with coarser copies of itself by view (spec 2.3, feature bank)."""
+    """Mix the feature with coarser copies of itself by view (Scaffold-GS, gaussian_model.py)."""
     bank_distance: bool
     """The bank sees the distance as well as the direction (Scaffold-GS yes, Octree-GS no)."""
     opacity_distance: bool

@@ -17,35 +17,35 @@ class LevelOptions:
 
     fork: int
     count: int
-    """Number of levels; -1: from the range of distances in the scene (spec 3.1)."""
+    """Number of levels; -1: from the range of distances in the scene (Octree-GS, set_level)."""
     first: int
-    """Highest level at the start; -1: half of them (spec 3.1)."""
+    """Highest level at the start; -1: half of them (Octree-GS, set_level)."""
     base_layer: int
-    """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel` (spec 3.2)."""
+    """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel`."""
     voxel: float
     """Cell of the middle level where base_layer is -1, scene units."""
     distance_quantile: float
-    """Distances between this quantile and its mirror count, per camera and over cameras (spec 3.1)."""
+    """Distances between this quantile and its mirror count, per camera and over cameras (Octree-GS, set_level)."""
     extend: float
-    """The box is the points' range of coordinates times this (spec 3.2)."""
+    """The box is the points' range of coordinates times this (Octree-GS, octree_sample)."""
     extend_rule: str
     """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
-    box grows on both sides wherever it lies, to the same length (spec 3.2); '': as backbone.fidelity says."""
+    box grows on both sides wherever it lies, to the same length (Octree-GS); '': as backbone.fidelity says."""
     visible_threshold: float
     """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
-    fraction (spec 3.4)."""
+    fraction (Octree-GS, weed_out)."""
     mode: str
-    """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (spec 3.7)."""
+    """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (Octree-GS)."""
     half_cell: bool | None
-    """Distances are taken to a point half a cell beyond the node, as the reference does (spec 3.5); None: as
+    """Distances are taken to a point half a cell beyond the node, as the reference does (Octree-GS); None: as
     backbone.fidelity says."""
     zoom: str
     """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
     reference does, trained there or not; training: none that the finest training camera would not draw."""
     coarse_until: int
-    """Published step at which all levels take part in training (spec 3.6); 0: from the start."""
+    """Published step at which all levels take part in training (Octree-GS, set_coarse_interval); 0: from the start."""
     coarse_factor: float
-    """Each interval between two levels is this much shorter than the one before (spec 3.6)."""
+    """Each interval between two levels is this much shorter than the one before (Octree-GS, set_coarse_interval)."""
 
     def __post_init__(self) -> None:
         threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES) + ", or '' for backbone.fidelity's"

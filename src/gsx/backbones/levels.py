@@ -1,4 +1,4 @@
-"""Levels of detail over any representation: which primitives a camera at a given distance sees (Octree-GS, spec 3).
+"""Levels of detail over any representation: which primitives a camera at a given distance sees (Octree-GS).
 
 Level 0 is the coarsest; a camera at distance d draws every level up to log_f(D / (s d)): coarse levels always, finer
 ones are added. There are no pointers between levels, only nested grids with cells of v / f^L. Everything is a function
@@ -21,7 +21,7 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
 
 BELOW_ONE = 0.9999
-"""Largest fading weight and largest fraction of a level in progressive mode (spec 3.7); largest adaptive threshold."""
+"""Largest fading weight and largest fraction of a level in progressive mode (Octree-GS); largest adaptive threshold."""
 
 
 LEAST_DISTANCE = 1e-8
@@ -80,7 +80,7 @@ class Levels:
     """K."""
     fork: int
     nearest: float
-    """Distance between cameras and points, low quantile; scene units, of the finest camera (spec 3.1)."""
+    """Distance between cameras and points, low quantile; scene units, of the finest camera (Octree-GS, set_level)."""
     farthest: float
     """D: at this distance, seen by the finest camera, only level 0 is drawn."""
     origin: float
@@ -92,7 +92,7 @@ class Levels:
     first: int
     """Highest level in training at the start."""
     switches: tuple[int, ...]
-    """Steps after which one more level takes part each (spec 3.6)."""
+    """Steps after which one more level takes part each (Octree-GS, set_coarse_interval)."""
     threshold: float
     """Least fraction of cameras that must draw a primitive; see `LevelOptions.visible_threshold`."""
     mode: str
@@ -107,7 +107,7 @@ class Levels:
 
     @property
     def cell(self) -> float:
-        """Cell length v of level 0, scene units (spec 3.2)."""
+        """Cell length v of level 0, scene units (Octree-GS, octree_sample)."""
         return self.size(0)
 
     def size(self, level: int) -> float:
@@ -127,7 +127,7 @@ class Levels:
         return (cells.double() * self.size(level) + self.origin).float()
 
     def highest(self, step: int) -> int:
-        """Highest level that takes part at a step (spec 3.6)."""
+        """Highest level that takes part at a step (Octree-GS, set_coarse_interval)."""
         return min(self.count - 1, unlocked(self.switches, self.first, step))
 
     def coarseness(self, camera: Camera) -> float:
@@ -136,13 +136,13 @@ class Levels:
         return max(1.0, ratio) if self.zoom == "training" else ratio
 
     def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
-        """L* = log_f(D / (s d)), finite everywhere (spec 3.5)."""
+        """L* = log_f(D / (s d)), finite everywhere (Octree-GS, set_anchor_mask)."""
         nearness = self.farthest / (coarseness * distances).clamp_min(LEAST_DISTANCE * self.farthest)
         return nearness.log2() / math.log2(self.fork)
 
 
 def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: LevelOptions, until: int) -> Levels:
-    """The levels of a scene from its points and training cameras (spec 3.1, 3.2, 3.4, 3.6).
+    """The levels of a scene from its points and training cameras (Octree-GS).
 
     `until`: step of this run at which all levels take part, `options.coarse_until` rescaled; 0: from the start.
     """
@@ -179,7 +179,7 @@ def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
-    """(near, far) distances between cameras and points, in units of the finest camera (spec 3.1)."""
+    """(near, far) distances between cameras and points, in units of the finest camera (Octree-GS, set_level)."""
     found = []
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         distances = offsets_from(points, centre).norm(dim=1)
@@ -189,35 +189,35 @@ def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: fl
 
 
 def level_count(near: float, far: float, fork: int) -> int:
-    """K: as many levels as the range of distances has forks (spec 3.1); 1 where every distance is 0."""
+    """K: as many levels as the range of distances has forks (Octree-GS, set_level); 1 where every distance is 0."""
     if far == 0:
         return 1
     return round(math.log(far / max(near, LEAST_DISTANCE * far), fork)) + 1
 
 
 def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[float, float]:
-    """(lowest coordinate, length) of the cube around the points, one range for all axes (spec 3.2)."""
+    """(lowest coordinate, length) of the cube around the points, one range for all axes (Octree-GS, octree_sample)."""
     low, high = float(points.min()), float(points.max())
     start = extend * low if rule == "reference" else low - (extend - 1) / 2 * (high - low)
     return start, extend * (high - low)
 
 
 def first_level(count: int, given: int, until: int) -> int:
-    """Highest level at the start: given, or -1 for half of them (spec 3.1); all where none is to wait."""
+    """Highest level at the start: given, or -1 for half of them (Octree-GS, set_level); all where none is to wait."""
     if until < 1:
         return count - 1
     return min(count // 2 if given == -1 else given, count - 1)
 
 
 def base_layer(box: float, count: int, options: LevelOptions) -> int:
-    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (spec 3.2)."""
+    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (Octree-GS)."""
     if options.base_layer >= 0:
         return options.base_layer
     return round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
 
 
 def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
-    """The adaptive threshold: mean fraction of cameras that draw a node, over all nodes of all levels (spec 3.4).
+    """The adaptive threshold: mean fraction of cameras that draw a node, over all nodes of all levels (Octree-GS).
 
     Held below 1, where every camera draws every node, so that those are kept.
     """
@@ -228,7 +228,7 @@ def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
 def all_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "C 3"], Int[Tensor, "C"], Int[Tensor, "K P"]]:
-    """(positions, level, group) of the nodes nearest to the points on every level, coarse to fine (spec 3.3)."""
+    """(positions, level, group) of the nodes nearest to the points on every level, coarse to fine (Octree-GS)."""
     positions, of, group, total = [], [], [], 0
     for level in range(levels.count):
         cells, place = new_cells(levels.cells(points, level), torch.empty(0, 3, dtype=torch.long, device=points.device))
@@ -242,7 +242,7 @@ def all_nodes(
 def initial_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "N"], Int[Tensor, "K P"]]:
-    """(positions, level, group) of the nodes a scene starts from: those that enough cameras draw (spec 3.3, 3.4).
+    """(positions, level, group) of the nodes a scene starts from: those that enough cameras draw (Octree-GS).
 
     Level is int16. `group[L, p]` is the row of the node of point p on level L, -1 if it was left out, so that
     `pooled_max(colours.repeat(K, 1), group.flatten(), N)` are the largest colours in each cell.
@@ -254,7 +254,7 @@ def initial_nodes(
 
 
 def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int[Tensor, "M"], Float[Tensor, "M"]]:
-    """(highest level drawn, weight of its opacities) for each primitive (spec 3.5 and 3.7)."""
+    """(highest level drawn, weight of its opacities) for each primitive (Octree-GS)."""
     if mode == "progressive":
         place = (ideal + 1).clamp(BELOW_ONE, highest + BELOW_ONE)
         return place.floor().long(), place - place.floor()
@@ -263,7 +263,7 @@ def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int
 
 
 def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """Fraction of the training cameras that would draw each primitive, by distance alone (spec 3.4)."""
+    """Fraction of the training cameras that would draw each primitive, by distance alone (Octree-GS, weed_out)."""
     views, counts = levels.views, torch.zeros_like(positions[:, 0])
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         ideal = levels.ideal(offsets_from(positions, centre).norm(dim=1), coarseness)
@@ -272,7 +272,7 @@ def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tenso
 
 
 def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Primitives that enough training cameras draw (spec 3.4); none without a finite place."""
+    """Primitives that enough training cameras draw (Octree-GS, weed_out); none without a finite place."""
     placed = torch.isfinite(positions).all(1)
     places = torch.where(placed[:, None], positions, 0.0)
     return (seen_fraction(levels, places, of) > levels.threshold) & placed
@@ -286,7 +286,7 @@ def drawn(
     camera: Camera,
     highest: int,
 ) -> tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]:
-    """(mask, weight): primitives whose level the camera draws, and how much of their opacity (spec 3.5 and 3.7).
+    """(mask, weight): primitives whose level the camera draws, and how much of their opacity (Octree-GS).
 
     `bias` is added to the level each primitive asks for; `highest` is the finest level in use, K - 1 outside training.
     Neither result carries gradients.
@@ -300,19 +300,19 @@ def drawn(
 
 
 def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
-    """Steps at which the levels above `first` join, each interval shorter than the last (spec 3.6)."""
+    """Steps at which the levels above `first` join, each interval shorter than the last (Octree-GS)."""
     intervals = count - 1 - first
     lengths = [factor**-n for n in range(intervals)]
     return tuple(int(until * sum(lengths[: n + 1]) / sum(lengths) + 0.5) for n in range(intervals))
 
 
 def unlocked(switches: Sequence[int], first: int, step: int) -> int:
-    """Highest level in training at a step: `first`, and one more after each switch point (spec 3.6)."""
+    """Highest level in training at a step: `first`, and one more after each switch point (Octree-GS)."""
     return first + sum(switch < step for switch in switches)
 
 
 def thresholds(base: float, fork: int, update_ratio: float, count: int) -> tuple[float, ...]:
-    """Gradient at which a primitive of each level grows: tau_L = base f^(update_ratio L) (spec 3.8)."""
+    """Gradient at which a primitive of each level grows: tau_L = base f^(update_ratio L) (Octree-GS)."""
     return tuple(base * fork ** (update_ratio * level) for level in range(count))
 
 
@@ -336,7 +336,7 @@ def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, An
 
 
 def note_of(levels: Levels) -> str:
-    """A file's comment: what a viewer must know to choose levels at a distance (spec 5.1)."""
+    """A file's comment: what a viewer must know to choose levels at a distance (Octree-GS, save_ply)."""
     return (
         f"levels {levels.count}, fork {levels.fork}, standard_dist {levels.farthest!r} at a focal length of "
         f"{levels.views.focal!r} px, init_pos {levels.origin!r}, voxel_size {levels.cell!r}"

@@ -1,4 +1,4 @@
-"""Mip-Splatting's filters for any backbone (Yu et al. 2024; spec 10.1-10.4).
+"""Mip-Splatting's filters for any backbone (Yu et al. 2024).
 
 The 3D filter widens each Gaussian by what the finest training camera can resolve, at the same integrated opacity. The
 2D filter is a rule of the rasterizer: a dilation of `kernel` px^2 with compensated opacity.
@@ -17,7 +17,7 @@ from gsx.core.shapes import Bool, Float
 
 FILTERS = ("none", "mip")
 LEAST_DEPTH = 1e-3
-"""Depths are held above this before anything is divided by them, scene units (spec 10.1)."""
+"""Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
 LEAST_SHARE = 1e-30
 """Of a scale in what the 3D filter makes of it: nothing is seen of a primitive near it, and gradients stay finite."""
 
@@ -61,7 +61,7 @@ def filtered_rules(raster: RasterSettings, name: str, options: MipOptions) -> Ra
 def seen_depths(
     points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
 ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-    """(depth z, whether the camera counts as seeing the point) (spec 10.1)."""
+    """(depth z, whether the camera counts as seeing the point) (Mip-Splatting, compute_3D_filter)."""
     local = camera.to_camera(points).to(points)
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
     column = local[:, 0] / depth * camera.fx + camera.cx
@@ -75,7 +75,7 @@ def seen_depths(
 def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], options: MipOptions) -> Float[Tensor, "N"]:
     """Standard deviation of the 3D filter at each point, world units: (least depth / largest focal) sqrt(variance).
 
-    Points that no camera sees get the largest depth of those that are seen (spec 10.1).
+    Points that no camera sees get the largest depth of those that are seen (Mip-Splatting, compute_3D_filter).
 
     Raises:
         InputError: no camera sees any point.
@@ -99,7 +99,7 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
 def smoothed(
     scales: Float[Tensor, "N 3"], log_opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Scales and log-opacities after the 3D filter, differentiable in both (spec 10.3).
+    """Scales and log-opacities after the 3D filter, differentiable in both (Mip-Splatting, get_scaling_with_3D_filter).
 
     The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
     """

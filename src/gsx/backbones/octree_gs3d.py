@@ -1,4 +1,4 @@
-"""Octree-GS on explicit Gaussians in both forms: on anchors, as reported, and free with clone and split (spec 4)."""
+"""Octree-GS on explicit Gaussians in both forms: on anchors, as reported, and free with clone and split."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class OctreeGS3DOptions(ExplicitOptions):
     """Options of both forms; values in conf/backbone/octree_gs3d.yaml. Defaults: runs older than the second form."""
 
     densification: str = "anchors"
-    """anchors: new ones on grid nodes (spec 4A); clone_split: of Gaussians anywhere (spec 4B)."""
+    """anchors: new ones on grid nodes (Octree-AnyGS); clone_split: of Gaussians anywhere (GSOctree)."""
     clone_split: CloneSplitOptions | None = None
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ Pair = tuple[Tensor, Tensor]
 
 
 OWN_EVERY = 6
-"""Of so many pairs to learn from one more shows the run's own render, which is to be left alone more (spec 5.1: 10 to
+"""Of so many pairs to learn from one more shows the run's own render, which is to be left alone more (usual: 10 to
 20 %)."""
 
 

@@ -1,4 +1,4 @@
-"""A restorer learnt from this scene: what photographs have that renders lack of places nobody photographed (spec 5.2).
+"""A restorer learnt from this scene: what photographs have that renders lack of places nobody photographed.
 
 Two networks learn from half of the training views each, rendered by a model that was not fitted to them. A picture made
 beside a training view is restored by the one that has not seen that view, so that neither can answer from memory.
@@ -149,7 +149,7 @@ class SceneRestorer:
         return [self.restored(request) for request in requests]
 
     def restored(self, request: Request) -> Float[Tensor, "3 h w"]:
-        """One picture; the whole correction at the first event's strength, half of it at half of that (spec 5.2)."""
+        """One picture; the whole correction at the first event's strength, half of it at half of that."""
         fold = (request.number + 1) % FOLDS
         if not self.useful[fold] or request.strength == 0:
             return request.image

@@ -1,4 +1,4 @@
-"""Super-resolution learnt from the scene's own photographs (spec 5.3; the idea: ZSSR, Shocher et al. 2018).
+"""Super-resolution learnt from the scene's own photographs (ours; the idea: ZSSR, Shocher et al. 2018).
 
 Photographs reduced by two as the scene reduces them, and themselves, are pairs of input and truth; textures that recur
 at several distances are what it learns. Every picture it gives back reduces to its input (`reduction.projected`),

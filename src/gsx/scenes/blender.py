@@ -1,4 +1,4 @@
-"""NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (spec 1.5, 2.2, 8.1)."""
+"""NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (3D-GS)."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -92,7 +92,7 @@ def load(options: BlenderOptions) -> Scene:
 
 
 def reduced(view: View, factor: int, grouped: bool = False) -> View:
-    """The view of an image `factor` times smaller, box-averaged before it is composited (spec 10.7).
+    """The view of an image `factor` times smaller, box-averaged before it is composited (Mip-Splatting).
 
     Raises:
         ConfigError: the view is reduced already.
@@ -126,7 +126,7 @@ class BoxAverage:
 
 
 def box_averaged(image: UInt8[Tensor, "C H W"], factor: int) -> UInt8[Tensor, "C height width"]:
-    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (spec 10.7).
+    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (Mip-Splatting).
 
     Three 2 x 2 averages of floats in a row are one over 8 x 8; here it is exact.
     """

@@ -1,4 +1,4 @@
-"""Scenes from a COLMAP model and its photos (spec 2.1, 2.4, 8.1)."""
+"""Scenes from a COLMAP model and its photos (3D-GS, dataset_readers.py and getNerfppNorm and camera_utils.py)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

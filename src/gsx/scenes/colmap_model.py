@@ -1,4 +1,4 @@
-"""COLMAP models as plain data: finding, checking and reading `cameras`, `images`, `points3D` (spec 2.1).
+"""COLMAP models as plain data: finding, checking and reading `cameras`, `images`, `points3D` (3D-GS).
 
 pycolmap reads every layout (binary and text, 3.x and 4.x with rigs and frames) but does not notice where a binary
 file ends: what lies past the end comes out as noise. The files are therefore walked record by record beforehand.

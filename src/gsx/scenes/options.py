@@ -10,22 +10,22 @@ class SceneOptions:
     name: str
     """Name of the format, which is also the name of its file in conf/scene."""
     background: list[float]
-    """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (spec 2.2)."""
+    """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (3D-GS, dataset_readers.py)."""
     iterations: int = 0
     """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
     published one."""
     path: str = ""
     """Folder of the scene."""
     downscale: int = 1
-    """Train on images reduced by this factor; the originals stay the truth of zoomed-in views (spec 8.1)."""
+    """Train on images reduced by this factor; the originals stay the truth of zoomed-in views (3D-GS)."""
     max_width: int = 1600
-    """With downscale=1, wider images are reduced to this many pixels; 0: no limit (spec 8.1)."""
+    """With downscale=1, wider images are reduced to this many pixels; 0: no limit (3D-GS, camera_utils.py)."""
     resize_filter: str = "bicubic"
     """bicubic (as published) | area | lanczos; all of them prefilter."""
     resize_light: str = "display"
     """display (as published): filter the stored values; linear: filter light, after undoing the sRGB curve."""
     principal_point: str = "exact"
-    """exact | centred; centred ignores the measured principal point, as 3D-GS does (spec 2.1)."""
+    """exact | centred; centred ignores the measured principal point, as 3D-GS does (3D-GS, dataset_readers.py)."""
     unit: float = 1.0
     """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
     0.2, least distances, limits of scales) expect scenes of a few units."""

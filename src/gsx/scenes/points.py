@@ -1,4 +1,4 @@
-"""Initial points of scenes that no reconstruction comes with: from a PLY file, or random (spec 1.5)."""
+"""Initial points of scenes that no reconstruction comes with: from a PLY file, or random (3D-GS)."""
 
 from pathlib import Path
 

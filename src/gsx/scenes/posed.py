@@ -131,7 +131,7 @@ def present_frames(
 
 
 def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """Rotation and translation camera_from_world, float64, of an OpenGL camera-to-world matrix (spec 2.2).
+    """Rotation and translation camera_from_world, float64, of an OpenGL camera-to-world matrix (3D-GS).
 
     `matrix` holds 3 or 4 rows of 4 numbers; OpenGL cameras have x right, y up, z back. Rotations that text has
     rounded are replaced by the nearest exact ones.

@@ -1,4 +1,4 @@
-"""Which images are held out for testing, decided by their sorted names (3D-GS spec 8.1)."""
+"""Which images are held out for testing, decided by their sorted names (3D-GS, camera_utils.py)."""
 
 from pathlib import Path, PurePosixPath
 

@@ -1,4 +1,4 @@
-"""Splat files: properties, order and bytes as the 3D-GS release writes them (spec 8.3)."""
+"""Splat files: properties, order and bytes as the 3D-GS release writes them."""
 
 import math
 import struct

@@ -1,4 +1,4 @@
-"""Opacities compensated for dilation, the 2D filter of Mip-Splatting (spec 10.4)."""
+"""Opacities compensated for dilation, the 2D filter of Mip-Splatting."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The eager rasterizer against the float64 truth, and the truth against numbers worked by hand (spec 12)."""
+"""The eager rasterizer against the float64 truth, and the truth against numbers worked by hand."""
 
 import math
 
@@ -106,7 +106,7 @@ def test_isotropic_splat_on_a_pixel_shows_its_opacity() -> None:
 
 
 def test_point_splat_is_the_dilation_with_radius_three() -> None:
-    # s f / z = 0: covariance 0.3 I, so alpha one pixel off centre is o exp(-1 / 0.6); radius 3 (spec 12 b)
+    # s f / z = 0: covariance 0.3 I, so alpha one pixel off centre is o exp(-1 / 0.6); radius 3
     rendering = rasterize(centre_splat(1e-12, 0.5), axis_camera(), RasterSettings())
     assert int(rendering.screen.radii[0]) == 3
     assert float(rendering.image[0, 16, 17]) == pytest.approx(0.5 * math.exp(-1 / 0.6), rel=1e-5)
@@ -118,7 +118,7 @@ def test_two_coincident_splats_blend_front_to_back() -> None:
 
 
 def test_the_splat_that_would_cross_the_stop_is_not_blended() -> None:
-    # 1 - T: 0.9, 0.99, 0.999; the fourth would leave T = 1e-4 (1 - tiny) < 1e-4, so T stays 1e-3 (spec 3.4)
+    # 1 - T: 0.9, 0.99, 0.999; the fourth would leave T = 1e-4 (1 - tiny) < 1e-4, so T stays 1e-3
     splats = centre_splat(0.1, 0.9001, count=6)
     rendering = rasterize(splats, axis_camera(), RasterSettings())
     assert float(1 - rendering.alpha[16, 16]) == pytest.approx((1 - 0.9001) ** 3, rel=1e-3)
@@ -131,7 +131,7 @@ def test_alpha_is_clamped_but_its_gradient_is_not() -> None:
     image = rasterize(splat, axis_camera(), RasterSettings()).image
     assert float(image[0, 16, 16].detach()) == pytest.approx(0.99, abs=1e-6)
     image[0, 16, 16].backward()
-    assert float(logit.grad) == pytest.approx(0.999, rel=1e-4)  # d(o)/d(log o), straight through (spec 4)
+    assert float(logit.grad) == pytest.approx(0.999, rel=1e-4)  # d(o)/d(log o), straight through
 
 
 def test_mean_lands_at_the_pinhole_projection() -> None:

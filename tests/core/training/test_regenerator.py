@@ -1,4 +1,4 @@
-"""Checks that every regenerator's pictures pass: size, colour, agreement, displacement (spec 6.4)."""
+"""Checks that every regenerator's pictures pass: size, colour, agreement, displacement."""
 
 from dataclasses import replace
 

@@ -173,5 +173,5 @@ def look_at(
 
 
 def centred(camera: Camera) -> Camera:
-    """The camera with its principal point at the middle of the raster, as 3D-GS assumes (spec 2.1)."""
+    """The camera with its principal point at the middle of the raster, as 3D-GS assumes (3D-GS, dataset_readers.py)."""
     return replace(camera, cx=camera.width / 2, cy=camera.height / 2)

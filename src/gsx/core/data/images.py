@@ -172,7 +172,7 @@ class PhotoSource:
 
 
 def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, float]) -> UInt8[Tensor, "3 H W"]:
-    """Straight-alpha RGBA over a background, in double precision, then truncated to 8 bits (spec 2.2)."""
+    """Straight-alpha RGBA over a background, in double precision, then truncated to 8 bits (3D-GS)."""
     values = image.double() / 255
     colour, alpha = values[:3], values[3:]
     behind = torch.tensor(background, dtype=torch.float64)[:, None, None]

@@ -30,7 +30,7 @@ def display_from_linear(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape
 
 
 def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:
-    """Size to train at (spec 8.1): divided by `downscale` and rounded; else limited to `max_width` (0: no limit).
+    """Size to train at (3D-GS): divided by `downscale` and rounded; else limited to `max_width` (0: no limit).
 
     Raises:
         ConfigError: downscale is below 1 or max_width below 0.
@@ -148,5 +148,5 @@ REACH = {"bicubic": 2, "lanczos": 3}
 
 
 def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Display values in [0, 1] rounded to 8 bits: x 255 + 0.5, clamped (spec 8.2)."""
+    """Display values in [0, 1] rounded to 8 bits: x 255 + 0.5, clamped (3D-GS, metrics.py)."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)

@@ -70,7 +70,7 @@ class Scene:
     background: Float[Tensor, "3"]
     """Display colour behind the scene, in [0, 1]."""
     extent: float
-    """1.1 x the largest distance of a training camera from their mean (3D-GS, spec 2.4)."""
+    """1.1 x the largest distance of a training camera from their mean (3D-GS, getNerfppNorm)."""
     reduction: Reduction = Reduction()
     """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
     notes: Sequence[str] = ()
@@ -80,6 +80,6 @@ class Scene:
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from the mean centre, in scene units (spec 2.4)."""
+    """1.1 x the largest distance of a camera centre from the mean centre, in scene units (3D-GS, getNerfppNorm)."""
     centres = torch.stack([camera.centre.double() for camera in cameras])
     return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())

@@ -18,7 +18,7 @@ STRIDES = (1 << 42, 1 << 21, 1)
 
 
 def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> Float[Tensor, "P"]:
-    """Mean of the squared distances to the nearest other points, exact search (spec 1.4).
+    """Mean of the squared distances to the nearest other points, exact search (3D-GS, simple-knn).
 
     With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0.
     """

@@ -1,4 +1,4 @@
-"""PLY files with one table of scalars per vertex: splats and point clouds (3D-GS spec 8.3).
+"""PLY files with one table of scalars per vertex: splats and point clouds (3D-GS, save_ply).
 
 Reads binary little-endian and ascii, writes binary little-endian. Elements after the vertices are ignored.
 """

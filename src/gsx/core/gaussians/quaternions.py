@@ -13,7 +13,7 @@ def make_identity_where_zero(quats: Float[Tensor, "N 4"]) -> None:
 
 
 def rotation_matrices(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; a zero quaternion is the identity (spec 1.2)."""
+    """Rotation matrices of quaternions (w, x, y, z) of any length; a zero quaternion is the identity (3D-GS)."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp_min(1e-12)).unbind(1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),

@@ -1,4 +1,4 @@
-"""Real spherical harmonics of bands 0..3 with the signs of 3D-GS (spec 1.3)."""
+"""Real spherical harmonics of bands 0..3 with the signs of 3D-GS (3D-GS, sh_utils.py)."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Splat files: the standard 62-property PLY of 3D-GS (spec 8.3), written and read back."""
+"""Splat files: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), written and read back."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -88,7 +88,7 @@ def read_gaussians(path: Path) -> Gaussians:
 
 
 def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
-    """What a viewer of the file draws: all bands active (spec 1.3)."""
+    """What a viewer of the file draws: all bands active (3D-GS, sh_utils.py)."""
     degree = round((gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
     return Splats(
         means=gaussians.means,

@@ -1,4 +1,4 @@
-"""The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (spec 5)."""
+"""The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (3D-GS, loss_utils.py)."""
 
 import math
 
@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 from gsx.core.shapes import Float
 
 WINDOW, SIGMA = 11, 1.5
-"""SSIM window edge and standard deviation, px (Wang et al. 2004; spec 5)."""
+"""SSIM window edge and standard deviation, px (Wang et al. 2004; 3D-GS, loss_utils.py)."""
 C1, C2 = 0.01**2, 0.03**2
 """SSIM constants for values in [0, 1]."""
 

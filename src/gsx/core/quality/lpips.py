@@ -2,7 +2,7 @@
 
 The trunk is torchvision's VGG16 or AlexNet state dict (`vgg16-397923af.pth`, `alexnet-owt-7be5be79.pth`), the head the
 linear layers of the lpips package (`vgg.pth`, `alex.pth`). Published 3D-GS figures feed images in [0, 1] although the
-network expects [-1, 1] (spec 8.2): `input_range` selects, and the name of the figure says which.
+network expects [-1, 1] (3D-GS, metrics.py): `input_range` selects, and the name of the figure says which.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""PSNR and SSIM by their published definitions (spec 8.2). Images are display values in [0, 1]."""
+"""PSNR and SSIM by their published definitions (3D-GS, metrics.py). Images are display values in [0, 1]."""
 
 import math
 

@@ -122,7 +122,7 @@ def just_below(value: float, dtype: torch.dtype) -> float:
 
 
 def alphas_(gaussian: Float[Tensor, "B K P"], settings: RasterSettings) -> Float[Tensor, "B K P"]:
-    """In place: clamped at alpha_max, zero below alpha_min (spec 3.4)."""
+    """In place: clamped at alpha_max, zero below alpha_min (3D-GS, renderCUDA)."""
     below = just_below(settings.alpha_min, gaussian.dtype)
     return torch.threshold_(gaussian.clamp_(max=settings.alpha_max), below, 0.0)
 
@@ -156,7 +156,7 @@ def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[T
 
 
 def unclamp_(slope: Tensor, gaussian: Tensor, settings: RasterSettings) -> None:
-    """In place: the straight-through gradient of min(alpha_max, .), as in the published backward (spec 4)."""
+    """In place: the straight-through gradient of min(alpha_max, .), as in the published backward (3D-GS)."""
     if bool(gaussian.amax() > settings.alpha_max):
         slope.mul_((gaussian / settings.alpha_max).clamp_(min=1.0))
 

@@ -84,7 +84,7 @@ def covariance_and_factor(p: Columns, q: Columns, dilation: float) -> tuple[Colu
 
 
 def log_compensation(bare: Float[Tensor, "M"], added: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """ln sqrt(|S| / |S + d I|) of determinants |S| = bare and |S + d I| = bare + added (Mip-Splatting, spec 10.4).
+    """ln sqrt(|S| / |S + d I|) of determinants |S| = bare and |S + d I| = bare + added (Mip-Splatting, forward.cu).
 
     The ratio is the sigmoid of ln(bare / added): exact near 0 and near 1; constant below the floor.
     """

@@ -45,7 +45,7 @@ class Pairs:
 
 
 def published_radii(covariances: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
-    """ceil(3 sqrt(lambda_max)) with the published floor of 0.1 under the inner root (spec 3.1, step 5)."""
+    """ceil(3 sqrt(lambda_max)) with the published floor of 0.1 under the inner root (3D-GS, forward.cu)."""
     xx, xy, yy = covariances.unbind(1)
     spread = ((xx - yy) / 2).square() + xy.square()
     return (3 * ((xx + yy) / 2 + spread.clamp_min(0.1).sqrt()).sqrt()).ceil()
@@ -54,7 +54,7 @@ def published_radii(covariances: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
 def published_windows(
     means: Float[Tensor, "M 2"], radii: Float[Tensor, "M"], frame: Frame
 ) -> tuple[Int[Tensor, "M 2"], Int[Tensor, "M 2"]]:
-    """First and past-the-last frame pixel of the 16 px tiles that 3D-GS assigns to each splat (spec 3.1, step 6)."""
+    """First and past-the-last frame pixel of the 16 px tiles that 3D-GS assigns to each splat (3D-GS, forward.cu)."""
     size = [-(-frame.width // WINDOW_TILE), -(-frame.height // WINDOW_TILE)]
     grid = torch.tensor(size, device=means.device, dtype=torch.int32)
     corner = means - 0.5  # the published mean is relative to integer pixel positions

@@ -143,7 +143,7 @@ def project(
     refuse_unusable(camera, intrinsics, margin)
     intrinsics = on_frame(intrinsics, camera.frame).to(splats.means.device)
     points = camera_points(splats, camera)
-    in_front, good = sound(splats, points, intrinsics, camera, margin)  # selecting comes before any division (spec 12)
+    in_front, good = sound(splats, points, intrinsics, camera, margin)  # selecting comes before any division
     ids = (good & in_front).nonzero()[:, 0]
     points, scales, quats, log_opacities, channels = (
         take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)

@@ -31,7 +31,7 @@ def frame_pixels(camera: Camera) -> Float[Tensor, "H W 2"]:
 def screen_roots(
     splats: Splats, points: Float[Tensor, "N 3"], camera: Camera, settings: RasterSettings
 ) -> Float[Tensor, "N 5 2"]:
-    """A with A^T A = J W Sigma W^T J^T + dilation (spec 3.2, off-centre form)."""
+    """A with A^T A = J W Sigma W^T J^T + dilation (3D-GS, computeCov2D)."""
     x, y, z = points.unbind(1)
     widen_x = settings.jacobian_margin * camera.width / (2 * camera.fx)
     widen_y = settings.jacobian_margin * camera.height / (2 * camera.fy)
@@ -62,7 +62,7 @@ def compensation(roots: Float[Tensor, "N 5 2"]) -> Float[Tensor, "N"]:
 def windows(
     means: Float[Tensor, "N 2"], covariances: Float[Tensor, "N 2 2"], xy: Float[Tensor, "H W 2"]
 ) -> Bool[Tensor, "N H W"]:
-    """Pixels inside the 16 px tiles that the published 3-sigma square touches (spec 3.1, steps 5 and 6)."""
+    """Pixels inside the 16 px tiles that the published 3-sigma square touches (3D-GS, forward.cu)."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     middle = (a + c) / 2
     largest = middle + torch.sqrt((middle**2 - (a * c - b * b)).clamp_min(0.1))
@@ -89,7 +89,7 @@ def alpha_maps(
     alpha = torch.exp(chosen.log_opacities.double()[:, None, None] - distance / 2)
     if settings.compensate:
         alpha = alpha * compensation(roots)[:, None, None]
-    clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (spec 4)
+    clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (3D-GS, backward.cu)
     keep = clamped >= settings.alpha_min
     if settings.cull == "published":
         keep = keep & windows(means, roots.mT @ roots, xy)

@@ -26,7 +26,7 @@ class ScreenStatistics:
     radii: Int[Tensor, "M"]
     """Published radius, px; 0: touches no tile."""
     means2d_offset: Float[Tensor, "M 2"]
-    """Zeros added to the screen means; their gradient is that of the means, px, blending path only (spec 4)."""
+    """Zeros added to the screen means; their gradient is that of the means, px, blending path only (3D-GS)."""
     absgrad: Float[Tensor, "M 2"] | None
     """Its gradient is the sum over pixels of absolute gradients, px; None unless asked for."""
     max_weights: Float[Tensor, "M"] | None
@@ -36,11 +36,11 @@ class ScreenStatistics:
 
     @property
     def visible(self) -> Bool[Tensor, "M"]:
-        """Splats that touch a tile; no pixel need have been shaded (spec 3.1)."""
+        """Splats that touch a tile; no pixel need have been shaded (3D-GS, forward.cu)."""
         return self.radii > 0
 
     def ndc_gradient(self, of: Tensor) -> Float[Tensor, "M 2"]:
-        """Gradient of `means2d_offset` or `absgrad` in NDC units: pixels times half the raster (spec 4)."""
+        """Gradient of `means2d_offset` or `absgrad` in NDC units: pixels times half the raster (3D-GS, backward.cu)."""
         gradient = of.grad if of.grad is not None else torch.zeros_like(of)
         return gradient * gradient.new_tensor(self.size) / 2
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 WINDOW_TILE = 16
-"""Tile edge of the published rasterizer: its 3-sigma windows are whole numbers of these (spec 3.1)."""
+"""Tile edge of the published rasterizer: its 3-sigma windows are whole numbers of these (3D-GS, forward.cu)."""
 
 CHOICES = {
     "cull": ("published", "tight"),
@@ -29,21 +29,21 @@ class RasterSettings:
     """Rules that shape the image, then sizes that only shape the work."""
 
     dilation: float = 0.3
-    """Added to both diagonal entries of the screen covariance, px^2 (3D-GS, spec 3.1)."""
+    """Added to both diagonal entries of the screen covariance, px^2 (3D-GS, forward.cu)."""
     compensate: bool = False
     """Opacity times sqrt(|S| / |S + dilation I|), S the screen covariance before dilation: Mip-Splatting's 2D filter
-    with dilation 0.1 (spec 10.4); published 3D-GS draws without."""
+    with dilation 0.1 (Mip-Splatting, forward.cu); published 3D-GS draws without."""
     alpha_min: float = 1 / 255
-    """Contributions below are skipped (spec 3.4)."""
+    """Contributions below are skipped (3D-GS, renderCUDA)."""
     alpha_max: float = 0.99
-    """Alphas are clamped here (spec 3.4)."""
+    """Alphas are clamped here (3D-GS, renderCUDA)."""
     transmittance_stop: float = 1e-4
-    """A pixel ends before the splat that would take its transmittance below (spec 3.4)."""
+    """A pixel ends before the splat that would take its transmittance below (3D-GS, renderCUDA)."""
     cull: str = "published"
     """`published`: a splat reaches only the 16 px tiles of its 3-sigma square, as 3D-GS draws it.
     `tight`: it reaches every pixel where its alpha is at least alpha_min (the better rule: no truncation)."""
     jacobian_margin: float = 0.3
-    """x/z, y/z are clamped to the raster widened by this fraction of half its extent in the Jacobian (spec 3.2)."""
+    """x/z, y/z are clamped to the raster widened by this fraction of half its extent in the Jacobian (3D-GS)."""
     tile_size: int = 8
     """Edge of the compositing tiles, px; with cull=published it must divide 16."""
     chunk: int = 16

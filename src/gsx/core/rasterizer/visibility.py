@@ -19,7 +19,7 @@ def touches(
     camera: Camera,
     settings: RasterSettings,
 ) -> Bool[Tensor, "N"]:
-    """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (spec 3.1).
+    """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (3D-GS, forward.cu).
 
     Those that have no such square, because something is out of range, are not held back either: the render counts them.
     """

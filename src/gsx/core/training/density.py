@@ -1,7 +1,7 @@
 """Row surgery on parameters and their Adam state together, and the statistics that decide about it.
 
 Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments and
-removed with their moments; a group's step count is never reset (spec 7, "Adam state"). A parameter touched by surgery
+removed with their moments; a group's step count is never reset (3D-GS, train.py). A parameter touched by surgery
 is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
 """
 
@@ -18,7 +18,7 @@ from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.shapes import Bool, Float, Int
 
 ADAM_EPSILON = 1e-15
-"""3D-GS: gradients of a mean loss are tiny (spec 6)."""
+"""3D-GS: gradients of a mean loss are tiny (3D-GS, arguments)."""
 
 
 @dataclass(eq=False)
@@ -165,7 +165,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor], device: tor
 def densification_statistics(
     screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
 ) -> dict[str, Tensor]:
-    """Of one render after its backward pass the visible primitives, and the norms of their gradients (spec 4).
+    """Of one render after its backward pass the visible primitives, and the norms of their gradients (3D-GS).
 
     `drawn`: rows of the splats that were rendered; None: splat n is row n. `weight`: see `Statistics`.
     """
@@ -199,7 +199,7 @@ class Statistics:
     count: Float[Tensor, "N"]
     """Sum of the weights of the renders in which the primitive was visible: steps, where all see it."""
     absolute: Float[Tensor, "N"] | None = None
-    """Sum of |g_x| + |g_y| over pixels, NDC units, where it is gathered (Mip-Splatting of 2024, spec 10.5)."""
+    """Sum of |g_x| + |g_y| over pixels, NDC units, where it is gathered (Mip-Splatting, densify_and_prune)."""
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> "Statistics":

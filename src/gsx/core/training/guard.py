@@ -15,7 +15,7 @@ from gsx.core.training.run import Run, Step
 logger = logging.getLogger(__name__)
 
 PATIENCE = 3
-"""Bad steps in a row that end the run (DESIGN section 7)."""
+"""Bad steps in a row that end the run."""
 
 
 class Guard:

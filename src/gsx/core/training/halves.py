@@ -1,7 +1,7 @@
 """Training views as a model shows them that was not fitted to them: half of the views, by one of the other half.
 
 The run's own renders of its training views are too clean to learn repair from. These have what renders of new places
-lack, and photographs to compare with (spec 5.1; every n-th view: Difix, Wu et al. 2025).
+lack, and photographs to compare with (ours; every n-th view: Difix, Wu et al. 2025).
 """
 
 import logging

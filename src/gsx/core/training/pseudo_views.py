@@ -1,4 +1,4 @@
-"""Pseudo details: pictures that nobody took, which training uses as truth for a while (spec 1.1-1.3)."""
+"""Pseudo details: pictures that nobody took, which training uses as truth for a while (the paper)."""
 
 import json
 from collections.abc import Sequence
@@ -43,19 +43,19 @@ class Term:
     parts: Sequence[tuple[PseudoView, float]]
     """Pseudo views with their weights."""
     replaces: float
-    """Share of the backbone's own loss that this term takes the place of; 0: it is added (spec 1.3)."""
+    """Share of the backbone's own loss that this term takes the place of; 0: it is added (the paper)."""
     observed: bool
     """Whether the renders count in density control (the authors' code does so), each by its weight in `parts`. That is
     the weight of the mean difference whatever its kind: squares, or what is known at a lower resolution beside it."""
     shared: bool
-    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, spec 1.4)."""
+    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, as the paper)."""
     squared: bool = False
     """Differences are (render - target)^2 instead of the paper's |render - target|."""
 
 
 def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
-    """Mean |render - target| over pixels and channels, each pixel by its trust (spec 1.3); that at a lower resolution
-    beside it where that is known (SRGS, spec 6.1). `squared`: (render - target)^2 in both."""
+    """Mean |render - target| over pixels and channels, each pixel by its trust (the paper); that at a lower resolution
+    beside it where that is known (SRGS). `squared`: (render - target)^2 in both."""
     size = torch.square if squared else torch.abs
     difference = size(image - view.target.to(image.device).float() / 255)
     if view.pixel_weight is not None:

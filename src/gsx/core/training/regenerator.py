@@ -1,4 +1,4 @@
-"""What redraws a picture: an upscaler, a restorer. It knows nothing of Gaussians (spec 6.4)."""
+"""What redraws a picture: an upscaler, a restorer. It knows nothing of Gaussians."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
 
 LARGEST_DRIFT = 2 / 255
-"""Mean colours that differ by more are put right (spec 6.4)."""
+"""Mean colours that differ by more are put right."""
 LEAST_SLOPE = 1e-3
 """Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
 ACTIONS = ("drop", "warn", "off")
@@ -44,7 +44,7 @@ class Check:
 
 @dataclass(frozen=True, kw_only=True)
 class Checks:
-    """What a redrawn picture has to keep of what it was made from (spec 6.4); values in conf/checks."""
+    """What a redrawn picture has to keep of what it was made from; values in conf/checks."""
 
     colour: Check
     """Largest change of the mean colour, 8-bit levels, after `colour_matched`."""
@@ -135,13 +135,13 @@ def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tens
 
 
 def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The result, its mean colour put right where it is more than LARGEST_DRIFT off (spec 6.4)."""
+    """The result, its mean colour put right where it is more than LARGEST_DRIFT off."""
     drift = colour_drift(request, result)
     return result if float(drift.abs().max()) <= LARGEST_DRIFT else result.cpu() - drift[:, None, None]
 
 
 def unusable(request: Request, result: Tensor) -> str:
-    """Why a result is no picture of what was asked for; empty for one that is (spec 6.4)."""
+    """Why a result is no picture of what was asked for; empty for one that is."""
     expected = (3, *request.result_size)
     if tuple(result.shape) != expected:
         return f"it is {tuple(result.shape)} and should be {expected}"
@@ -151,7 +151,7 @@ def unusable(request: Request, result: Tensor) -> str:
 
 
 def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
-    """How a result differs from its input by more than a check allows, in words by the check's name (spec 6.4).
+    """How a result differs from its input by more than a check allows, in words by the check's name.
 
     Looked at without the rim of the window, which was reduced from pixels beyond it.
     """

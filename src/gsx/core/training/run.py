@@ -41,7 +41,7 @@ class TrainingOptions:
 
 @dataclass(eq=False)
 class Sampler:
-    """Training views without replacement, reshuffled when all have been seen (spec 7).
+    """Training views without replacement, reshuffled when all have been seen (3D-GS, train.py).
 
     Each order comes from the seed and its number alone, so that those to come can be told.
     """

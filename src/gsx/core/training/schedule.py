@@ -25,6 +25,6 @@ class Schedule:
 
 
 def log_linear(step: int, steps: int, first: float, last: float) -> float:
-    """Interpolates from `first` to `last` with the logarithm linear in step / steps, held at `last` (spec 6)."""
+    """Interpolates from `first` to `last` with the logarithm linear in step / steps, held at `last` (3D-GS)."""
     fraction = min(max(step / steps, 0.0), 1.0)
     return math.exp((1 - fraction) * math.log(first) + fraction * math.log(last))

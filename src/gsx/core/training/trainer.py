@@ -37,7 +37,7 @@ def train(run: Run, plugins: Plugins) -> None:
 
 
 def train_step(run: Run, plugins: Plugins) -> Step:
-    """One step in the order of the published loop (spec 7): render, backward, statistics, density, Adam."""
+    """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
     step = backward(run)
     reason = veto(run, step, plugins)
     if reason:
@@ -100,7 +100,7 @@ def terms_of(run: Run, number: int, picked: int) -> list[Term]:
 
 
 def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
-    """Render a view, and the pseudo views that go with it, and send the loss back (spec 1.3).
+    """Render a view, and the pseudo views that go with it, and send the loss back (the paper).
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are

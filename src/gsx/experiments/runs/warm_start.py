@@ -28,7 +28,7 @@ BRANCH = "branch.json"
 
 SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 """Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
-(spec 1.8)."""
+(the paper, Experimental Setup)."""
 
 
 def common_steps(run: Run) -> int:

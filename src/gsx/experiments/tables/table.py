@@ -23,7 +23,7 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "kGS": lambda e: thousandth(e.get("visible_primitives")),
     "MB": lambda e: e.get("megabytes"),
 }
-"""By metric, from an evaluation or one of its groups; Mem is the size of the model (spec 1.10, 32)."""
+"""By metric, from an evaluation or one of its groups; Mem is the size of the model file, as the paper has it."""
 PLACES = ("model", "revision", "variant", "dtype", "tiling")
 """Keys of regenerators that say where a model comes from and how it fits into memory."""
 SHOWN_KEYS = 12

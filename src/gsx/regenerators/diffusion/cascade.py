@@ -24,7 +24,7 @@ class CascadeOptions:
 
 
 def rungs(scale: int) -> list[int]:
-    """Factors whose product is the scale, the larger first (spec 1.9: x8 is x4, then x2); x1 has none.
+    """Factors whose product is the scale, the larger first (the paper: x8 is x4, then x2); x1 has none.
 
     Raises:
         ConfigError: it is no power of two.

@@ -1,4 +1,4 @@
-"""What is known of each model: where it is, what sizes it takes, how it is called (spec 4)."""
+"""What is known of each model: where it is, what sizes it takes, how it is called (diffusers)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -88,7 +88,7 @@ class ModelSpec:
 def steps_for(strength: float, steps: int) -> int:
     """The steps to ask for; 0: as many as let image-to-image, which executes int(steps * strength), execute one.
 
-    floor(1/s) + 1, the authors' rule; ceil(1/s) ends in none for some strengths (spec 4).
+    floor(1/s) + 1, the authors' rule; ceil(1/s) ends in none for some strengths (diffusers).
     """
     return steps or math.floor(1 / strength) + 1
 

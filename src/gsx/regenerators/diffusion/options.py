@@ -98,7 +98,7 @@ class PipelineOptions(DiffusionOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class TuningOptions:
-    """Per-scene LoRA on (render, photograph) pairs (spec 5.1)."""
+    """Per-scene LoRA on (render, photograph) pairs."""
 
     steps: int
     """0: the model is used as it is."""

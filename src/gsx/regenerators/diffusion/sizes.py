@@ -1,6 +1,6 @@
 """Sizes that a model takes: pictures grow by their own reflection, and results lose exactly what was added.
 
-A pipeline that is handed another size resizes without a word (spec 4), which moves every pixel.
+A pipeline that is handed another size resizes without a word (diffusers), which moves every pixel.
 """
 
 import torch

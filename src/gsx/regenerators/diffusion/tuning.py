@@ -1,4 +1,4 @@
-"""A LoRA for one scene: the model learns to take renders of unseen views to their photographs (spec 5.1).
+"""A LoRA for one scene: the model learns to take renders of unseen views to their photographs.
 
 It is trained as it will be called: the render's latent, noised as little as the strengths of the run allow, is to
 become the photograph's in the one step that image-to-image executes.
@@ -55,7 +55,7 @@ WEIGHT_DECAY = 1e-2
 
 
 LARGEST_NORM = 1.0
-"""To which gradients are clipped (spec 5.1)."""
+"""To which gradients are clipped."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
