@@ -7,7 +7,8 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D, GS3DOptions
+from gsx.backbones.gs3d import GS3D, gs3d
+from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
@@ -58,7 +59,7 @@ def small_gs3d(scene: Scene, *, iterations: int = 30000, seed: int = 0, options:
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
     )
-    return GS3D(options or published_options(), context)
+    return gs3d(options or published_options(), context)
 
 
 def spread(count: int, seed: int = 0) -> Tensor:

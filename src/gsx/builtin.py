@@ -12,7 +12,8 @@ def gsx_register(registry: Registry) -> None:
     from gsx.augmenters.pseudo_details import PseudoDetails
     from gsx.augmenters.pseudo_options import PseudoOptions
     from gsx.backbones.anchors import NeuralOptions, neural_anchors
-    from gsx.backbones.gs3d import GS3D, GS3DOptions
+    from gsx.backbones.gs3d import gs3d
+    from gsx.backbones.gs3d_options import GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
@@ -33,8 +34,8 @@ def gsx_register(registry: Registry) -> None:
     registry.add("scene", "blender", blender.load, blender.BlenderOptions)
     registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions)
     registry.add("scene", "bungee", bungee.load, bungee.BungeeOptions)
-    registry.add("backbone", "gs3d", GS3D, GS3DOptions)
-    registry.add("backbone", "mip_splatting", GS3D, GS3DOptions)
+    registry.add("backbone", "gs3d", gs3d, GS3DOptions)
+    registry.add("backbone", "mip_splatting", gs3d, GS3DOptions)
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)

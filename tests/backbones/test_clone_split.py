@@ -15,15 +15,17 @@ from torch import Tensor
 
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
+    VisibleByLevel,
     clones,
     densify_masks,
     relative_sizes,
     small_children,
     starting_points,
 )
-from gsx.backbones.gs3d import GS3D, DrawnGaussians
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import DrawnGaussians, everything
 from gsx.backbones.levels import Levels, initial_nodes, kept
-from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians
+from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians, free_options
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
@@ -68,15 +70,19 @@ def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
     )
-    backbone = GS3D(free_gaussians(options), context)
-    assert backbone.levels is not None
-    backbone.levels = replace(backbone.levels, farthest=8.0)
+    backbone = free_gaussians(options, context)
+    visibility = visibility_of(backbone)
+    visibility.levels = replace(visibility.levels, farthest=8.0)
     return backbone
 
 
+def visibility_of(backbone: GS3D) -> VisibleByLevel:
+    assert isinstance(backbone.visibility, VisibleByLevel)
+    return backbone.visibility
+
+
 def levels_of(backbone: GS3D) -> Levels:
-    assert backbone.levels is not None
-    return backbone.levels
+    return visibility_of(backbone).levels
 
 
 def render(backbone: GS3D, camera: Camera, step: int) -> tuple[DrawnGaussians, Rendering]:
@@ -166,7 +172,7 @@ def test_verdicts_by_hand(level: int, gradient: float, scale: float, wanted: str
 
 
 def raw_of(backbone: GS3D) -> dict[str, Tensor]:
-    return {name: value.detach().clone() for name, value in backbone.everything().values.items()}
+    return {name: value.detach().clone() for name, value in everything(backbone.table).values.items()}
 
 
 def test_clones_are_copies_on_their_level_without_bias() -> None:
@@ -322,10 +328,9 @@ def test_fidelity_reaches_every_switch_of_the_second_form() -> None:
     """Those of the reference, and what levels leave open; what means nothing here is refused."""
     found = {}
     for fidelity in ("reference", "sane"):
-        given = free_gaussians(options_of(f"fidelity={fidelity}", "levels.half_cell=null"))
-        assert given.quirks is not None
-        assert given.levels is not None
-        found[fidelity] = (given.quirks.gate, given.quirks.bias, given.levels.extend_rule, given.levels.half_cell)
+        options = options_of(f"fidelity={fidelity}", "levels.half_cell=null")
+        quirks, levels = options.switches(), free_options(options)[1]
+        found[fidelity] = (quirks.gate, quirks.bias, levels.extend_rule, levels.half_cell)
     assert found == {"reference": ("open", "level", "reference", True), "sane": ("closed", "own", "sane", False)}
     with pytest.raises(
         ConfigError, match=r"quirks\.promoted is 'max', which means nothing to densification=clone_split"
@@ -374,14 +379,14 @@ def test_bias_lets_a_gaussian_be_drawn_from_farther() -> None:
     close = ((of == 2) & (reach < 1.5) & (reach > 1.0)).nonzero()[:, 0]
     assert len(close) > 0
     row = int(close[0])
-    assert row not in backbone.shown(camera, 40000).rows.tolist()  # type: ignore[union-attr]
+    assert row not in backbone.visibility.shown(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
     backbone.table["bias"][row] = 0.6
-    assert row in backbone.shown(camera, 40000).rows.tolist()  # type: ignore[union-attr]
+    assert row in backbone.visibility.shown(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
 
 
 def test_levels_that_wait_are_not_drawn() -> None:
     backbone = small_octree()
-    shown = backbone.shown(seen_from(1.0), 1)
+    shown = backbone.visibility.shown(backbone.table, seen_from(1.0), 1)
     assert shown.rows is not None
     assert int(backbone.table["level"][shown.rows].max()) == levels_of(backbone).first < 2
 
@@ -404,7 +409,7 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
 def test_fading_levels_are_fainter() -> None:
     backbone = small_octree("levels.mode=progressive")
     camera = seen_from(3.0)
-    shown = backbone.shown(camera, 40000)
+    shown = backbone.visibility.shown(backbone.table, camera, 40000)
     assert shown.rows is not None
     assert shown.weights is not None
     assert 0 < float(shown.weights.min()) < 0.9
@@ -445,7 +450,7 @@ def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path
     assert torch.equal(columns["extra_level"], backbone.table["bias"])
     assert columns["info"].tolist() == [8.0] + [0.0] * (len(backbone.table) - 1)
     assert "standard_dist 8.0" in backbone.export_notes()[1]
-    scales, log_opacities = backbone.extents(backbone.everything())
+    scales, log_opacities = backbone.extents(everything(backbone.table))
     torch.testing.assert_close(columns["scale_1"].exp(), scales[:, 1].detach())
     torch.testing.assert_close(columns["opacity"].sigmoid(), log_opacities.detach().exp())
 
@@ -483,18 +488,16 @@ def test_options_are_checked(words: tuple[str, ...], complaint: str) -> None:
 
 def test_shared_options_reach_the_second_form() -> None:
     words = ("filter=mip", "max_primitives=77", "levels.count=5", "published_iterations=50000")
-    given = free_gaussians(options_of(*words))
+    given, levels, _ = free_options(options_of(*words))
     assert (given.filter, given.max_primitives, given.published_iterations) == ("mip", 77, 50000)
-    assert given.levels is not None
-    assert given.levels.count == 5
+    assert levels.count == 5
 
 
 def test_overrides_of_a_saved_run_reach_the_second_form(tmp_path: Path) -> None:
     settings = compose(list(WORDS), plugins())
     write_config(tmp_path / "config.yaml", settings.resolved)
     again = read_config(tmp_path / "config.yaml", plugins(), ["backbone.levels.mode=progressive"])
-    levels = free_gaussians(again.backbone.options).levels
-    assert levels is not None
+    levels = free_options(again.backbone.options)[1]
     assert levels.mode == "progressive"
 
 

@@ -12,6 +12,7 @@ from test_extremes_of_training import built
 from torch import Tensor
 
 from gsx.backbones.anchors import Anchors
+from gsx.backbones.clone_split import VisibleByLevel
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.levels import distance_range, drawn, seen_fraction, viewpoints_of
 from gsx.backbones.mip import filter_sizes
@@ -113,7 +114,7 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     """Primitives stand just within and just beyond the distance at which their level begins."""
     near = built("octree_gs3d, clone_split", near_scene())
     assert isinstance(near, GS3D)
-    assert near.levels is not None
+    assert isinstance(near.visibility, VisibleByLevel)
     means = near.table["means"].detach()
     means = (means * 16).round() / 16
     away = (means.double() + FAR).float()
@@ -121,7 +122,7 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     views, far_views = viewpoints_of(near.cameras), viewpoints_of(far_cameras)
     assert distance_range(away, far_views, 0.9) == pytest.approx(distance_range(means, views, 0.9), rel=1e-6)
     camera, of = near.cameras[2], near.table["level"]
-    levels = replace(near.levels, mode="floor", half_cell=False, views=views)
+    levels = replace(near.visibility.levels, mode="floor", half_cell=False, views=views)
     ideal = (levels.farthest / (means.double() - camera.centre).norm(dim=1)).log2()
     within = torch.arange(len(means)) % 2 == 0
     bias = (1 - ideal + torch.where(within, 1e-4, -1e-4)).float()  # level 1 begins 1e-4 of a level away

@@ -8,7 +8,8 @@ import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D, DrawnGaussians, children
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import DrawnGaussians, children
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric

@@ -55,7 +55,7 @@ def in_view(run: Run) -> int:
     """A primitive that every camera draws at the next step."""
     backbone, camera = backbone_of(run), run.scene.train[0].camera
     step = run.step + 1
-    rows = backbone.visible(camera, step).rows if isinstance(backbone, Anchors) else backbone.shown(camera, step).rows
+    rows = backbone.visible(camera, step).rows if isinstance(backbone, Anchors) else backbone.draw(camera, step).rows
     return 3 if rows is None else int(rows[3])
 
 

@@ -18,8 +18,8 @@ from torch.nn.functional import logsigmoid
 
 from gsx.backbones import gs3d
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.levels import quantile
 from gsx.backbones.mip import MipOptions, filter_sizes, logit_of_log, smoothed
+from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene

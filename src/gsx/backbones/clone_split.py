@@ -4,18 +4,36 @@ Small Gaussians with large gradients get a copy on their own level. Large ones g
 and stay as they are. Without pointers between levels, a Gaussian's level is all that ties it to the octree.
 """
 
+import logging
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.levels import Levels, initial_nodes, thresholds
+from gsx.backbones.growth_options import Quirks
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import DrawnGaussians, Shown
+from gsx.backbones.levels import (
+    Levels,
+    drawn,
+    facts_of,
+    initial_nodes,
+    kept,
+    note_of,
+    thresholds,
+    warnings_of,
+)
 from gsx.backbones.sampling import sampled_means
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
+from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable
+from gsx.core.training.density import ParameterTable, append_rows, withheld, within_room
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,3 +145,80 @@ def bias_levels(table: ParameterTable, biased: Bool[Tensor, "N"], step: float, m
     """Let Gaussians with fair gradients be drawn from a little farther, by at most so many levels."""
     table["bias"][: len(biased)] += step * biased
     table["bias"].clamp_max_(most)
+
+
+class VisibleByLevel:
+    """A camera draws the Gaussians of the levels that its distance asks for (Octree-GS)."""
+
+    def __init__(self, levels: Levels) -> None:
+        self.levels = levels
+
+    def start(self, points: PointCloud) -> tuple[PointCloud, dict[str, Tensor]]:
+        """The nodes of the levels; columns `level` and `bias`."""
+        cloud, columns = starting_points(points, self.levels)
+        for warning in warnings_of(self.levels, len(cloud)):
+            logger.warning("%s", warning)
+        return cloud, columns
+
+    def shown(self, table: ParameterTable, camera: Camera, step: int) -> Shown:
+        """Those of the levels that the camera draws, faded where the mode says so (Octree-GS, set_anchor_mask)."""
+        means, level, bias = (table[name] for name in ("means", "level", "bias"))
+        mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
+        rows = mask.nonzero()[:, 0]
+        values = {name: take_rows(parameter, rows) for name, parameter in table.parameters.items()}
+        values |= {name: column[rows] for name, column in table.columns.items()}
+        return Shown(values=values, rows=rows, weights=weights[rows])
+
+    def columns(self, table: ParameterTable) -> dict[str, Tensor]:
+        """Levels, and the distance at which the coarsest alone is drawn (GSOctree, save_ply)."""
+        info = torch.zeros_like(table["bias"])
+        info[:1] = self.levels.farthest
+        return {"level": table["level"].float(), "extra_level": table["bias"], "info": info}
+
+    def plan(self, table: ParameterTable) -> dict[str, Any]:
+        """Levels in numbers."""
+        return {"levels": facts_of(self.levels, table["level"])}
+
+    def notes(self) -> list[str]:
+        """What chooses the levels at a distance."""
+        return [note_of(self.levels)]
+
+
+class CloneSplitAcrossLevels:
+    """Copies of small Gaussians on their level, children of large ones a level finer (GSOctree)."""
+
+    resets = False  # the published schedule does not reach a reset
+
+    def __init__(self, visibility: VisibleByLevel, options: LevelDensityOptions, quirks: Quirks) -> None:
+        self.visibility, self.options, self.quirks = visibility, options, quirks
+
+    def densify(self, model: GS3D, step: int) -> dict[str, int]:
+        """Parents stay; what too few cameras would draw is not made."""
+        levels, options, table = self.visibility.levels, self.options, model.table
+        gradient = model.statistics.mean_gradient()
+        masks = densify_masks(
+            gradient,
+            table["log_scales"].detach().exp(),
+            table["level"],
+            levels,
+            options,
+            threshold=model.options.density.gradient,
+            large=model.options.density.split_extent * model.extent,
+            splitting=self.quirks.gate == "open" or levels.highest(step) == levels.count - 1,
+        )
+        cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
+        raw = {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+        new = stacked([clones(raw, cloned), small_children(raw, split, levels, options.shrink, model.generator)])
+        seen = kept(levels, new["means"], new["level"])
+        keep = within_room(seen, gradient[torch.cat([cloned, split])], model.room())
+        bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)
+        append_rows(table, {name: value[keep] for name, value in new.items()})
+        done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum())}
+        return done | withheld(seen, keep)
+
+    def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
+        """Mean volume of what was drawn, 0 for nothing."""
+        if not self.options.volume_weight:
+            return None
+        volumes = drawn.splats.scales.prod(1)
+        return self.options.volume_weight * volumes.sum() / max(1, len(volumes))

@@ -1,9 +1,7 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
-import logging
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,20 +9,18 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import logsigmoid, normalize
 
-from gsx.backbones.clone_split import (
-    LevelDensityOptions,
-    bias_levels,
-    clones,
-    densify_masks,
-    small_children,
-    stacked,
-    starting_points,
+from gsx.backbones.gs3d_options import GS3DOptions
+from gsx.backbones.gs3d_parts import (
+    AllVisible,
+    CloneSplit,
+    Densification,
+    DrawnGaussians,
+    Shown,
+    Visibility,
+    everything,
 )
-from gsx.backbones.growth_options import Quirks
-from gsx.backbones.level_options import LevelOptions, checked_end
-from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, kept, note_of, quantile, warnings_of
-from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules, logit_of_log, smoothed
-from gsx.backbones.sampling import sampled_means
+from gsx.backbones.mip import filter_sizes, filtered_rules, logit_of_log, smoothed
+from gsx.backbones.sampling import quantile
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
@@ -33,13 +29,12 @@ from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import Rendering, drawable, take_rows
-from gsx.core.shapes import Bool, Float, Int
+from gsx.core.rasterizer import Rendering, drawable
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
     ParameterTable,
     Statistics,
-    append_rows,
     densification_statistics,
     finite_rows,
     keep_rows,
@@ -47,99 +42,19 @@ from gsx.core.training.density import (
     restored_table,
     room_under,
     table_tensors,
-    withheld,
-    within_room,
 )
 from gsx.core.training.schedule import log_linear
 
-logger = logging.getLogger(__name__)
-
 LARGEST_LOG_SCALE = 30.0
 """Scales are held below e^30 world units, so that their squares stay finite in float32."""
+
+
 LEAST_WEIGHT = 1e-37
 """A level that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
+
+
 LEAST_SQUARE_DISTANCE = 1e-7
 """Lower bound of the squared neighbour distance that sets the initial scale (3D-GS, simple-knn)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rates:
-    """Adam learning rates (3D-GS, arguments)."""
-
-    means_first: float
-    means_last: float
-    sh_constant: float
-    sh_rest: float
-    opacity_logits: float
-    log_scales: float
-    quats: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Density:
-    """Adaptive density control in steps of the published run (3D-GS, train.py)."""
-
-    start: int
-    stop: int
-    every: int
-    gradient: float
-    """Mean NDC gradient at or above which a primitive is cloned or split."""
-    absolute: bool
-    """Also clone or split as many again by the mean of absolute gradients (Mip-Splatting, densify_and_prune)."""
-    split_extent: float
-    """Primitives larger than this fraction of the extent are split, smaller ones cloned."""
-    split_shrink: float
-    """Children are the parent's scale divided by this."""
-    prune_opacity: float
-    prune_extent: float
-    """Primitives larger than this fraction of the extent are removed, after the first opacity reset."""
-    reset_every: int
-    reset_opacity: float
-    reset_passes: float
-    """In a shortened run at least this many passes over the views lie between opacity resets."""
-    white_reset: int
-    """Step of the extra opacity reset on a white background."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GS3DOptions:
-    """Options of the backbone; values in conf/backbone/gs3d.yaml and mip_splatting.yaml."""
-
-    name: str
-    filter: str
-    """none, or mip: both filters of Mip-Splatting."""
-    published_iterations: int
-    sh_degree: int
-    sh_every: int
-    initial_opacity: float
-    max_primitives: int
-    """No primitive is added beyond this number; 0: none is withheld."""
-    rates: Rates
-    density: Density
-    mip: MipOptions
-    levels: LevelOptions | None = None
-    """Levels of detail (Octree-GS), with density control across them; None: every camera draws everything."""
-    level_density: LevelDensityOptions | None = None
-    quirks: Quirks | None = None
-    """With levels: the switches of their reference, of which `gate` and `bias` concern free Gaussians."""
-    decay_until: int = 0
-    """Published step at which the rate of the means has come down; 0: at the end of the run."""
-
-    def __post_init__(self) -> None:
-        checked_filter(self.filter)
-        if self.sh_degree not in range(4):
-            raise ValueError(f"backbone.sh_degree is {self.sh_degree}; choose 0 to 3")
-        if not 0 < self.initial_opacity < 1:
-            raise ValueError(f"backbone.initial_opacity is {self.initial_opacity}; give a value between 0 and 1")
-        if self.published_iterations < 1 or self.max_primitives < 0:
-            raise ValueError("backbone.published_iterations must be at least 1, backbone.max_primitives at least 0")
-        if not (self.rates.means_first > 0 and self.rates.means_last > 0):
-            raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")
-        checked_end(self.levels, self.published_iterations)
-        if len({part is None for part in (self.levels, self.level_density, self.quirks)}) > 1:
-            raise ValueError(
-                "backbone.levels, level_density and quirks belong together: give all, or take backbone=gs3d for none"
-            )
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
@@ -156,45 +71,26 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
     }
 
 
-def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
-    """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (3D-GS, train.py)."""
-    return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
-
-
 def without_normals(columns: dict[str, Tensor]) -> dict[str, Tensor]:
     """The columns of a splat file but nx, ny, nz."""
     return {name: column for name, column in columns.items() if name not in ("nx", "ny", "nz")}
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Shown:
-    """Parameters of what a camera draws of N Gaussians."""
-
-    values: dict[str, Tensor]
-    """Parameters and columns, M rows."""
-    rows: Int[Tensor, "M"] | None = None
-    """Rows of the table; None: all of them."""
-    weights: Float[Tensor, "M"] | None = None
-    """Factors of the opacities; None: 1."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DrawnGaussians:
-    """Splats of a camera, and the rows of the table that they come from."""
-
-    splats: Splats
-    rows: Int[Tensor, "M"] | None
-    """None: all of them."""
+def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
+    """The backbones gs3d and mip_splatting."""
+    return GS3D(options, context, AllVisible(), CloneSplit())
 
 
 class GS3D:
-    """Explicit Gaussians, N rows in every parameter; at several levels of detail if asked for (GSOctree)."""
+    """Explicit Gaussians, N rows in every parameter."""
 
-    def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
+    def __init__(
+        self, options: GS3DOptions, context: BackboneContext, visibility: Visibility, densification: Densification
+    ) -> None:
         scene = context.scene
         if len(scene.points) == 0:
             raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
-        self.options = options
+        self.options, self.visibility, self.densification = options, visibility, densification
         self.extent = scene.extent
         self.white = bool((scene.background == 1).all())
         self.generator = context.generator
@@ -202,27 +98,14 @@ class GS3D:
         self.raster = filtered_rules(context.raster, options.filter, options.mip)
         self.absolute_gradient = options.density.absolute
         self.cameras = [view.camera for view in scene.train]
-        self.levels = self.derived_levels(scene.points)
-        self.standard_file = self.levels is None
         self.table = self.initial_table(scene.points, context.device)
         self.statistics = Statistics.zeros(len(self.table), context.device, options.density.absolute)
+        self.standard_file = not self.visibility.columns(self.table)
         self.refresh_filter()
 
-    def derived_levels(self, points: PointCloud) -> Levels | None:
-        """The levels of the scene, None if there are to be none."""
-        options = self.options.levels
-        if options is None:
-            return None
-        until = all_levels_from(options, self.schedule)
-        return derive(points.positions.float(), self.cameras, options, until)
-
     def initial_table(self, points: PointCloud, device: torch.device) -> ParameterTable:
-        """One Gaussian per point, or per node of the levels."""
-        columns: dict[str, Tensor] = {}
-        if self.levels is not None:
-            points, columns = starting_points(points, self.levels)
-            for warning in warnings_of(self.levels, len(points)):
-                logger.warning("%s", warning)
+        """A Gaussian for each point that visibility starts from."""
+        points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
         return ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
@@ -237,7 +120,7 @@ class GS3D:
 
     def draw(self, camera: Camera, step: int) -> DrawnGaussians:
         """The Gaussians that the camera draws, with their colours as seen from there."""
-        shown = self.shown(camera, step)
+        shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
         offsets = offsets_from(values["means"], camera.centre)
         scales, log_opacities = self.extents(shown)
@@ -250,21 +133,6 @@ class GS3D:
         )
         return DrawnGaussians(splats=splats, rows=shown.rows)
 
-    def everything(self) -> Shown:
-        """All Gaussians."""
-        return Shown(values={**self.table.parameters, **self.table.columns})
-
-    def shown(self, camera: Camera, step: int) -> Shown:
-        """All Gaussians, or those of the levels that the camera draws (Octree-GS, set_anchor_mask)."""
-        if self.levels is None:
-            return self.everything()
-        means, level, bias = (self.table[name] for name in ("means", "level", "bias"))
-        mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
-        rows = mask.nonzero()[:, 0]
-        values = {name: take_rows(parameter, rows) for name, parameter in self.table.parameters.items()}
-        values |= {name: column[rows] for name, column in self.table.columns.items()}
-        return Shown(values=values, rows=rows, weights=weights[rows])
-
     def extents(self, shown: Shown) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
         """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
         scales = shown.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
@@ -276,12 +144,8 @@ class GS3D:
         return smoothed(scales, log_opacities, shown.values["filter"])
 
     def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
-        """3D-GS has none; across levels the mean volume of what was drawn, 0 for nothing (GSOctree)."""
-        control = self.options.level_density
-        if control is None or not control.volume_weight:
-            return None
-        volumes = drawn.splats.scales.prod(1)
-        return control.volume_weight * volumes.sum() / max(1, len(volumes))
+        """That of density control; 3D-GS has none."""
+        return self.densification.regulariser(drawn)
 
     def observe(self, drawn: DrawnGaussians, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Screen gradients, which count until density control ends (3D-GS, train.py)."""
@@ -298,7 +162,7 @@ class GS3D:
         """Clone, split, prune and reset when due."""
         done: dict[str, int] = {}
         if self.density_due(step):
-            done |= self.densify(step) if self.levels is None else self.densify_levels(step, self.levels)
+            done |= self.densify(step)
         if done or self.filter_due(step):
             self.refresh_filter()
         if self.reset_due(step):
@@ -354,7 +218,7 @@ class GS3D:
         good = drawable(drawn.splats, camera, self.raster) & torch.isfinite(drawn.splats.scales.prod(1))
         if drawn.rows is None:
             return good
-        return torch.ones_like(self.table["level"], dtype=torch.bool).index_copy_(0, drawn.rows, good)
+        return torch.ones(len(self.table), dtype=torch.bool, device=good.device).index_copy_(0, drawn.rows, good)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -374,58 +238,19 @@ class GS3D:
         return self.schedule.interval(density.reset_every, density.reset_passes)
 
     def reset_due(self, step: int) -> bool:
-        """Every reset interval while density control runs, and once early on a white background.
-
-        Never across levels: the published schedule does not reach one (GSOctree).
-        """
-        if self.levels is not None:
+        """Every reset interval while density control runs, and once early on a white background; or never."""
+        if not self.densification.resets:
             return False
         density = self.options.density
         regular = step % self.reset_interval() == 0 and step < self.schedule.step(density.stop)
         return regular or (self.white and step == max(1, self.schedule.step(density.white_reset)))
 
     def densify(self, step: int) -> dict[str, int]:
-        """Clone small and split large primitives with large gradients, then prune (3D-GS, train.py)."""
-        density = self.options.density
-        gradient = self.statistics.mean_gradient()
-        wanted = self.candidates(gradient)
-        chosen = within_room(wanted, gradient, self.room())  # each adds one
-        large = self.largest_scales() > density.split_extent * self.extent
-        cloned, split = chosen & ~large, chosen & large
-        self.clone_and_split(cloned, split)
-        pruned = self.prune(step)
-        self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
-        done = {"cloned": int(cloned.sum()), "split": int(split.sum()), "pruned": pruned}
-        return done | withheld(wanted, chosen)
-
-    def densify_levels(self, step: int, levels: Levels) -> dict[str, int]:
-        """Copies of small Gaussians on their level, children of large ones a level finer, then prune (GSOctree)."""
-        density, control, quirks = self.options.density, self.options.level_density, self.options.quirks
-        assert control is not None
-        assert quirks is not None
-        gradient, level = self.statistics.mean_gradient(), self.table["level"]
-        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
-        masks = densify_masks(
-            gradient,
-            raw["log_scales"].exp(),
-            level,
-            levels,
-            control,
-            threshold=density.gradient,
-            large=density.split_extent * self.extent,
-            splitting=quirks.gate == "open" or levels.highest(step) == levels.count - 1,
-        )
-        cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
-        children_made = small_children(raw, split, levels, control.shrink, self.generator)
-        new = stacked([clones(raw, cloned), children_made])
-        seen = kept(levels, new["means"], new["level"])
-        keep = within_room(seen, gradient[torch.cat([cloned, split])], self.room())
-        bias_levels(self.table, masks.biased, control.bias_step, 1.0 if quirks.bias == "own" else math.inf)
-        append_rows(self.table, {name: value[keep] for name, value in new.items()})
-        pruned = self.prune(step)
-        self.statistics = Statistics.zeros(len(self.table), gradient.device, density.absolute)
-        done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum()), "pruned": pruned}
-        return done | withheld(seen, keep)
+        """Density control's own way, then prune (3D-GS, densify_and_prune: the order in one event)."""
+        done = self.densification.densify(self, step)
+        done = {"cloned": done.pop("cloned"), "split": done.pop("split"), "pruned": self.prune(step)} | done
+        self.statistics = Statistics.zeros(len(self.table), self.statistics.count.device, self.absolute_gradient)
+        return done
 
     def candidates(self, gradient: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (Mip-Splatting).
@@ -443,17 +268,6 @@ class GS3D:
         """Primitives that may be added under max_primitives."""
         return room_under(self.options.max_primitives, len(self.table))
 
-    def clone_and_split(self, cloned: Bool[Tensor, "N"], split: Bool[Tensor, "N"]) -> None:
-        """Rows become: survivors, clones, first children, second children."""
-        raw = {name: parameter.detach() for name, parameter in self.table.parameters.items()} | self.table.columns
-        parents = {name: value[split] for name, value in raw.items()}
-        shrink = self.options.density.split_shrink
-        twins = [children(parents, shrink, self.generator) for _ in range(2)]
-        added = {name: torch.cat([value[cloned], *(twin[name] for twin in twins)]) for name, value in raw.items()}
-        append_rows(self.table, added)
-        new = torch.ones(len(self.table) - len(split), dtype=torch.bool, device=split.device)
-        keep_rows(self.table, torch.cat([~split, new]))
-
     def prune(self, step: int) -> int:
         """Remove faint primitives, and after the first reset huge ones; returns how many."""
         density = self.options.density
@@ -468,7 +282,7 @@ class GS3D:
     def reset_opacities(self) -> None:
         """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting)."""
         highest, logits = self.options.density.reset_opacity, self.table["opacity_logits"].detach()
-        excess = (self.extents(self.everything())[1].detach() - math.log(highest)).clamp_min(0)
+        excess = (self.extents(everything(self.table))[1].detach() - math.log(highest)).clamp_min(0)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
         reset_column(self.table, "opacity_logits", lowered)
 
@@ -494,12 +308,13 @@ class GS3D:
     def size(self) -> tuple[int, int]:
         """(primitives, bytes of their parameters and levels)."""
         stored: list[Tensor] = [*self.table.parameters.values()]
-        stored += [self.table[name] for name in ("level", "bias") if name in self.table.columns]
+        stored += [column for name, column in self.table.columns.items() if name != "filter"]
         return len(self.table), sum(value.numel() * value.element_size() for value in stored)
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         """What `gaussians` makes of what the camera draws; without a camera of all levels."""
-        return self.gaussians(self.everything() if camera is None else self.shown(camera, step))
+        shown = everything(self.table) if camera is None else self.visibility.shown(self.table, camera, step)
+        return self.gaussians(shown)
 
     def gaussians(self, shown: Shown) -> Gaussians:
         """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (Mip-Splatting)."""
@@ -512,19 +327,16 @@ class GS3D:
         return Gaussians(**raw)
 
     def file(self) -> dict[str, Tensor]:
-        """The standard 62 properties (3D-GS, save_ply); levels stand where normals would be (Octree-GS, save_ply)."""
-        columns = columns_of(self.gaussians(self.everything()))
-        if self.levels is None:
+        """The standard 62 properties (3D-GS, save_ply); further columns stand where normals would be."""
+        columns, more = columns_of(self.gaussians(everything(self.table))), self.visibility.columns(self.table)
+        if not more:
             return columns
-        info = torch.zeros_like(columns["nx"])
-        info[:1] = self.levels.farthest
-        levels = {"level": self.table["level"].float(), "extra_level": self.table["bias"], "info": info}
-        return {axis: columns.pop(axis) for axis in "xyz"} | levels | without_normals(columns)
+        return {axis: columns.pop(axis) for axis in "xyz"} | more | without_normals(columns)
 
     def export_notes(self) -> list[str]:
-        """Whether the 3D filter is in the file, and what chooses the levels at a distance."""
+        """Whether the 3D filter is in the file, and what visibility has to say."""
         filtered = "3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"
-        return [filtered] + ([] if self.levels is None else [note_of(self.levels)])
+        return [filtered, *self.visibility.notes()]
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""
@@ -538,7 +350,7 @@ class GS3D:
                 "until": steps.step(density.stop),
                 "every": steps.interval(density.every),
             },
-            **({"opacity_reset": resets} if self.levels is None else {}),
+            **({"opacity_reset": resets} if self.densification.resets else {}),
             "prune_huge": {"from": self.reset_interval()},
             "sh_degree": {
                 "every": max(1, steps.step(self.options.sh_every)),
@@ -549,7 +361,7 @@ class GS3D:
                 "to": self.options.rates.means_last * self.extent,
                 "over": steps.step(self.options.decay_until or self.options.published_iterations),
             },
-            **({} if self.levels is None else {"levels": facts_of(self.levels, self.table["level"])}),
+            **self.visibility.plan(self.table),
         }
 
     def tensors(self) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsx.backbones.cells import new_cells
 from gsx.backbones.level_options import LevelOptions
+from gsx.backbones.sampling import quantile
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
@@ -169,13 +170,6 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         views=views,
     )
     return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_seen(points, levels))
-
-
-def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
-    """Linearly interpolated quantile of any number of values (torch.quantile refuses more than 2^24)."""
-    place = fraction * (len(values) - 1)
-    low, high = (float(values.kthvalue(rank + 1).values) for rank in (math.floor(place), math.ceil(place)))
-    return low + (high - low) * (place - math.floor(place))
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
-from gsx.backbones.clone_split import LevelDensityOptions
-from gsx.backbones.gs3d import GS3D, Density, GS3DOptions, Rates
-from gsx.backbones.level_options import faithful
+from gsx.backbones.clone_split import CloneSplitAcrossLevels, LevelDensityOptions, VisibleByLevel
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_options import Density, GS3DOptions, Rates
+from gsx.backbones.level_options import LevelOptions, faithful
+from gsx.backbones.levels import all_levels_from, derive
 from gsx.core.training.backbone import BackboneContext
 
 FORMS = ("anchors", "clone_split")
@@ -41,11 +43,11 @@ class OctreeGS3DOptions(ExplicitOptions):
         if self.densification not in FORMS:
             raise ValueError(f"backbone.densification is '{self.densification}'; choose {' or '.join(FORMS)}")
         if self.densification == "clone_split":
-            free_gaussians(self)
+            free_options(self)
 
 
-def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
-    """The options of the second form.
+def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions, LevelDensityOptions]:
+    """What the second form takes: options of its Gaussians, of its levels, of density control across them.
 
     Raises:
         ValueError: something that it needs is missing, or a switch is set that it does not have.
@@ -60,7 +62,7 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
             f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which means nothing to "
             f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
         )
-    return GS3DOptions(
+    gaussians = GS3DOptions(
         name=options.name,
         filter=options.filter,
         published_iterations=options.published_iterations,
@@ -71,15 +73,26 @@ def free_gaussians(options: OctreeGS3DOptions) -> GS3DOptions:
         rates=own.rates,
         density=own.density,
         mip=options.mip,
-        levels=faithful(options.levels, options.fidelity),
-        level_density=own.level_density,
-        quirks=options.switches(),
         decay_until=options.decay_until,
     )
+    levels = faithful(options.levels, options.fidelity)
+    assert levels is not None
+    return gaussians, levels, own.level_density
+
+
+def free_gaussians(options: OctreeGS3DOptions, context: BackboneContext) -> GS3D:
+    """The second form: Gaussians at several levels of detail."""
+    gaussians, level_options, density = free_options(options)
+    schedule = context.schedule(options.published_iterations)
+    cameras = [view.camera for view in context.scene.train]
+    points = context.scene.points.positions.float()
+    levels = derive(points, cameras, level_options, all_levels_from(level_options, schedule))
+    visibility = VisibleByLevel(levels)
+    return GS3D(gaussians, context, visibility, CloneSplitAcrossLevels(visibility, density, options.switches()))
 
 
 def octree_gs3d(options: OctreeGS3DOptions, context: BackboneContext) -> Anchors | GS3D:
     """The backbone octree_gs3d in the form that is asked for."""
     if options.densification == "clone_split":
-        return GS3D(free_gaussians(options), context)
+        return free_gaussians(options, context)
     return explicit_anchors(options, context)

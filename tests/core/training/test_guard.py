@@ -9,7 +9,8 @@ import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D, DrawnGaussians
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins

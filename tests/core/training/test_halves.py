@@ -9,7 +9,7 @@ from small_scene import published_options, small_scene, spread
 from tiny import tiny_run
 from torch import Tensor
 
-from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d import gs3d
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene
@@ -49,7 +49,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     scene = replace(grey, train=[replace(view, source=Told(n, seen)) for n, view in enumerate(grey.train)])
 
     def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
-        return GS3D(
+        return gs3d(
             published_options(),
             BackboneContext(
                 scene=scene,

@@ -38,6 +38,7 @@ class BackboneContext:
         )
 
 
+@runtime_checkable
 class Drawn(Protocol):
     """What a backbone draws for one camera; each backbone adds what it needs to learn from the render."""
 
