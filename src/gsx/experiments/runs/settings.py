@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -283,6 +284,22 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 
 
 def add_newer_settings(config: Any) -> None:
-    """Give the configuration of an older gsx the rasterizer settings it does not know, at their defaults."""
-    if isinstance(config, DictConfig) and isinstance(config.get("rasterizer"), DictConfig):
+    """Give the configuration of an older gsx what it does not know, as older runs had it.
+
+    Settings of the rasterizer at their defaults; checks of redrawn pictures, which were the strict ones; the gate of
+    `clone_split`, which was a yes or no beside its numbers.
+    """
+    if not isinstance(config, DictConfig):
+        return
+    if isinstance(config.get("rasterizer"), DictConfig):
         config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
+    with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
+        strict = OmegaConf.load(path)
+    for node in (config.get("augmenter") or {}).values():
+        if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
+            node.checks = strict
+    density = OmegaConf.select(config, "backbone.clone_split.level_density")
+    if density is not None and "gate" in density:
+        waits = density.pop("gate")
+        if config.backbone.densification == "clone_split":
+            config.backbone.quirks.gate = "closed" if waits else "open"
