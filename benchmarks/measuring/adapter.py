@@ -70,7 +70,7 @@ def to_tiles(raster: Float[Tensor, "C H W"], camera: Camera, tile: int) -> Float
 
 def learnable(screen: ScreenSplats) -> ScreenSplats:
     """The same splats with leaves that gather gradients."""
-    leaves = ("means", "factors", "log_opacities", "channels")
+    leaves = ("means", "conic_factors", "log_opacities", "channels")
     made = {name: getattr(screen, name).detach().clone().requires_grad_() for name in leaves}
     return ScreenSplats(**(vars(screen) | made))
 

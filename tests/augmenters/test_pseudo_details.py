@@ -394,7 +394,7 @@ def test_scales_in_turn(tmp_path: Path) -> None:
     words = ("augmenter=upscale_paper", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true",
              "augmenter.upscale.narrow=1.0")  # fmt: skip
     augmenter = augmenter_of(run_at(tmp_path / "run", 44, *words))
-    assert [augmenter.scales_of(event) for event in augmenter.events] == [[2]] * 2 + [[4]] * 2 + [[8]]
+    assert [augmenter.planner.scales_of(event) for event in augmenter.events] == [[2]] * 2 + [[4]] * 2 + [[8]]
 
 
 def test_a_known_lower_resolution_enters_the_loss(tmp_path: Path) -> None:

@@ -16,14 +16,14 @@ def explained(error: BaseException) -> int:
     if isinstance(error, OSError):
         return complain(os_sentence(error))
     if isinstance(error, KeyboardInterrupt):
-        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", sys.stderr)
+        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", as_error=True)
         return INTERRUPTED
     raise error
 
 
 def complain(sentence: str) -> int:
     """Show an error as one sentence."""
-    say(f"gsx: {sentence}\n", sys.stderr)
+    say(f"gsx: {sentence}\n", as_error=True)
     return 2
 
 

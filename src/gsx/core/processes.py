@@ -1,7 +1,8 @@
 """The processes of one run as torchrun numbers them, and which of them is heard. Without torch."""
 
 import os
-from typing import TYPE_CHECKING, TextIO
+import sys
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     pass
@@ -17,7 +18,7 @@ def speaks() -> bool:
     return processes() == 1 or os.environ["RANK"] == "0"
 
 
-def say(text: str, stream: TextIO) -> None:
-    """Write to a stream, once for all processes."""
+def say(text: str, *, as_error: bool = False) -> None:
+    """Write to standard output, or to standard error, once for all processes."""
     if speaks():
-        stream.write(text)
+        (sys.stderr if as_error else sys.stdout).write(text)

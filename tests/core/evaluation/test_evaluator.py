@@ -13,6 +13,7 @@ from small_scene import small_gs3d, small_scene, spread
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.evaluation.evaluator import EvalOptions, Evaluator
@@ -51,16 +52,17 @@ class Painted(GS3D):
 
     names: Sequence[str] = tuple(LEVELS)
 
-    def splats(self, camera: Camera) -> Splats:
+    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
         name = self.names[round(float(camera.centre[0]) / 0.1)]
         ahead = camera.rotation[2] * torch.tensor([[2.0], [-2.0]])
-        return Splats(
+        splats = Splats(
             means=(camera.centre + ahead).float(),
             scales=torch.full((2, 3), 1e5),
             quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
             log_opacities=torch.full((2,), math.log(0.5)),
             colours=torch.full((2, 3), 2 * LEVELS[name][camera.width // SIZE[0]] / 255),
         )
+        return DrawnGaussians(splats=splats, rows=None)
 
 
 def run_of(folder: Path) -> Run:

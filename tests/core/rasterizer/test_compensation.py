@@ -145,5 +145,5 @@ def test_without_compensation_the_same_bits_as_ever() -> None:
     assert not RasterSettings().compensate
     assert torch.equal(screen.log_opacities, splats.log_opacities[screen.ids])
     assert (compensated.log_opacities < screen.log_opacities).all()
-    for name in ("means", "covariances", "factors"):
+    for name in ("means", "covariances", "conic_factors"):
         assert torch.equal(getattr(screen, name), getattr(compensated, name))

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import image_size, read_image
 from gsx.core.data.resize import linear_from_display
@@ -44,31 +45,30 @@ WIDTH, HEIGHT = 80, 64
 class FourSplats:
     """A backbone that hands out four fixed splats."""
 
-    def splats(self, camera: Camera) -> Splats:
-        return Splats(
+    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
+        splats = Splats(
             means=torch.tensor([[-0.5, 0, 0], [0.4, 0.2, 0.1], [0, -0.4, 0.3], [0.2, 0.5, -0.2]]),
             scales=torch.tensor([[0.2, 0.1, 0.1], [0.05, 0.3, 0.1], [0.15, 0.15, 0.15], [0.1, 0.02, 0.1]]),
             quats=torch.tensor([[1.0, 0, 0, 0], [0.9, 0.1, 0.2, 0], [1, 0, 0, 0], [0.7, 0, 0, 0.7]]),
             log_opacities=torch.tensor([0.9, 0.8, 0.7, 0.95]).log(),
             colours=torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.3, 0.9], [1, 1, 0.2]]),
         )
+        return DrawnGaussians(splats=splats, rows=None)
 
     def size(self) -> tuple[int, int]:
         return 4, 4 * 14 * 4
 
-    def begin(self, step: int) -> None: ...
+    def regulariser(self, drawn: DrawnGaussians) -> None: ...
 
-    def regulariser(self) -> None: ...
-
-    def observe(self, rendering: Rendering, step: int) -> dict[str, Tensor]:
+    def observe(self, drawn: DrawnGaussians, rendering: Rendering, step: int, weight: float = 1.0) -> dict[str, Tensor]:
         return {}
 
-    def record(self, seen: dict[str, Tensor]) -> None: ...
+    def accumulate(self, seen: dict[str, Tensor]) -> None: ...
 
     def densify_and_prune(self, step: int) -> dict[str, int]:
         return {}
 
-    def update(self) -> None: ...
+    def update(self, step: int) -> None: ...
 
     def parameters(self) -> Iterator[tuple[str, Parameter]]:
         return iter(())
@@ -79,7 +79,7 @@ class FourSplats:
     def shared(self) -> Iterator[Tensor]:
         return iter(())
 
-    def remove_nonfinite(self) -> int:
+    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
         return 0
 
     def zero_grad(self) -> None: ...
@@ -94,7 +94,7 @@ class FourSplats:
     def export_notes(self) -> list[str]:
         return []
 
-    def explicit(self, camera: Camera | None = None) -> Gaussians:
+    def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         raise NotImplementedError
 
     def plan(self) -> dict[str, Any]:

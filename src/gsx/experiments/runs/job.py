@@ -121,12 +121,12 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
-        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
+        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards(run)}\n", as_error=True)
         return INTERRUPTED
     if not run.complete:
-        say(f"gsx: stopped at step {run.step}; go on with: {onwards(run)}\n", sys.stderr)
+        say(f"gsx: stopped at step {run.step}; go on with: {onwards(run)}\n", as_error=True)
         return INTERRUPTED
-    say(f"{run.folder / 'report.html'}\n", sys.stdout)
+    say(f"{run.folder / 'report.html'}\n")
     return 0
 
 
