@@ -219,7 +219,7 @@ def test_whole_views_are_the_truth_and_the_measured_render(run: Run) -> None:
         shown = quantise(render(run, view.camera).image)
         assert torch.equal(stored(run, entry["files"]["truth"]), view.image())
         assert torch.equal(stored(run, entry["files"]["render"]), shown)
-        assert (stored(run, entry["files"]["error"]) - error_map(render, view.image())).abs().max() < 0.6 / 255
+        assert (stored(run, entry["files"]["error"]) - error_map(shown, view.image())).abs().max() < 0.6 / 255
         assert entry["name"] == view.name
         assert entry["size"] == [WIDTH, HEIGHT]
 

@@ -55,7 +55,7 @@ def test_a_table_shares_beginnings_survives_a_failure_and_redoes_nothing(
     term = PseudoDetails.term
 
     def failing(self: PseudoDetails, run: object, step: int, view: int) -> object:
-        if self.setting.name == "bootstrap" and step > 30:
+        if self.context.name == "bootstrap" and step > 30:
             raise MemoryError("no room for another picture")
         return term(self, run, step, view)  # type: ignore[arg-type]
 
