@@ -11,7 +11,8 @@ def gsx_register(registry: Registry) -> None:
     """Scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
     from gsx.augmenters.pseudo_details import PseudoDetails
     from gsx.augmenters.pseudo_options import PseudoOptions
-    from gsx.backbones.anchors import NeuralOptions, neural_anchors
+    from gsx.backbones.anchor_options import NeuralOptions
+    from gsx.backbones.anchors import neural_anchors
     from gsx.backbones.gs3d import gs3d
     from gsx.backbones.gs3d_options import GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d

@@ -13,7 +13,9 @@ from small_scene import small_scene, spread
 from tiny import tiny_run
 from torch import Tensor
 
-from gsx.backbones.anchors import Anchors, Decay, DrawnAnchors, automatic_voxel, voxel_nodes
+from gsx.backbones.anchor_options import Decay
+from gsx.backbones.anchors import Anchors, DrawnAnchors
+from gsx.backbones.voxels import automatic_voxel, voxel_nodes
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene

@@ -6,15 +6,15 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.backbones.anchor_options import ExplicitOptions, HeadRates, NeuralOptions
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
 from gsx.backbones.growth import (
@@ -23,16 +23,15 @@ from gsx.backbones.growth import (
     fresh_statistics,
     grow_by_depth,
     grow_by_level,
-    nodes_of,
     observe,
     prune,
     reset_offsets,
 )
-from gsx.backbones.growth_options import GrowthOptions, Quirks, resolved
-from gsx.backbones.heads import HeadOptions, Heads
-from gsx.backbones.level_options import LevelOptions, checked_end, faithful
+from gsx.backbones.heads import Heads, optimiser_of
+from gsx.backbones.level_options import faithful
 from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, initial_nodes, note_of, warnings_of
-from gsx.backbones.mip import MipOptions, checked_filter, filter_sizes, filtered_rules
+from gsx.backbones.mip import filter_sizes, filtered_rules
+from gsx.backbones.voxels import LEAST_SQUARE_DISTANCE, automatic_voxel, voxel_nodes
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
@@ -43,7 +42,6 @@ from gsx.core.rasterizer import Rendering, drawable, touches
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import (
-    ADAM_EPSILON,
     ParameterTable,
     adam_tensors,
     densification_statistics,
@@ -53,132 +51,8 @@ from gsx.core.training.density import (
     restored_table,
     table_tensors,
 )
-from gsx.core.training.schedule import log_linear
 
 logger = logging.getLogger(__name__)
-
-LEAST_SQUARE_DISTANCE = 1e-7
-"""Lower bound of the squared neighbour distance that sets the initial lengths (Scaffold-GS, create_from_pcd)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Decay:
-    """A learning rate, log-linear over the published run."""
-
-    first: float
-    last: float
-
-    def __post_init__(self) -> None:
-        if not ((self.first > 0 and self.last > 0) or self.first == self.last == 0):
-            raise ValueError(
-                f"a learning rate goes from {self.first} to {self.last}; give two positive numbers, or 0 twice"
-            )
-
-    def at(self, step: int, steps: int) -> float:
-        """The rate of a step."""
-        return log_linear(step, steps, self.first, self.last) if self.first > 0 else 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeuralRates:
-    """Learning rates by parameter; `offsets` in units of the extent (Scaffold-GS, training_setup)."""
-
-    offsets: Decay
-    features: Decay
-    log_scales: Decay
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeadRates:
-    """Learning rates of the networks (Scaffold-GS, training_setup)."""
-
-    opacity: Decay
-    covariance: Decay
-    colour: Decay
-    bank: Decay
-    appearance: Decay
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplicitRates:
-    """Learning rates by parameter; `offsets` in units of the extent (Octree-AnyGS)."""
-
-    offsets: Decay
-    log_scales: Decay
-    quats: Decay
-    opacity_logits: Decay
-    sh_constant: Decay
-    sh_rest: Decay
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnchorOptions:
-    """What all anchor backbones share; values in conf/backbone, with their sources."""
-
-    name: str
-    published_iterations: int
-    fidelity: str
-    """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
-    filter: str
-    max_primitives: int
-    """No anchor is added beyond this number; 0: none is withheld."""
-    volume_weight: float
-    """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
-    voxel: float
-    """Edge of the initial grid's cells without levels, world units; 0: from the points (Scaffold-GS)."""
-    growth: GrowthOptions
-    quirks: Quirks
-    mip: MipOptions
-    levels: LevelOptions | None
-    decay_until: int = 0
-    """Published step at which learning rates have come down; 0: at the end of the run."""
-    reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
-
-    def __post_init__(self) -> None:
-        checked_filter(self.filter)
-        checked_end(self.levels, self.published_iterations)
-        self.switches()
-        if self.max_primitives < 0:
-            raise ValueError(f"backbone.max_primitives is {self.max_primitives}; give a number, or 0 for no cap")
-        if self.voxel < 0:
-            raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
-
-    def switches(self) -> Quirks:
-        """All quirks decided, by themselves or by the fidelity.
-
-        Raises:
-            ValueError: a value is unknown.
-        """
-        return resolved(self.quirks, self.fidelity, self.reference)
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeuralOptions(AnchorOptions):
-    """Anchors decoded by networks."""
-
-    offsets: int
-    """k: Gaussians per anchor."""
-    heads: HeadOptions
-    rates: NeuralRates
-    head_rates: HeadRates
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.offsets < 1:
-            raise ValueError(f"backbone.offsets is {self.offsets}; give at least 1 Gaussian per anchor")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplicitOptions(AnchorOptions):
-    """Anchors of one explicit Gaussian each."""
-
-    rates: ExplicitRates
-    sh_degree: int
-    sh_every: int
-    """Published steps between SH degrees."""
-    initial_opacity: float
-    reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})
 
 
 def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
@@ -192,19 +66,6 @@ def explicit_anchors(options: ExplicitOptions, context: BackboneContext) -> "Anc
     logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
     representation = Explicit(options.sh_degree, logit)
     return Anchors(options, context, representation, None, None, (options.sh_degree, options.sh_every))
-
-
-def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:
-    """Median over points of the mean squared distance to three neighbours, or its root (Scaffold-GS)."""
-    squares = mean_square_distance(points)
-    median = float(squares.kthvalue(max(1, len(points) // 2)).values.clamp_min(LEAST_SQUARE_DISTANCE))
-    return median if squared else math.sqrt(median)
-
-
-def voxel_nodes(points: Float[Tensor, "P 3"], voxel: float) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "P"]]:
-    """(grid nodes with a point next to them, node of each point) (Scaffold-GS, voxelize_sample)."""
-    cells, inverse = torch.unique(nodes_of(points, voxel), dim=0, return_inverse=True)
-    return (cells.double() * voxel).float(), inverse
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -238,13 +99,8 @@ class Anchors:
         scene = context.scene
         if len(scene.points) == 0:
             raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
-        self.options, self.representation, self.heads, self.head_rates, self.sh = (
-            options,
-            representation,
-            heads,
-            head_rates,
-            sh,
-        )
+        self.options, self.representation, self.sh = options, representation, sh
+        self.heads, self.head_rates = heads, head_rates
         self.quirks = options.switches()
         self.extent, self.generator, self.device = scene.extent, context.generator, context.device
         self.raster = filtered_rules(context.raster, options.filter, options.mip)
@@ -254,7 +110,7 @@ class Anchors:
         self.levels: Levels | None = None
         self.voxel = options.voxel
         self.table = self.initial_table(scene.points)
-        self.head_optimiser = self.initial_optimiser()
+        self.head_optimiser = None if heads is None else optimiser_of(heads)
         self.refresh_filter()
 
     # -- the beginning -----------------------------------------------------------------------------------------
@@ -286,15 +142,6 @@ class Anchors:
             logger.warning("%s", warning)
         source = torch.arange(len(points)).repeat(self.levels.count)
         return positions, {"level": of, "bias": torch.zeros(len(of))}, group.flatten(), source
-
-    def initial_optimiser(self) -> torch.optim.Adam | None:
-        """Adam for the heads, a group each; None without heads."""
-        if self.heads is None:
-            return None
-        groups = [
-            {"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in self.heads.named_children()
-        ]
-        return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 

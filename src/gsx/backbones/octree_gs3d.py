@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from gsx.backbones.anchors import Anchors, ExplicitOptions, explicit_anchors
+from gsx.backbones.anchor_options import ExplicitOptions
+from gsx.backbones.anchors import Anchors, explicit_anchors
 from gsx.backbones.clone_split import CloneSplitAcrossLevels, LevelDensityOptions, VisibleByLevel
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_options import Density, GS3DOptions, Rates

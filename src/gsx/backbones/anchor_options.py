@@ -1,0 +1,132 @@
+"""Options of anchors, decoded by networks or explicit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar
+
+from gsx.backbones.growth_options import GrowthOptions, Quirks, resolved
+from gsx.backbones.heads import HeadOptions
+from gsx.backbones.level_options import LevelOptions, checked_end
+from gsx.backbones.mip import MipOptions, checked_filter
+from gsx.core.training.schedule import log_linear
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decay:
+    """A learning rate, log-linear over the published run."""
+
+    first: float
+    last: float
+
+    def __post_init__(self) -> None:
+        if not ((self.first > 0 and self.last > 0) or self.first == self.last == 0):
+            raise ValueError(
+                f"a learning rate goes from {self.first} to {self.last}; give two positive numbers, or 0 twice"
+            )
+
+    def at(self, step: int, steps: int) -> float:
+        """The rate of a step."""
+        return log_linear(step, steps, self.first, self.last) if self.first > 0 else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralRates:
+    """Learning rates by parameter; `offsets` in units of the extent (Scaffold-GS, training_setup)."""
+
+    offsets: Decay
+    features: Decay
+    log_scales: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadRates:
+    """Learning rates of the networks (Scaffold-GS, training_setup)."""
+
+    opacity: Decay
+    covariance: Decay
+    colour: Decay
+    bank: Decay
+    appearance: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitRates:
+    """Learning rates by parameter; `offsets` in units of the extent (Octree-AnyGS)."""
+
+    offsets: Decay
+    log_scales: Decay
+    quats: Decay
+    opacity_logits: Decay
+    sh_constant: Decay
+    sh_rest: Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorOptions:
+    """What all anchor backbones share; values in conf/backbone, with their sources."""
+
+    name: str
+    published_iterations: int
+    fidelity: str
+    """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
+    filter: str
+    max_primitives: int
+    """No anchor is added beyond this number; 0: none is withheld."""
+    volume_weight: float
+    """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
+    voxel: float
+    """Edge of the initial grid's cells without levels, world units; 0: from the points (Scaffold-GS)."""
+    growth: GrowthOptions
+    quirks: Quirks
+    mip: MipOptions
+    levels: LevelOptions | None
+    decay_until: int = 0
+    """Published step at which learning rates have come down; 0: at the end of the run."""
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
+
+    def __post_init__(self) -> None:
+        checked_filter(self.filter)
+        checked_end(self.levels, self.published_iterations)
+        self.switches()
+        if self.max_primitives < 0:
+            raise ValueError(f"backbone.max_primitives is {self.max_primitives}; give a number, or 0 for no cap")
+        if self.voxel < 0:
+            raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
+
+    def switches(self) -> Quirks:
+        """All quirks decided, by themselves or by the fidelity.
+
+        Raises:
+            ValueError: a value is unknown.
+        """
+        return resolved(self.quirks, self.fidelity, self.reference)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralOptions(AnchorOptions):
+    """Anchors decoded by networks."""
+
+    offsets: int
+    """k: Gaussians per anchor."""
+    heads: HeadOptions
+    rates: NeuralRates
+    head_rates: HeadRates
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.offsets < 1:
+            raise ValueError(f"backbone.offsets is {self.offsets}; give at least 1 Gaussian per anchor")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitOptions(AnchorOptions):
+    """Anchors of one explicit Gaussian each."""
+
+    rates: ExplicitRates
+    sh_degree: int
+    sh_every: int
+    """Published steps between SH degrees."""
+    initial_opacity: float
+    reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})
