@@ -55,8 +55,8 @@ RUNS: Mapping[str, tuple[str, ...]] = {
     "octree_ub": ("variant=octree_ub", "dataset=demo", "budget=smoke"),
     "batch": ("backbone=octree_scaffold", "training.batch=2", "augmenter=[upscale]", "regenerator/upscale=lanczos"),
 }
-CLOCKS = ("time", "fps", "second", "memory", "_mb", "per_s")
-"""Parts of the keys of figures that two runs of the same source do not share: seconds, speed, memory."""
+CLOCKS = ("time", "seconds", "fps", "per_second", "memory_mb")
+"""How keys of figures end that two runs of the same source do not share: seconds, speed, memory."""
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
@@ -91,6 +91,8 @@ def two_processes(folder: Path) -> None:
 
 def resumed(folder: Path) -> None:
     """A run that goes on from its state at step 40."""
+    if (folder / "resumed").exists():
+        return
     run = train(folder, "resumed", *RUNS["octree_scaffold_both"])
     for path in run.glob("checkpoints/*60*"):
         path.unlink()
@@ -130,7 +132,7 @@ def content_of(path: Path) -> bytes:
         return b"".join(tensor_bytes(load_file(path)))
     if path.suffix in (".png", ".ply", ".csv"):
         return path.read_bytes()
-    if path.name in ("evaluation.json", "pseudo.json"):
+    if path.name in ("evaluation.json", "index.json"):
         return json.dumps(without_clocks(read_json(path)), sort_keys=True).encode()
     if path.name == "metrics.jsonl":
         lines = (without_clocks(json.loads(line)) for line in path.read_text().splitlines())
@@ -154,7 +156,7 @@ def without_clocks(value: Any) -> Any:
 
 def is_clock(key: str) -> bool:
     """Whether a key names seconds, speed or memory."""
-    return any(word in key for word in CLOCKS)
+    return key.endswith(CLOCKS)
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
@@ -169,6 +171,7 @@ def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str
 def main(words: Sequence[str]) -> int:
     """Run everything, write the digests, compare."""
     given = arguments(words)
+    before = read_json(given.against) if given.against else None
     for name, overrides in RUNS.items():
         train(given.folder, name, *overrides)
     for further in FURTHER:
@@ -176,7 +179,7 @@ def main(words: Sequence[str]) -> int:
     runs = sorted(path for path in given.folder.iterdir() if (path / "evaluation.json").exists())
     found = {run.name: digests(run) for run in runs}
     write_json(given.to, found)
-    lines = differences(read_json(given.against), found) if given.against else []
+    lines = [] if before is None else differences(before, found)
     print("\n".join(lines) or f"{sum(map(len, found.values()))} results of {len(found)} runs")
     return 1 if lines else 0
 

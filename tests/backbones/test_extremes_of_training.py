@@ -10,6 +10,7 @@ from torch import Tensor
 from gsx.builtin import plugins
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import Scene, View
+from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
@@ -159,3 +160,9 @@ def test_one_camera_takes_its_extent_from_the_points() -> None:
     distance = (scene.points.positions - scene.train[0].camera.centre.float()).norm(dim=1)
     assert scene.extent == pytest.approx(1.1 * float(distance.median()))
     assert "all training cameras stand at one place" in scene.notes[-1]
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_a_scene_without_points_is_refused_with_the_remedy(name: str) -> None:
+    with pytest.raises(InputError, match=r"scene 'small' has no points to start from: .*scene\.points=random"):
+        built(name, small_scene(torch.zeros(0, 3)))

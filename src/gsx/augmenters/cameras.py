@@ -1,4 +1,4 @@
-"""Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random (the paper)."""
+"""Cameras of pseudo views: windows of a raster, zoomed in, and poses moved at random."""
 
 from dataclasses import replace
 

@@ -9,8 +9,6 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.shapes import Bool, Float, Int, UInt8
 
 BOX = Reduction()
-
-
 REPAIRS = 50
 """Rounds in which errors of rounding are spread back, where blocks overlap."""
 

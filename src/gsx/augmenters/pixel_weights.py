@@ -89,6 +89,6 @@ def agreeing(
     return as_blocks((off <= levels).float(), scale)
 
 
-def in_bytes(trust: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:
+def in_bytes(weights: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:
     """Weights from 0 to 1 as 0 to 255."""
-    return (trust * 255 + 0.5).clamp(0, 255).to(torch.uint8)
+    return (weights * 255 + 0.5).clamp(0, 255).to(torch.uint8)

@@ -1,19 +1,11 @@
-"""Which pseudo views an event makes: cameras, windows, seeds (the paper)."""
+"""Which pseudo views an event makes: cameras, windows, seeds."""
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 
 import torch
 
-from gsx.augmenters.cameras import (
-    centred_window,
-    grid_window,
-    moved,
-    noise,
-    random_window,
-    window_size,
-    worst_window,
-)
+from gsx.augmenters.cameras import centred_window, grid_window, moved, noise, random_window, window_size, worst_window
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window

@@ -1,6 +1,6 @@
 """Pseudo details from training views: zoomed in and redrawn (upscale), moved aside and redrawn (bootstrap).
 
-Both are one procedure (the paper): take windows of training cameras, some of them moved at random; zoom in; have a
+Both are one procedure: take windows of training cameras, some of them moved at random; zoom in; have a
 regenerator redraw what is cut from the photograph or rendered there; compare with that for a while.
 """
 
@@ -8,9 +8,7 @@ import logging
 from collections.abc import Sequence, Set
 from typing import Any
 
-from gsx.augmenters.cameras import (
-    window_size,
-)
+from gsx.augmenters.cameras import window_size
 from gsx.augmenters.planner import Planner
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.augmenters.redraw import Redrawer
@@ -20,14 +18,13 @@ from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term
-from gsx.core.training.regenerator import (
-    Checked,
-)
+from gsx.core.training.regenerator import Checked
 from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
 
 logger = logging.getLogger(__name__)
+
 LEAST_WINDOW = 4
 """Narrowest window that shows anything, px."""
 
@@ -94,7 +91,7 @@ class PseudoDetails:
         return {"events": self.events, "span": self.span, "share": share}
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
-        """The pseudo views of the training view picked at this step, with their weights (the paper)."""
+        """The pseudo views of the training view picked at this step, with their weights."""
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event, self.facts = {}, 0, {}
@@ -191,14 +188,14 @@ class PseudoDetails:
             "learnt": learnt,
             **self.redrawer.judged(event, drawn),
         }
-        trusted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
+        counted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
         if kept:
             share = sum(kept) / len(kept)
             facts["consistent"] = share
             logger.info("%s: %.1f%% consistent pixels", self.context.name, 100 * share)
-        if trusted:
-            masked = 1 - (sum(trusted) + len(views) - len(trusted)) / len(views)
+        if counted:
+            masked = 1 - (sum(counted) + len(views) - len(counted)) / len(views)
             facts["masked"] = masked
             logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * masked)
         return views, facts

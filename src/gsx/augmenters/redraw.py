@@ -23,18 +23,13 @@ from gsx.core.data.window import Window
 from gsx.core.errors import TrainingError
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.pseudo_views import PseudoView, picture_name
-from gsx.core.training.regenerator import (
-    Regenerator,
-    Request,
-    colour_matched,
-    strayed,
-    unusable,
-)
+from gsx.core.training.regenerator import Regenerator, Request, colour_matched, strayed, unusable
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
 
 logger = logging.getLogger(__name__)
+
 BATCH = 64
 """Pictures redrawn between two lines of progress."""
 MOST_DROPPED = 0.5
@@ -44,8 +39,8 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Drawn:
-    """What has become of a sketch."""
+class RedrawnView:
+    """What has become of a planned pseudo view."""
 
     scale: int
     view: PseudoView | None
@@ -65,21 +60,21 @@ class Redrawer:
     regenerator: Regenerator
     schedule: Schedule
 
-    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[Drawn]:
-        """What has become of each sketch, told batch by batch."""
-        drawn: list[Drawn] = []
+    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[RedrawnView]:
+        """What has become of each planned view, told batch by batch."""
+        drawn: list[RedrawnView] = []
         shown = sorted({spec.parent for spec in specs})[:SHOWN]
         for first in range(0, len(specs), BATCH):
             drawn += self.drawn(run, event, specs[first : first + BATCH], shown)
             logger.info("%s at step %d: %d of %d pictures", self.name, event, len(drawn), len(specs))
         return drawn
 
-    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[Drawn]:
-        """What becomes of each sketch; pictures of the training views `shown` are kept to be looked at."""
+    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[RedrawnView]:
+        """What becomes of each planned view; pictures of the training views `shown` are kept to be looked at."""
         regenerator = self.regenerator
         requests = [self.request(run, event, spec) for spec in specs]
         samples = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
-        out: list[Drawn] = []
+        out: list[RedrawnView] = []
         for spec, request, *results in zip(specs, requests, *samples, strict=True):
             result = torch.stack([result.detach().cpu().float() for result in results]).mean(0)
             one = self.checked(run, event, spec, request, result)
@@ -88,7 +83,7 @@ class Redrawer:
             out.append(one)
         return out
 
-    def checked(self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Tensor) -> Drawn:
+    def checked(self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Tensor) -> RedrawnView:
         """The pseudo view of a result, if it may be used."""
         problem, found = unusable(request, result), dict[str, str]()
         if not problem:
@@ -101,7 +96,7 @@ class Redrawer:
         named = problem and f"{request.view.name}: {problem}"
         view = None if problem else self.view(run, event, spec, request, result)
         warnings = {} if problem else {check: f"{request.view.name}: {told}" for check, told in found.items()}
-        return Drawn(scale=spec.scale, view=view, problem=named, warnings=warnings)
+        return RedrawnView(scale=spec.scale, view=view, problem=named, warnings=warnings)
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
@@ -212,7 +207,7 @@ class Redrawer:
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.name, view), torch.cat([given, result, difference], 2))
 
-    def judged(self, event: int, drawn: Sequence[Drawn]) -> dict[str, Any]:
+    def judged(self, event: int, drawn: Sequence[RedrawnView]) -> dict[str, Any]:
         """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
 
         Raises:
@@ -242,7 +237,7 @@ def again(request: Request, number: int) -> Request:
     return replace(request, seed=request.seed + number)
 
 
-def by_scale(drawn: Sequence[Drawn]) -> dict[str, int]:
+def by_scale(drawn: Sequence[RedrawnView]) -> dict[str, int]:
     """How many there are at each scale; keys as JSON has them."""
     counts = Counter(one.scale for one in drawn)
     return {str(scale): counts[scale] for scale in sorted(counts)}

@@ -65,7 +65,7 @@ def stepped(values: list[float], place: float, split: str) -> float:
 
 
 def ramp(values: list[float], event: int, timing: Timing, schedule: Schedule) -> float:
-    """A value that goes linearly from its first at `start` to its last at `stop` (the paper)."""
+    """A value that goes linearly from its first at `start` to its last at `stop`."""
     first, last = values
     start, stop = schedule.step(timing.start), schedule.step(timing.stop)
     return first + (last - first) * min(1.0, max(0, event - start) / max(1, stop - start))

@@ -31,11 +31,11 @@ from gsx.backbones.heads import Heads, optimiser_of
 from gsx.backbones.level_options import faithful
 from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, initial_nodes, note_of, warnings_of
 from gsx.backbones.mip import filter_sizes, filtered_rules
-from gsx.backbones.voxels import LEAST_SQUARE_DISTANCE, automatic_voxel, voxel_nodes
+from gsx.backbones.voxels import automatic_voxel, voxel_nodes
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
-from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, drawable, touches
@@ -97,8 +97,6 @@ class Anchors:
         sh: tuple[int, int] = (0, 1),
     ) -> None:
         scene = context.scene
-        if len(scene.points) == 0:
-            raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
         self.options, self.representation, self.sh = options, representation, sh
         self.heads, self.head_rates = heads, head_rates
         self.quirks = options.switches()
@@ -109,7 +107,7 @@ class Anchors:
         self.schedule = context.schedule(options.published_iterations)
         self.levels: Levels | None = None
         self.voxel = options.voxel
-        self.table = self.initial_table(scene.points)
+        self.table = self.initial_table(context.points())
         self.head_optimiser = None if heads is None else optimiser_of(heads)
         self.refresh_filter()
 

@@ -16,16 +16,7 @@ from gsx.backbones.cells import pooled_max
 from gsx.backbones.growth_options import Quirks
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import DrawnGaussians, Shown
-from gsx.backbones.levels import (
-    Levels,
-    drawn,
-    facts_of,
-    initial_nodes,
-    kept,
-    note_of,
-    thresholds,
-    warnings_of,
-)
+from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, note_of, thresholds, warnings_of
 from gsx.backbones.sampling import sampled_means
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud

@@ -63,7 +63,7 @@ class Representation(Protocol):
         """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
         ...
 
-    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """The Gaussians of the anchors drawn, differentiable."""
         ...
 
@@ -125,17 +125,17 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (Scaffold-GS)."""
-        rows, k = drawn.rows, self.offsets
+        rows, k = visible.rows, self.offsets
         anchors = table["anchors"][rows]
         raw, shapes, colours = self.heads(
             take_rows(table["features"], rows),
-            offsets_from(anchors, drawn.camera.centre),
+            offsets_from(anchors, visible.camera.centre),
             table["level"][rows, None].to(anchors) if "level" in table.columns else torch.zeros_like(anchors[:, :1]),
-            drawn.view,
+            visible.view,
         )
-        opacities = raw * drawn.weights[:, None]
+        opacities = raw * visible.weights[:, None]
         # what is not a number is handed on: the render counts it
         chosen = (~(opacities.detach() <= 0)).view(-1).nonzero()[:, 0]
         owner = chosen // k
@@ -200,24 +200,24 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: ParameterTable, drawn: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
-        rows = drawn.rows
+        rows = visible.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
         size = lengths(row["log_scales"])
         means = table["anchors"][rows] + row["offsets"][:, 0] * size[:, :3]
-        weights = drawn.weights.clamp_min(LEAST)
+        weights = visible.weights.clamp_min(LEAST)
         scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + weights.log()
         opacities = log_opacities.detach().exp()[:, None]
         if filters is not None:
             scales, log_opacities = smoothed(scales, log_opacities, filters)
-        offsets = offsets_from(means, drawn.camera.centre)
+        offsets = offsets_from(means, visible.camera.centre)
         splats = Splats(
             means=means,
             scales=scales,
             quats=row["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(row["sh_constant"], row["sh_rest"], offsets, drawn.sh_degree),
+            colours=colours_of(row["sh_constant"], row["sh_rest"], offsets, visible.sh_degree),
         )
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 

@@ -160,7 +160,7 @@ def grow_by_depth(
     generator: torch.Generator,
     most: int,
 ) -> tuple[int, int]:
-    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (Scaffold-GS, anchor_growing).
+    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (anchor_growing).
 
     Returns how many grew, and how many did not for want of room.
     """
@@ -204,7 +204,7 @@ def grow_by_level(
     gate: bool,
     most: int,
 ) -> tuple[int, int]:
-    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (Octree-GS, anchor_growing).
+    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (anchor_growing).
 
     `gate`: whether promotion and bias take place. Returns how many grew, and how many did not for want of room.
     """

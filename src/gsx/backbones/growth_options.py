@@ -79,11 +79,7 @@ CHOICES = {
     "duplicates": ("next", "own"),
 }
 """Values of each quirk, the reference's first."""
-
-
 SANE = {name: values[1] for name, values in CHOICES.items()} | {"duplicates": "next"}
-
-
 FIDELITIES = {"reference": {name: values[0] for name, values in CHOICES.items()}, "sane": SANE}
 
 

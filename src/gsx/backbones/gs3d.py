@@ -23,8 +23,7 @@ from gsx.backbones.mip import filter_sizes, filtered_rules, logit_of_log, smooth
 from gsx.backbones.sampling import quantile
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
-from gsx.core.errors import InputError
-from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splat_files import columns_of
@@ -47,14 +46,8 @@ from gsx.core.training.schedule import log_linear
 
 LARGEST_LOG_SCALE = 30.0
 """Scales are held below e^30 world units, so that their squares stay finite in float32."""
-
-
 LEAST_WEIGHT = 1e-37
-"""A level that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
-
-
-LEAST_SQUARE_DISTANCE = 1e-7
-"""Lower bound of the squared neighbour distance that sets the initial scale (3D-GS, simple-knn)."""
+"""A Gaussian that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
@@ -88,8 +81,6 @@ class GS3D:
         self, options: GS3DOptions, context: BackboneContext, visibility: Visibility, densification: Densification
     ) -> None:
         scene = context.scene
-        if len(scene.points) == 0:
-            raise InputError(f"scene '{scene.name}' has no points to start from: give it points or scene.points=random")
         self.options, self.visibility, self.densification = options, visibility, densification
         self.extent = scene.extent
         self.white = bool((scene.background == 1).all())
@@ -98,7 +89,7 @@ class GS3D:
         self.raster = filtered_rules(context.raster, options.filter, options.mip)
         self.absolute_gradient = options.density.absolute
         self.cameras = [view.camera for view in scene.train]
-        self.table = self.initial_table(scene.points, context.device)
+        self.table = self.initial_table(context.points(), context.device)
         self.statistics = Statistics.zeros(len(self.table), context.device, options.density.absolute)
         self.standard_file = not self.visibility.columns(self.table)
         self.refresh_filter()
@@ -306,13 +297,13 @@ class GS3D:
     # -- what others need --------------------------------------------------------------------------------------
 
     def size(self) -> tuple[int, int]:
-        """(primitives, bytes of their parameters and levels)."""
+        """(primitives, bytes of parameters and columns, but for filter sizes)."""
         stored: list[Tensor] = [*self.table.parameters.values()]
         stored += [column for name, column in self.table.columns.items() if name != "filter"]
         return len(self.table), sum(value.numel() * value.element_size() for value in stored)
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """What `gaussians` makes of what the camera draws; without a camera of all levels."""
+        """What `gaussians` makes of what the camera draws; without a camera of all Gaussians."""
         shown = everything(self.table) if camera is None else self.visibility.shown(self.table, camera, step)
         return self.gaussians(shown)
 

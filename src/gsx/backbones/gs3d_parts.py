@@ -12,20 +12,14 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.gaussians.splats import Splats
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import (
-    ParameterTable,
-    append_rows,
-    keep_rows,
-    withheld,
-    within_room,
-)
+from gsx.core.training.density import ParameterTable, append_rows, keep_rows, withheld, within_room
 
 if TYPE_CHECKING:
     from gsx.backbones.gs3d import GS3D
 
 
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
-    """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (3D-GS, train.py)."""
+    """One child of each parent: drawn from the parent's Gaussian, `shrink` times smaller (3D-GS, densify_and_split)."""
     return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
 
 

@@ -3,11 +3,7 @@
 from dataclasses import dataclass, replace
 
 MODES = ("round", "floor", "ceil", "progressive")
-
-
 EXTEND_RULES = ("reference", "sane")
-
-
 ZOOM_RULES = ("finer", "training")
 
 

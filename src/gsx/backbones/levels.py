@@ -23,25 +23,13 @@ from gsx.core.training.schedule import Schedule
 
 BELOW_ONE = 0.9999
 """Largest fading weight and largest fraction of a level in progressive mode (Octree-GS); largest adaptive threshold."""
-
-
 LEAST_DISTANCE = 1e-8
 """Distances are held above this fraction of the farthest: the logarithm of a camera at a primitive is finite."""
-
-
 MANY_LEVELS = 12
-
-
 NEAR_RATIO = 1e-3
 """A nearest distance below this fraction of the farthest comes from points at cameras."""
-
-
 FEW_ANCHORS = 100
-
-
 MANY_ANCHORS = 5_000_000
-
-
 FLOAT_STEP = 2.0**-23
 """Neighbouring float32 numbers differ by up to this fraction."""
 

@@ -86,7 +86,7 @@ def free_gaussians(options: OctreeGS3DOptions, context: BackboneContext) -> GS3D
     gaussians, level_options, density = free_options(options)
     schedule = context.schedule(options.published_iterations)
     cameras = [view.camera for view in context.scene.train]
-    points = context.scene.points.positions.float()
+    points = context.points().positions.float()
     levels = derive(points, cameras, level_options, all_levels_from(level_options, schedule))
     visibility = VisibleByLevel(levels)
     return GS3D(gaussians, context, visibility, CloneSplitAcrossLevels(visibility, density, options.switches()))

@@ -5,14 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from gsx.backbones.growth import (
-    nodes_of,
-)
-from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.backbones.growth import nodes_of
+from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.shapes import Float, Int
-
-LEAST_SQUARE_DISTANCE = 1e-7
-"""Lower bound of the squared neighbour distance that sets the initial lengths (Scaffold-GS, create_from_pcd)."""
 
 
 def automatic_voxel(points: Float[Tensor, "P 3"], squared: bool) -> float:

@@ -13,6 +13,7 @@ from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
 
 logger = logging.getLogger("gsx.cli")
+
 HYDRA_FLAGS = (
     "-m",
     "--multirun",

@@ -10,8 +10,6 @@ from gsx.core.training.regenerator import RegeneratorContext
 
 Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, h, w] each, display values."""
-
-
 OWN_EVERY = 6
 """Of so many pairs to learn from one more shows the run's own render, which is to be left alone more (usual: 10 to
 20 %)."""

@@ -26,15 +26,7 @@ from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_model import model_folders
 from gsx.scenes.points import grey_points, read_points
-from gsx.scenes.posed import (
-    Shot,
-    pose_from_opengl,
-    provenance,
-    read_json,
-    reduction_of,
-    refuse_too_few,
-    views_of,
-)
+from gsx.scenes.posed import Shot, pose_from_opengl, provenance, read_json, reduction_of, refuse_too_few, views_of
 from gsx.scenes.splits import Split, split_names
 
 POSES_FILE = "poses_enu.json"

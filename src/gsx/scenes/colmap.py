@@ -26,11 +26,7 @@ from gsx.scenes.posed import (
     views_of,
 )
 from gsx.scenes.splits import split_names
-from gsx.scenes.undistort import (
-    METHOD,
-    pinhole_of,
-    undistort_points,
-)
+from gsx.scenes.undistort import METHOD, pinhole_of, undistort_points
 
 MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observations that could be compared instead
 

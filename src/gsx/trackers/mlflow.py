@@ -65,7 +65,7 @@ class MLflow:
 
     def __init__(self, options: MLflowOptions) -> None:
         keep_quiet()
-        require("mlflow", PACKAGES, "gsx[mlflow]")
+        require("tracker mlflow", PACKAGES, "gsx[mlflow]")
         self.options = options
         self.client: Any = checked_client(options.uri) if options.uri else None
         self.run_id = ""

@@ -35,7 +35,7 @@ class TensorBoard:
     """
 
     def __init__(self, options: TensorBoardOptions) -> None:
-        require("tensorboard", ("tensorboard",), "gsx[tensorboard]")
+        require("tracker tensorboard", ("tensorboard",), "gsx[tensorboard]")
         self.options = options
         self.writer: Any = None
         self.sent = 0

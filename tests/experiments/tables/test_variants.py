@@ -1,4 +1,4 @@
-"""Named methods against the paper's text (supplementary; specification, section 2), all at the published length."""
+"""Named methods against the paper's text (supplementary), all at the published length."""
 
 from typing import Any
 

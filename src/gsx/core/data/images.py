@@ -20,11 +20,7 @@ from gsx.core.files import replacing
 from gsx.core.shapes import Float, UInt8
 
 ZOOM_SLACK = 1.01  # sizes are rounded to whole pixels, so four times a quarter can be a little more than all
-
-
 JPEG_QUALITY = 95
-
-
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
     1: (False, ()),
     2: (False, (-1,)),

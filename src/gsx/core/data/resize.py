@@ -12,8 +12,6 @@ from gsx.core.shapes import Float, UInt8
 Size = tuple[int, int]
 """(width, height) in pixels."""
 FILTERS = ("bicubic", "area", "lanczos")
-
-
 LIGHTS = ("display", "linear")
 
 
@@ -142,8 +140,6 @@ def _lanczos(x: Tensor) -> Tensor:
 
 
 KERNELS = {"bicubic": _keys, "lanczos": _lanczos}
-
-
 REACH = {"bicubic": 2, "lanczos": 3}
 
 

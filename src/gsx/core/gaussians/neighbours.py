@@ -5,6 +5,8 @@ from torch import Tensor
 
 from gsx.core.shapes import Float, Int
 
+LEAST_SQUARE_DISTANCE = 1e-7
+"""Lower bound of the squared neighbour distance that sets initial sizes, scene units^2 (3D-GS, simple-knn)."""
 CHUNK_VALUES = 1 << 24
 """Distances held at once by direct comparison."""
 DIRECT = 2048

@@ -1,4 +1,4 @@
-"""The slow float64 truth: every splat at every pixel, written from the equations (3D-GS, spec section 3), no tiles.
+"""The slow float64 truth: every splat at every pixel, written from the equations (3D-GS, forward.cu), no tiles.
 
 Shares no code with the fast path; O(splats x pixels) memory. Differentiable by plain autograd.
 """

@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import Scene
+from gsx.core.data.scene import PointCloud, Scene
+from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.shapes import Float
@@ -30,6 +31,18 @@ class BackboneContext:
     """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
+
+    def points(self) -> PointCloud:
+        """What the model starts from.
+
+        Raises:
+            InputError: the scene has no points.
+        """
+        if len(self.scene.points) == 0:
+            raise InputError(
+                f"scene '{self.scene.name}' has no points to start from: give it points or scene.points=random"
+            )
+        return self.scene.points
 
     def schedule(self, published_iterations: int) -> Schedule:
         """Maps steps of a published run of that length onto this run."""

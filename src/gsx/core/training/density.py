@@ -1,7 +1,7 @@
 """Row surgery on parameters and their Adam state together, and the statistics that decide about it.
 
 Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments and
-removed with their moments; a group's step count is never reset (3D-GS, train.py). A parameter touched by surgery
+removed with their moments; a group's step count is never reset (3D-GS). A parameter touched by surgery
 is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
 """
 
@@ -18,7 +18,7 @@ from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.shapes import Bool, Float, Int
 
 ADAM_EPSILON = 1e-15
-"""3D-GS: gradients of a mean loss are tiny (3D-GS, arguments)."""
+"""Gradients of a mean loss are tiny (3D-GS, training_setup)."""
 
 
 @dataclass(eq=False)

@@ -1,7 +1,7 @@
-"""Several views in one step, on one process or on several: their gradients, losses and sightings become those of one.
+"""Several views in one step, on one process or on several: gradients, losses and observations become those of one.
 
-Every view's own loss is sent back, and the sums are divided in the end. Of a step's sightings each counts by its weight
-in the mean loss (`density.Statistics`), so that published thresholds hold for any number of views.
+Every view's own loss is sent back, and the sums are divided in the end. An observation counts by its weight in the
+mean loss (`density.Statistics`), so that published thresholds hold for any number of views.
 """
 
 from collections.abc import Iterator, Sequence

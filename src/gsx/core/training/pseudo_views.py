@@ -1,4 +1,4 @@
-"""Pseudo details: pictures that nobody took, which training uses as truth for a while (the paper)."""
+"""Pseudo details: pictures that nobody took, which training uses as truth for a while."""
 
 import json
 from collections.abc import Sequence
@@ -43,18 +43,18 @@ class Term:
     parts: Sequence[tuple[PseudoView, float]]
     """Pseudo views with their weights."""
     replaces: float
-    """Share of the backbone's own loss that this term takes the place of; 0: it is added (the paper)."""
+    """Share of the backbone's own loss that this term takes the place of; 0: it is added."""
     observed: bool
     """Whether the renders count in density control (the authors' code does so), each by its weight in `parts`. That is
     the weight of the mean difference whatever its kind: squares, or what is known at a lower resolution beside it."""
     shared: bool
-    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP, as the paper)."""
+    """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP)."""
     squared: bool = False
     """Differences are (render - target)^2 instead of the paper's |render - target|."""
 
 
 def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
-    """Mean |render - target| over pixels and channels, each pixel by its trust (the paper); that at a lower resolution
+    """Mean |render - target| over pixels and channels, each pixel by its weight; that at a lower resolution
     beside it where that is known (SRGS). `squared`: (render - target)^2 in both."""
     size = torch.square if squared else torch.abs
     difference = size(image - view.target.to(image.device).float() / 255)
@@ -84,7 +84,7 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
     listed = []
     for number, view in enumerate(views):
         held = {"target": view.target, "rotation": view.camera.rotation, "translation": view.camera.translation}
-        optional = {"trust": view.pixel_weight, "coarse": view.coarse}
+        optional = {"trust": view.pixel_weight, "coarse": view.coarse}  # names that files have always had
         held |= {name: value for name, value in optional.items() if value is not None}
         tensors |= {
             f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()

@@ -100,7 +100,7 @@ def terms_of(run: Run, number: int, picked: int) -> list[Term]:
 
 
 def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
-    """Render a view, and the pseudo views that go with it, and send the loss back (the paper).
+    """Render a view, and the pseudo views that go with it, and send the loss back.
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are

@@ -17,8 +17,6 @@ OmegaConf.register_new_resolver("either", lambda first, second: first or second,
 OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
 MODULE = "gsx.conf"
-
-
 LAUNCHERS = {
     "processes": ("hydra-joblib-launcher", "sweep"),
     "joblib": ("hydra-joblib-launcher", "sweep"),

@@ -15,13 +15,12 @@ from gsx.core.cache import source_revision
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer.prepare import path_of
-from gsx.core.run_folder.run_key import (
-    scene_stamp,
-)
+from gsx.core.run_folder.run_key import scene_stamp
 from gsx.core.training.run import Run
 from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)
+
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
 
 

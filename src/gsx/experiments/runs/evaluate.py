@@ -7,9 +7,7 @@ from typing import Any
 from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.files import write_json
 from gsx.core.run_folder.files import read_run
-from gsx.core.run_folder.run_key import (
-    judging,
-)
+from gsx.core.run_folder.run_key import judging
 from gsx.core.training.remarks import remarks_of
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import Pictures

@@ -36,7 +36,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
 def render_mode(raster: RasterSettings) -> str:
     """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
 
-    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads (spec B6 of splat formats).
+    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads.
     """
     return "mip" if raster.compensate else "default"
 

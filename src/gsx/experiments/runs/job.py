@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger("gsx.cli")
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report it."""
 

@@ -295,11 +295,12 @@ def add_newer_settings(config: Any) -> None:
         config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
     with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
         strict = OmegaConf.load(path)
-    for node in (config.get("augmenter") or {}).values():
+    augmenters = config.get("augmenter")
+    for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
         if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
             node.checks = strict
     density = OmegaConf.select(config, "backbone.clone_split.level_density")
-    if density is not None and "gate" in density:
+    if isinstance(density, DictConfig) and "gate" in density:
         waits = density.pop("gate")
         if config.backbone.densification == "clone_split":
-            config.backbone.quirks.gate = "closed" if waits else "open"
+            OmegaConf.update(config, "backbone.quirks.gate", "closed" if waits else "open", force_add=True)

@@ -96,8 +96,6 @@ def rounded_up(value: float) -> str:
 
 
 NONE = "n/a"
-
-
 HEADINGS = (
     "", "#", "f+b ms", "x base", "+-", "fwd ms", "max error", "99.99 %", "PSNR", "gradient", "ideal", "pairs", "MB",
 )  # fmt: skip

@@ -16,27 +16,15 @@ from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
-from gsx.experiments.trade.knobs import (
-    Row,
-    Trial,
-    gradient_error,
-    image_errors,
-    pooled_psnr,
-)
+from gsx.experiments.trade.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
 from gsx.experiments.trade.subject import Shot, Subject
 
 EXACT: dict[str, Any] = {"path": "eager", "exponent": "direct", "evaluation": "float64", "accumulation": "float64"}
 """How the truth is computed; what it is, the rules of the base settings say."""
-
-
 UNBOUNDED: dict[str, Any] = {"cull": "tight", "alpha_min": 1e-5, "transmittance_stop": 0.0, "tile_cap": 0}
 """Rules so loose that nothing visible is cut off: the ideal picture."""
-
-
 CROP = 32
 """Edge of the picture on which the truth is compared with the untiled reference, px."""
-
-
 CROP_SPLATS = 300
 """Splats in it."""
 

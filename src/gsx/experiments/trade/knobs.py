@@ -1,6 +1,6 @@
 """What each knob of the rasterizer costs and gives: the sweep's choices, errors, front, recommendation and table.
 
-Nothing here looks at a clock; `trade_measure.py` does.
+Nothing here looks at a clock; `bench.py` does.
 """
 
 import math
@@ -31,33 +31,19 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "tile_cap": (0, 128, 512, 2048),
 }
 """Values tried for each setting; the published ones are among them."""
-
-
 KNOBS = ("path", *VALUES)
 """Everything that can be swept."""
-
-
 OUTLIERS = 1e-4
 """Share of the pixels that may jump: where rounding decides whether a splat reaches a cut-off, a pixel changes by up to
 that cut-off, so over a whole picture the largest error of float32 is that of a few such pixels."""
-
-
 NOISE = 0.03
 """Times that differ by less than this fraction are taken as equal."""
-
-
 WORTHWHILE = 0.1
 """A change that saves less than this fraction of the time or of the error is not combined with others."""
-
-
 ROUND = 1e-3
 """Gradients of orientations count against at least this fraction of those of log-scales: round splats have none."""
-
-
 COSTS = {"step_ms": "forward and backward", "forward_ms": "forward only"}
 """Times of a row, by what they measure."""
-
-
 SPREADS = {"step_ms": "step_spread", "forward_ms": "forward_spread"}
 
 

@@ -13,16 +13,11 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.available import available, complaint
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.trade.bench import EXACT, Bench, Check, Times, check_truth, reason
-from gsx.experiments.trade.knobs import (
-    Row,
-    Trial,
-    combinations,
-    ordered,
-    single_changes,
-)
+from gsx.experiments.trade.knobs import Row, Trial, combinations, ordered, single_changes
 from gsx.experiments.trade.subject import Subject
 
 logger = logging.getLogger(__name__)
+
 STEADY = 0.1
 """Times of a machine with nothing else to do vary by less than this fraction."""
 

@@ -15,6 +15,7 @@ from gsx.core.files import replace_file
 from gsx.regenerators.diffusion.options import TuningOptions
 
 logger = logging.getLogger(__name__)
+
 ADAPTERS = "lora"
 """Kind of the adapters in the cache."""
 

@@ -44,6 +44,7 @@ from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
 
 logger = logging.getLogger(__name__)
+
 REASONS = {
     "raw": "tuning does not help on held-out renders",
     "renders": "held-out renders are closest to their photographs as they are (regenerator/restore=identity)",
@@ -52,8 +53,6 @@ REASONS = {
 
 
 WEIGHT_DECAY = 1e-2
-
-
 LARGEST_NORM = 1.0
 """To which gradients are clipped."""
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsx.core.shapes import Float, Int
 from gsx.scenes.demo import textures
-from gsx.scenes.demo.solids import (
+from gsx.scenes.demo.solids import (  # fmt: skip
     Solid,
     box,
     cylinder,
@@ -23,7 +23,7 @@ from gsx.scenes.demo.solids import (
     normalise,
     smoothstep,
     sphere,
-)  # fmt: skip
+)
 from gsx.scenes.demo.textures import Kit, make_kit
 
 Texture = Callable[[Tensor, Tensor, Kit], Tensor]
