@@ -9,25 +9,13 @@ from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 @hookimpl
 def gsx_register(registry: Registry) -> None:
     """Scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
-    from gsx.augmenters.pseudo_details import PseudoDetails
-    from gsx.augmenters.pseudo_options import PseudoOptions
-    from gsx.backbones.anchor_options import NeuralOptions
-    from gsx.backbones.anchors import neural_anchors
-    from gsx.backbones.gs3d import gs3d
-    from gsx.backbones.gs3d_options import GS3DOptions
-    from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
-    from gsx.regenerators.called import Called, CalledOptions
-    from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
-    from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
-    from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
-    from gsx.regenerators.diffusion.options import PipelineOptions, UpscalerOptions
-    from gsx.regenerators.diffusion.options import RestorerOptions as DiffusionRestorerOptions
-    from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
-    from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
-    from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
+    for add in (add_scenes, add_backbones, add_augmenters, add_regenerators, add_diffusion, add_trackers):
+        add(registry)
+
+
+def add_scenes(registry: Registry) -> None:
+    """Loaders, a format each."""
     from gsx.scenes import blender, bungee, colmap, demo, photos, transforms
-    from gsx.trackers.mlflow import MLflow, MLflowOptions
-    from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
     registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions)
@@ -35,26 +23,66 @@ def gsx_register(registry: Registry) -> None:
     registry.add("scene", "blender", blender.load, blender.BlenderOptions)
     registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions)
     registry.add("scene", "bungee", bungee.load, bungee.BungeeOptions)
+
+
+def add_backbones(registry: Registry) -> None:
+    """Free Gaussians and anchors, with and without levels and filters."""
+    from gsx.backbones.anchor_options import NeuralOptions
+    from gsx.backbones.anchors import neural_anchors
+    from gsx.backbones.gs3d import gs3d
+    from gsx.backbones.gs3d_options import GS3DOptions
+    from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
+
     registry.add("backbone", "gs3d", gs3d, GS3DOptions)
     registry.add("backbone", "mip_splatting", gs3d, GS3DOptions)
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)
-    registry.add("augmenter", "upscale", PseudoDetails, PseudoOptions)
-    registry.add("augmenter", "bootstrap", PseudoDetails, PseudoOptions)
-    registry.add("augmenter", "mipmap", PseudoDetails, PseudoOptions)
-    registry.add("augmenter", "bootstrap_original", PseudoDetails, PseudoOptions)
+
+
+def add_augmenters(registry: Registry) -> None:
+    """One procedure under four names, each with numbers of its own."""
+    from gsx.augmenters.pseudo_details import PseudoDetails
+    from gsx.augmenters.pseudo_options import PseudoOptions
+
+    for name in ("upscale", "bootstrap", "mipmap", "bootstrap_original"):
+        registry.add("augmenter", name, PseudoDetails, PseudoOptions)
+
+
+def add_regenerators(registry: Registry) -> None:
+    """Filters, what the scene itself teaches, and functions."""
+    from gsx.regenerators.called import Called, CalledOptions
+    from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
+    from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
+
     registry.add("regenerator", "lanczos", Resampled, PlainOptions)
     registry.add("regenerator", "oracle", Oracle, PlainOptions)
     registry.add("regenerator", "identity", Unchanged, PlainOptions)
     registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
     registry.add("regenerator", "callable", Called, CalledOptions)
+
+
+def add_diffusion(registry: Registry) -> None:
+    """Diffusion models; their packages are imported when one is used."""
+    from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
+    from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
+    from gsx.regenerators.diffusion.options import PipelineOptions, RestorerOptions, UpscalerOptions
+    from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
+
     registry.add("regenerator", "diffusers_pipeline", any_pipeline, PipelineOptions)
     registry.add("regenerator", "sd_by_scale", Cascade, CascadeOptions)
     registry.add("regenerator", "sd_x2_latent", partial(Diffusion, SD_X2_LATENT), UpscalerOptions)
     registry.add("regenerator", "sd_x4", partial(Diffusion, SD_X4), UpscalerOptions)
-    registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), DiffusionRestorerOptions)
+    registry.add("regenerator", "sdxl_turbo", partial(Diffusion, SDXL_TURBO), RestorerOptions)
+
+
+def add_trackers(registry: Registry) -> None:
+    """Listeners that tell other programs of a run."""
+    from gsx.trackers.mlflow import MLflow, MLflowOptions
+    from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
+
     registry.add("tracker", "tensorboard", TensorBoard, TensorBoardOptions)
     registry.add("tracker", "mlflow", MLflow, MLflowOptions)
 
