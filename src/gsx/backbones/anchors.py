@@ -38,6 +38,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import Rendering, drawable, touches
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
@@ -181,8 +182,7 @@ class Anchors:
         """Mean volume of the Gaussians drawn; 0 for none (Scaffold-GS, train.py)."""
         if not self.options.volume_weight:
             return None
-        volumes = drawn.splats.scales.prod(1)
-        return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
+        return volume_loss(drawn.splats.scales, self.options.volume_weight)
 
     def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (Scaffold-GS, training_statis)."""

@@ -20,9 +20,10 @@ from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, n
 from gsx.backbones.sampling import sampled_means
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
+from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable, append_rows, withheld, within_room
+from gsx.core.training.density import ParameterTable, append_rows, detached_rows, withheld, within_room
 
 logger = logging.getLogger(__name__)
 
@@ -198,7 +199,7 @@ class CloneSplitAcrossLevels:
             splitting=self.quirks.gate == "open" or levels.highest(step) == levels.count - 1,
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
-        raw = {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+        raw = detached_rows(table)
         new = stacked([clones(raw, cloned), small_children(raw, split, levels, options.shrink, model.generator)])
         seen = kept(levels, new["means"], new["level"])
         keep = within_room(seen, gradient[torch.cat([cloned, split])], model.room())
@@ -211,5 +212,4 @@ class CloneSplitAcrossLevels:
         """Mean volume of what was drawn, 0 for nothing."""
         if not self.options.volume_weight:
             return None
-        volumes = drawn.splats.scales.prod(1)
-        return self.options.volume_weight * volumes.sum() / max(1, len(volumes))
+        return volume_loss(drawn.splats.scales, self.options.volume_weight)

@@ -239,7 +239,7 @@ class GS3D:
     def densify(self, step: int) -> dict[str, int]:
         """Density control's own way, then prune (3D-GS, densify_and_prune: the order in one event)."""
         done = self.densification.densify(self, step)
-        done = {"cloned": done.pop("cloned"), "split": done.pop("split"), "pruned": self.prune(step)} | done
+        done["pruned"] = self.prune(step)
         self.statistics = Statistics.zeros(len(self.table), self.statistics.count.device, self.absolute_gradient)
         return done
 

@@ -12,7 +12,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.gaussians.splats import Splats
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable, append_rows, keep_rows, withheld, within_room
+from gsx.core.training.density import ParameterTable, append_rows, detached_rows, keep_rows, withheld, within_room
 
 if TYPE_CHECKING:
     from gsx.backbones.gs3d import GS3D
@@ -142,7 +142,7 @@ def clone_and_split(
     generator: torch.Generator,
 ) -> None:
     """Rows become: survivors, clones, first children, second children."""
-    raw = {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+    raw = detached_rows(table)
     parents = {name: value[split] for name, value in raw.items()}
     twins = [children(parents, shrink, generator) for _ in range(2)]
     added = {name: torch.cat([value[cloned], *(twin[name] for twin in twins)]) for name, value in raw.items()}

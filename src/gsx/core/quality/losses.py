@@ -64,6 +64,12 @@ def ssim_map(
     return luminance * (2 * covariance + C2) / (variances + C2)
 
 
+def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""]:
+    """`weight` times the mean product of the three scales; 0 for no splat (Scaffold-GS, train.py)."""
+    volumes = scales.prod(1)
+    return weight * volumes.sum() / max(1, len(volumes))
+
+
 def photometric(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float) -> Float[Tensor, ""]:
     """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels."""
     absolute = (image - target).abs().mean()

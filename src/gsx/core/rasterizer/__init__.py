@@ -4,10 +4,11 @@ from gsx.core.rasterizer.batch import rasterize_batch
 from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
-from gsx.core.rasterizer.tiled import TiledRendering, rasterize_tiled
+from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import screen_radii, touches
 
 __all__ = [
+    "TILE_PIXELS",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",

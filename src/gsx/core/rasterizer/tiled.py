@@ -14,6 +14,9 @@ from gsx.core.rasterizer.render import Rendering, rasterize
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float
 
+TILE_PIXELS = 1 << 20
+"""Pixels rendered at a time where nothing else is said."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
@@ -127,7 +130,7 @@ def rasterize_tiled(
     *,
     background: Float[Tensor, "C"] | None = None,
     depth: bool = False,
-    pixels: int = 1 << 20,
+    pixels: int = TILE_PIXELS,
 ) -> TiledRendering:
     """What `rasterize` draws without gradients, bit for bit, in windows of at most `pixels` px (but at least a tile).
 
@@ -138,7 +141,7 @@ def rasterize_tiled(
         InputError: a single tile needs more pairs than `settings.max_pairs`, or `pixels` is not positive.
     """
     if pixels < 1:
-        raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {1 << 20}")
+        raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {TILE_PIXELS}")
     tiled, count, dropped = TiledRendering.empty(splats, camera, depth), 0, 0
     for window in windows(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
         for place, part in renderings(splats, camera, settings, window, background, depth):

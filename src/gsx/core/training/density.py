@@ -87,6 +87,11 @@ def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
         table.columns[name] = column[kept]
 
 
+def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
+    """All parameters and columns by name, without gradient: what `append_rows` wants rows of."""
+    return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+
+
 def room_under(cap: int, count: int) -> int:
     """Rows that may be added to `count` of them under a cap; a cap of 0 is none."""
     return max(0, cap - count) if cap else sys.maxsize

@@ -4,11 +4,8 @@ import torch
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import TiledRendering, rasterize_tiled
+from gsx.core.rasterizer import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.training.run import Run
-
-TILE_PIXELS = 1 << 20
-"""Pixels rendered at a time where nothing else is said."""
 
 
 @torch.no_grad()

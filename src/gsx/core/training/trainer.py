@@ -111,14 +111,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
-    drawn = run.backbone.draw(view.camera, number)
-    rendering = rasterize(
-        drawn.splats,
-        view.camera,
-        run.raster,
-        background=colour,
-        absolute_gradient=run.backbone.absolute_gradient,
-    )
+    drawn, rendering = rendered(run, view.camera, number, colour)
     loss = photometric(rendering.image, target, run.training.ssim_weight)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
@@ -145,6 +138,13 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     )
 
 
+def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
+    """(what the backbone draws at this step, its render), to be learnt from."""
+    drawn = run.backbone.draw(camera, number)
+    absolute = run.backbone.absolute_gradient
+    return drawn, rasterize(drawn.splats, camera, run.raster, background=colour, absolute_gradient=absolute)
+
+
 def without_graph(rendering: Rendering) -> Rendering:
     """The picture alone, so that the steps of a batch do not hold on to what made theirs."""
     return replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach())
@@ -165,14 +165,7 @@ def pseudo_term(run: Run, term: Term, number: int, seen: list[Observation]) -> f
     """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
     total = 0.0
     for view, weight in term.parts:
-        drawn = run.backbone.draw(view.camera, number)
-        rendering = rasterize(
-            drawn.splats,
-            view.camera,
-            run.raster,
-            background=run.background,
-            absolute_gradient=run.backbone.absolute_gradient,
-        )
+        drawn, rendering = rendered(run, view.camera, number, run.background)
         loss = weight * pseudo_loss(rendering.image, view, term.squared)
         loss.backward()
         total += float(loss.detach())

@@ -293,12 +293,11 @@ def add_newer_settings(config: Any) -> None:
         return
     if isinstance(config.get("rasterizer"), DictConfig):
         config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
-    with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
-        strict = OmegaConf.load(path)
     augmenters = config.get("augmenter")
     for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
         if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
-            node.checks = strict
+            with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
+                node.checks = OmegaConf.load(path)
     density = OmegaConf.select(config, "backbone.clone_split.level_density")
     if isinstance(density, DictConfig) and "gate" in density:
         waits = density.pop("gate")
