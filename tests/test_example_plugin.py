@@ -2,13 +2,23 @@
 
 import json
 import os
+import re
 import shutil
+import statistics
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 from tiny import words
+
+from gsx import builtin
+from gsx.core.data.images import write_image
+from gsx.core.plugins import load_plugins
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.load_scene import load_scene
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -19,7 +29,7 @@ def site(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     source = tmp_path_factory.mktemp("source")
     command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-build-isolation"]
-    for name in ("plugin", "pseudo_plugin"):
+    for name in ("plugin", "pseudo_plugin", "own_plugin"):
         shutil.copytree(EXAMPLES / name, source / name)
         subprocess.run([*command, "--target", str(folder), str(source / name)], check=True, capture_output=True)
     broken = folder / "broken-1.0.dist-info"
@@ -66,3 +76,48 @@ def test_its_augmenter_trains_with_its_regenerator(site: Path, tmp_path: Path) -
     assert all(line["terms"]["steady_zoom"] > 0 for line in lines[10:])
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert evaluation["psnr"] > 5
+
+
+@pytest.fixture(scope="module")
+def snapshots(tmp_path_factory) -> Path:
+    """Pictures of the built-in scene in the format of the example's loader."""
+    options = {"scene.width": 64, "scene.height": 48, "scene.train_views": 8, "scene.test_views": 1}
+    scene = load_scene(compose([f"{key}={value}" for key, value in options.items()], load_plugins([("gsx", builtin)])))
+    folder, entries = tmp_path_factory.mktemp("snapshots"), []
+    for view in scene.train:
+        write_image(folder / f"{view.name}.png", view.image())
+        pose = torch.cat([view.camera.rotation, view.camera.translation[:, None]], 1)
+        entries.append({"file": f"{view.name}.png", "fx": view.camera.fx, "camera_from_world": pose.tolist()})
+    (folder / "snapshots.json").write_text(json.dumps(entries))
+    return folder
+
+
+def test_its_scene_format_is_recognised(site: Path, snapshots: Path) -> None:
+    out = gsx(site, "scenes", str(snapshots)).stdout.splitlines()
+    assert out[0] == "format    snapshots: snapshots (snapshots.json)"
+    assert "split     7 to train on, 1 to test on" in out
+    assert out[-1] == f"train     gsx scene=snapshots scene.path={snapshots}"
+
+
+def test_a_backbone_of_its_own_trains_on_it_resumes_and_is_exported(
+    site: Path, snapshots: Path, tmp_path: Path
+) -> None:
+    """Loss falls; a run that was stopped ends with the same bits; the splat file draws the same pictures."""
+    own = ("backbone=spheres", "scene=snapshots", f"scene.path={snapshots}", "iterations=60", "training.log_every=1")
+    once, halves = tmp_path / "once", tmp_path / "halves"
+    assert gsx(site, *own, f"folder={once}").returncode == 0
+    lines = [json.loads(line) for line in (once / "metrics.jsonl").read_text().splitlines()]
+    assert statistics.fmean(line["loss"] for line in lines[-10:]) < 0.8 * statistics.fmean(
+        line["loss"] for line in lines[:10]
+    )
+    stopped = gsx(site, *own, "training.checkpoint_every=20", f"folder={halves}")
+    assert stopped.returncode == 0, stopped.stderr
+    for path in (halves / "checkpoints").glob("step_0000060.*"):
+        path.unlink()
+    assert gsx(site, "resume", str(halves)).returncode == 0
+    last = [load_file(folder / "checkpoints" / "step_0000060.safetensors") for folder in (once, halves)]
+    assert all(torch.equal(last[0][key], last[1][key]) for key in last[0])
+    exported = gsx(site, "export", str(once), str(tmp_path / "spheres.ply"))
+    assert exported.returncode == 0, exported.stderr
+    worst = float(re.search(r"rendered again: (\S+) dB", exported.stderr).group(1))
+    assert worst > 60

@@ -59,7 +59,7 @@ def step_section(bench: Bench) -> Section:
     """Steps per second."""
     loaded = plugins()
     run = a_run(bench, loaded)
-    begun, primitives = run.step, run.backbone.size()[0]
+    begun, primitives = run.step, len(run.backbone.table)
     for view in run.scene.train[:VIEWS]:
         view.image()  # decoded now, not in the first path's turn
     jobs = {path: stepping(run, loaded, raster_of(run, path)) for path in bench.paths}
@@ -80,7 +80,7 @@ def step_section(bench: Bench) -> Section:
         "Training step",
         columns,
         rows,
-        f"Scene {name}, {width}x{height} px, from step {begun} on, {primitives:,} to {run.backbone.size()[0]:,} "
+        f"Scene {name}, {width}x{height} px, from step {begun} on, {primitives:,} to {len(run.backbone.table):,} "
         "primitives. Median of whole steps: render, loss, backward, density control, Adam; paths in turn on the "
         "same views.",
     )

@@ -14,15 +14,15 @@ def gsx_register(registry: Registry) -> None:
 
 
 def add_scenes(registry: Registry) -> None:
-    """Loaders, a format each."""
+    """Loaders, a format each; of two that can read a folder the later is the more telling."""
     from gsx.scenes import blender, bungee, colmap, demo, photos, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
-    registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions)
-    registry.add("scene", "photos", photos.load, photos.PhotosOptions)
-    registry.add("scene", "blender", blender.load, blender.BlenderOptions)
-    registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions)
-    registry.add("scene", "bungee", bungee.load, bungee.BungeeOptions)
+    registry.add("scene", "photos", photos.load, photos.PhotosOptions, photos.FORMAT)
+    registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions, transforms.FORMAT)
+    registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions, colmap.FORMAT)
+    registry.add("scene", "blender", blender.load, blender.BlenderOptions, blender.FORMAT)
+    registry.add("scene", "bungee", bungee.load, bungee.BungeeOptions, bungee.FORMAT)
 
 
 def add_backbones(registry: Registry) -> None:

@@ -20,6 +20,7 @@ from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.augmenter import Augmenter
+from gsx.core.training.parameter_table import gradients, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, load_views, pseudo_loss, save_views
 from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
@@ -62,8 +63,8 @@ def by_options(run: Run, **changes: Any) -> PseudoDetails:
 # -- the loss ----------------------------------------------------------------------------------------------------------
 
 
-def gradients(run: Run) -> dict[str, Tensor]:
-    return {name: gradient.clone() for name, gradient in run.backbone.gradients()}
+def copied_gradients(run: Run) -> dict[str, Tensor]:
+    return {name: gradient.clone() for name, gradient in gradients(run.backbone.table).items()}
 
 
 def picture(run: Run, camera: Camera) -> Tensor:
@@ -95,8 +96,8 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
     picked = run.sampler.count - 1
     run.sampler.order = [picked]
     step = backward(run)
-    found = gradients(run)
-    run.backbone.zero_grad()
+    found = copied_gradients(run)
+    zero_grad(run.backbone.table)
     views = augmenter_of(run).views[picked]
     assert len(views) == 3
     losses = [pseudo_loss(picture(run, view.camera), view) for view in views]
@@ -107,7 +108,7 @@ def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_pat
     assert float(step.loss) == pytest.approx(float(whole.detach()), rel=1e-5)
     assert step.terms["upscale"] == pytest.approx(float(pseudo.detach()), rel=1e-5)
     assert step.terms["own"] + step.terms["upscale"] == pytest.approx(float(step.loss), rel=1e-5)
-    for name, gradient in run.backbone.gradients():
+    for name, gradient in gradients(run.backbone.table).items():
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
@@ -116,7 +117,7 @@ def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Pa
     run = run_at(tmp_path / "run", 44, "backbone=gs3d", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
-    run.backbone.zero_grad()
+    zero_grad(run.backbone.table)
     assert step.terms["own"] == pytest.approx(0.85 * float(own_loss(run, 0).detach()), rel=1e-4)
 
 
@@ -138,7 +139,7 @@ def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "backbone=octree_scaffold", "augmenter=[upscale_paper,bootstrap]")
     run.sampler.order = [0]
     step = backward(run)
-    run.backbone.zero_grad()
+    zero_grad(run.backbone.table)
     assert step.terms["own"] == pytest.approx(0.75 * float(own_loss(run, 0).detach()), rel=1e-4)
     assert list(step.terms) == ["own", "upscale", "bootstrap"]
 
@@ -149,10 +150,10 @@ def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_pat
     run = run_at(tmp_path / "run", 40, *words)
     run.sampler.order = [1]
     backward(run)
-    found = gradients(run)
-    run.backbone.zero_grad()
+    found = copied_gradients(run)
+    zero_grad(run.backbone.table)
     (0.85 * own_loss(run, 1)).backward()
-    alone = gradients(run)
+    alone = copied_gradients(run)
     colour = [name for name in alone if name.startswith("heads.colour")]
     assert colour
     for name in colour:
@@ -188,8 +189,8 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("gsx.core.training.trainer.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
     step = backward(run)
     assert len(renders) == (3 if background == "true" else 2)
-    found = gradients(run)
-    run.backbone.zero_grad()
+    found = copied_gradients(run)
+    zero_grad(run.backbone.table)
     views = augmenter_of(run).views[2]
     assert [(view.provenance["scale"], view.camera.size) for view in views] == [(1, (48, 36)), (2, (48, 36))]
     assert torch.equal(views[0].target.float() / 255, run.scene.train[2].image())
@@ -202,7 +203,7 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     whole = own_loss(run, 2) + pseudo
     whole.backward()
     assert float(step.loss) == pytest.approx(float(whole.detach()), rel=1e-5)
-    for name, gradient in run.backbone.gradients():
+    for name, gradient in gradients(run.backbone.table).items():
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
@@ -366,7 +367,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     """
     run = run_at(tmp_path / "run", 80, "backbone=octree_gs3d", "backbone.levels.count=6", "augmenter=upscale_paper")
     own, backbone = run.scene.train[0].camera, run.backbone
-    table, distance = backbone.table, backbone.levels.farthest / 2**1.3  # type: ignore[attr-defined]
+    table, distance = backbone.table, backbone.grid.levels.farthest / 2**1.3  # type: ignore[attr-defined]
     spot = (own.centre + distance * own.rotation[2]).float()
     table.columns["anchors"] = spot.expand(len(table), 3).clone()
     table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)

@@ -13,6 +13,7 @@ from small_scene import small_scene, spread
 from tiny import tiny_run
 from torch import Tensor
 
+from gsx.backbones.anchor_grids import LevelGrids
 from gsx.backbones.anchor_options import Decay
 from gsx.backbones.anchors import Anchors, DrawnAnchors
 from gsx.backbones.voxels import automatic_voxel, voxel_nodes
@@ -23,7 +24,8 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, touches
-from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.backbone import Backbone, BackboneContext, remove_nonfinite
+from gsx.core.training.parameter_table import gradients, size_of, table_tensors, zero_grad
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
@@ -85,7 +87,7 @@ def test_they_are_backbones_that_tell_their_size(name: str) -> None:
     backbone = small_anchors(name)
     assert isinstance(backbone, Backbone)
     assert tuple(backbone.table.parameters) == PARAMETERS[name]
-    count, size = backbone.size()
+    count, size = size_of(backbone.table)
     assert count == len(backbone.table) == len(backbone.table["anchors"])
     floats = {
         "scaffold": 3 + 30 + 32 + 6,
@@ -132,9 +134,9 @@ def test_the_automatic_voxel_is_the_literal_median_of_mean_squares() -> None:
     five = torch.cat([points, torch.tensor([[10.0, 0, 0]])])
     means = sorted(sum(sorted(float((p - q).square().sum()) for q in five)[1:4]) / 3 for p in five)
     assert automatic_voxel(five, squared=True) == pytest.approx(means[1], rel=1e-5)
-    assert small_anchors("scaffold", "voxel=0", scene=small_scene(points)).voxel == pytest.approx(16 / 3)
+    assert small_anchors("scaffold", "voxel=0", scene=small_scene(points)).grid.voxel == pytest.approx(16 / 3)
     sane = small_anchors("scaffold", "voxel=0", "fidelity=sane", scene=small_scene(points))
-    assert sane.voxel == pytest.approx(math.sqrt(16 / 3))
+    assert sane.grid.voxel == pytest.approx(math.sqrt(16 / 3))
     assert automatic_voxel(torch.zeros(5, 3), squared=True) > 0
 
 
@@ -178,7 +180,7 @@ def test_learning_rates_at_the_first_middle_and_last_step(name: str) -> None:
     for step in (1, steps // 2, steps, steps + 7):
         backbone.set_rates(step)
         groups = [*backbone.table.optimiser.param_groups]
-        groups += backbone.head_optimiser.param_groups if backbone.head_optimiser else []
+        groups += backbone.table.networks.optimiser.param_groups if backbone.table.networks else []
         u = min(1.0, step / steps)
         for group in groups:
             first, last = RATES[name][group["name"]]
@@ -288,7 +290,7 @@ def test_anchors_in_view_are_judged_by_their_reach(name: str) -> None:
 def test_coarse_levels_are_drawn_and_finer_ones_added(name: str) -> None:
     """D / d of 1, 2, 4 draw levels up to 0, 1, 2; levels that do not train yet stay away."""
     backbone = small_anchors(name, "levels.count=4", "levels.first=1", "levels.half_cell=false")
-    levels, table = backbone.levels, backbone.table
+    levels, table = backbone.grid.levels, backbone.table
     rows = torch.arange(len(table))
     table.columns["anchors"] = torch.zeros(len(table), 3)
     table.columns["level"] = (rows % 4).to(torch.int16)
@@ -317,19 +319,19 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
     if name in NEURAL:
         shut = small_anchors(name)
         with torch.no_grad():
-            shut.heads.opacity[2].bias.fill_(-10.0)
+            shut.table.networks.modules.opacity[2].bias.fill_(-10.0)
         cases.append((shut, shut.cameras[0]))
     for model, camera in cases:
         drawn, rendering = render(model, camera, 1000)
         assert len(drawn.splats) == 0
         regulariser = model.regulariser(drawn)
         assert regulariser is None or float(regulariser.detach()) == 0
-        assert all(not gradient.any() for _, gradient in model.gradients())
+        assert all(not gradient.any() for gradient in gradients(model.table).values())
         model.accumulate(model.observe(drawn, rendering, 1000))
         assert model.table["visits"].sum() == len(drawn.anchors.rows)
         assert model.densify_and_prune(1000) == {}
         model.update(1000)
-        assert all(torch.isfinite(value).all() for value in model.tensors().values())
+        assert all(torch.isfinite(value).all() for value in table_tensors(model.table).values())
 
 
 def test_the_volume_term_is_the_mean_over_what_is_drawn() -> None:
@@ -370,7 +372,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
                 wanted[2][slot] += math.hypot(x * camera.width / 2, y * camera.height / 2)
                 wanted[3][slot] += 1
         backbone.accumulate(backbone.observe(drawn, rendering, 1000))
-        backbone.zero_grad()
+        zero_grad(backbone.table)
     for column, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(backbone.table[column].flatten(), torch.tensor(values))
     assert 0 < sum(visits > 0 for visits in wanted[0]) < count
@@ -414,7 +416,7 @@ def test_a_growth_step_moves_only_the_networks(name: str) -> None:
     backbone = judged(name)
     backbone.update(1600)
     render(backbone, backbone.cameras[0], 1600)
-    table, heads = backbone.table, dict(backbone.head_parameters())
+    table, heads = backbone.table, dict(backbone.table.networks.named() if backbone.table.networks else ())
     moments = {n: table.optimiser.state[table[n]]["exp_avg"].clone() for n in table.parameters}
     held = {n: p.detach().clone() for n, p in heads.items()}
     before = len(table)
@@ -432,7 +434,7 @@ def test_a_growth_step_moves_only_the_networks(name: str) -> None:
         assert torch.equal(state["exp_avg"][: before - 5], moments[n][5:])
         assert not state["exp_avg"][before - 5 :].any()
     for n, parameter in heads.items():
-        assert float(backbone.head_optimiser.state[parameter]["step"]) == 2
+        assert float(backbone.table.networks.optimiser.state[parameter]["step"]) == 2
         assert not torch.equal(parameter.detach(), held[n]), n
 
 
@@ -510,11 +512,11 @@ def test_fidelity_reaches_the_switches_of_levels_and_of_each_reference(name: str
         ("quirks.bias=all", ("all", half_cell)),
     ):
         backbone = small_anchors(name, word)
-        assert backbone.levels is not None
-        assert (backbone.quirks.bias, backbone.levels.half_cell) == wanted
+        assert isinstance(backbone.grid, LevelGrids)
+        assert (backbone.quirks.bias, backbone.grid.levels.half_cell) == wanted
     points = torch.tensor([[3.0, 3, 3], [4.0, 4, 4], [3.5, 3.2, 3.9]]).repeat(10, 1) + spread(30) / 8
     origins = {
-        word: small_anchors(name, word, scene=small_scene(points)).levels.origin
+        word: small_anchors(name, word, scene=small_scene(points)).grid.levels.origin
         for word in ("fidelity=reference", "fidelity=sane", "levels.extend_rule=sane")
     }
     low, high = float(points.min()), float(points.max())
@@ -529,7 +531,7 @@ def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
         backbone.table["offsets"][7, 1, 0] = torch.inf
     before = backbone.table["anchors"].clone()
     kept = [row for row in range(len(before)) if row not in (3, 7)]
-    assert backbone.remove_nonfinite([], 1) == 2
+    assert remove_nonfinite(backbone, [], 1) == 2
     assert torch.equal(backbone.table["anchors"], before[kept])
     assert {len(column) for column in backbone.table.columns.values()} == {len(kept)}
 
@@ -538,8 +540,16 @@ def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
 
 RUN = ("iterations=14", "backbone.growth.every=400", "backbone.growth.gradient=1e-6", "training.checkpoint_every=50")
 MORE = {
-    "scaffold": ("backbone.heads.bank=true", "backbone.heads.appearance=4", "backbone.quirks.early_stop=no"),
-    "octree_scaffold": ("backbone.heads.level=true", "backbone.levels.mode=progressive", "backbone.filter=mip"),
+    "scaffold": (
+        "backbone.heads.bank=true",
+        "backbone.heads.appearance=4",
+        "backbone.quirks.early_stop=no",
+    ),
+    "octree_scaffold": (
+        "backbone.heads.level=true",
+        "backbone.levels.mode=progressive",
+        "backbone.filter=mip",
+    ),
     "octree_gs3d": ("backbone.levels.count=3",),
 }
 
@@ -573,7 +583,9 @@ def test_runs_grow_and_keep_everything(finished: tuple[str, Path]) -> None:
     assert sum(line.get("grown", 0) for line in lines) > 0, "the test needs growth"
     tensors = final_tensors(folder)
     wanted = {f"parameters.{n}" for n in PARAMETERS[name]} | {f"adam.{n}.exp_avg" for n in PARAMETERS[name]}
-    wanted |= {f"columns.{n}" for n in ("anchors", "visits", "opacity_sum", "gradient_sum", "gradient_count")}
+    wanted |= {"columns.anchors"} | {
+        f"statistics.{n}" for n in ("visits", "opacity_sum", "gradient_sum", "gradient_count")
+    }
     if name != "scaffold":
         wanted |= {"columns.level", "columns.bias"}
         assert tensors["columns.level"].dtype == torch.int16
@@ -591,7 +603,7 @@ def test_one_seed_gives_the_same_bits(finished: tuple[str, Path], tmp_path: Path
 
 
 def test_other_seeds_begin_with_other_networks() -> None:
-    first, other = (dict(small_anchors("scaffold", seed=seed).head_parameters()) for seed in (0, 1))
+    first, other = (dict(small_anchors("scaffold", seed=seed).table.networks.named()) for seed in (0, 1))
     assert not any(torch.equal(first[name], other[name]) for name in first)
 
 

@@ -23,7 +23,7 @@ from gsx.backbones.clone_split import (
     starting_points,
 )
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import DrawnGaussians, everything
+from gsx.backbones.gs3d_parts import everything, extents
 from gsx.backbones.levels import Levels, initial_nodes, kept
 from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians, free_options
 from gsx.builtin import plugins
@@ -33,8 +33,9 @@ from gsx.core.errors import ConfigError
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.gaussians.splat_files import splats_of, write_columns
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.density import within_room
+from gsx.core.training.parameter_table import size_of
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
@@ -85,7 +86,7 @@ def levels_of(backbone: GS3D) -> Levels:
     return visibility_of(backbone).levels
 
 
-def render(backbone: GS3D, camera: Camera, step: int) -> tuple[DrawnGaussians, Rendering]:
+def render(backbone: GS3D, camera: Camera, step: int) -> tuple[DrawnSplats, Rendering]:
     """A picture with its backward pass."""
     drawn = backbone.draw(camera, step)
     rendering = rasterize(drawn.splats, camera, backbone.raster, background=torch.zeros(3))
@@ -124,7 +125,7 @@ def test_gaussians_start_half_a_cell_beyond_the_nodes_with_the_largest_colours_o
 def test_they_are_backbones_that_tell_their_size() -> None:
     backbone = small_octree()
     assert isinstance(backbone, Backbone)
-    count, size = backbone.size()
+    count, size = size_of(backbone.table)
     assert count == len(backbone.table)
     assert size == count * (4 * (59 + 1) + 2)  # 59 floats of 3D-GS, a bias, and 16 bits of level
 
@@ -252,9 +253,9 @@ def due(*overrides: str, step: int = 1600, scene: Scene | None = None) -> GS3D:
         backbone.table["log_scales"][2:4] = math.log(0.02)
     render(backbone, seen_from(1.0), step)
     backbone.update(step)
-    backbone.statistics.gradient.zero_()
-    backbone.statistics.count.fill_(2)
-    backbone.statistics.gradient[:4] = torch.tensor([4.4e-4, 4.4e-4, 4.4e-4, 6.4e-4])
+    backbone.table.statistics["gradient"].zero_()
+    backbone.table.statistics["count"].fill_(2)
+    backbone.table.statistics["gradient"][:4] = torch.tensor([4.4e-4, 4.4e-4, 4.4e-4, 6.4e-4])
     return backbone
 
 
@@ -274,8 +275,8 @@ def test_an_event_by_hand() -> None:
     torch.testing.assert_close(after["bias"], torch.tensor([0.01 * (row == 3) for row in range(count + 4)]))
     assert after["level"][count:].tolist() == [0, 0, 1, 1]
     assert torch.equal(after["means"][count : count + 2], before["means"][:2])
-    assert len(backbone.statistics.gradient) == count + 4
-    assert not backbone.statistics.gradient.any()
+    assert len(backbone.table.statistics["gradient"]) == count + 4
+    assert not backbone.table.statistics["gradient"].any()
     for parameter in backbone.table.parameters.values():
         moment = backbone.table.optimiser.state[parameter]["exp_avg"]
         assert moment[:count].any()
@@ -341,7 +342,7 @@ def test_fidelity_reaches_every_switch_of_the_second_form() -> None:
 @pytest.mark.parametrize(("step", "pruned"), [(3000, 1), (3100, 3)])
 def test_faint_gaussians_go_at_once_and_huge_ones_after_step_3000(step: int, pruned: int) -> None:
     backbone = due(step=step)
-    backbone.statistics.gradient.zero_()
+    backbone.table.statistics["gradient"].zero_()
     with torch.no_grad():
         backbone.table["opacity_logits"][10] = -6.0
         backbone.table["log_scales"][11:13, 1] = math.log(0.11)
@@ -350,7 +351,7 @@ def test_faint_gaussians_go_at_once_and_huge_ones_after_step_3000(step: int, pru
 
 def test_opacities_are_never_reset() -> None:
     white = small_octree(scene=deep_scene(background=1.0))
-    assert not any(white.reset_due(step) for step in range(1, 40001))
+    assert not any(white.control.reset_due(step) for step in range(1, 40001))
     assert "opacity_reset" not in white.plan()
 
 
@@ -397,9 +398,9 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
     backbone.table["level"].copy_(torch.arange(len(backbone.table)) % 3)
     backbone.accumulate(backbone.observe(*render(backbone, seen_from(30.0), 1), 1))
     coarse = backbone.table["level"] == 0
-    assert backbone.statistics.count[coarse].sum() > 10
-    assert not backbone.statistics.count[~coarse].any()
-    assert not backbone.statistics.gradient[~coarse].any()
+    assert backbone.table.statistics["count"][coarse].sum() > 10
+    assert not backbone.table.statistics["count"][~coarse].any()
+    assert not backbone.table.statistics["gradient"][~coarse].any()
     grad = backbone.table["means"].grad
     assert grad is not None
     assert not grad[~coarse].any()
@@ -439,7 +440,7 @@ def test_the_volume_of_what_is_drawn_is_held_small() -> None:
 def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path) -> None:
     backbone = small_octree(*words)
     stir(backbone)
-    write_columns(tmp_path / "levels.ply", backbone.file(), backbone.export_notes())
+    write_columns(tmp_path / "levels.ply", backbone.file_columns(), backbone.file_notes())
     data = (tmp_path / "levels.ply").read_bytes()
     assert len(data) - data.index(b"end_header\n") - len(b"end_header\n") == 248 * len(backbone.table)
     columns = {name: torch.from_numpy(column) for name, column in read_ply(tmp_path / "levels.ply").items()}
@@ -449,8 +450,8 @@ def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path
     assert torch.equal(columns["level"], backbone.table["level"].float())
     assert torch.equal(columns["extra_level"], backbone.table["bias"])
     assert columns["info"].tolist() == [8.0] + [0.0] * (len(backbone.table) - 1)
-    assert "standard_dist 8.0" in backbone.export_notes()[1]
-    scales, log_opacities = backbone.extents(everything(backbone.table))
+    assert "standard_dist 8.0" in backbone.file_notes()[1]
+    scales, log_opacities = extents(backbone.table, everything(backbone.table), backbone.filter)
     torch.testing.assert_close(columns["scale_1"].exp(), scales[:, 1].detach())
     torch.testing.assert_close(columns["opacity"].sigmoid(), log_opacities.detach().exp())
 
@@ -517,8 +518,8 @@ def test_the_anchors_form_is_free_of_the_second_forms_demands() -> None:
 
 def test_the_filter_follows_the_gaussians_to_the_end() -> None:
     backbone = small_octree("filter=mip")
-    assert backbone.filter_due(39800)
-    assert not backbone.filter_due(39900)
+    assert backbone.filter.due(39800)
+    assert not backbone.filter.due(39900)
 
 
 RUN = (

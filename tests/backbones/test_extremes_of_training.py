@@ -14,6 +14,7 @@ from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.parameter_table import table_tensors
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import in_units, measured, warned_of_units
 
@@ -99,8 +100,8 @@ def test_training_stays_finite(name: str, scene: str) -> None:
     backbone = built(name, given)
     losses = trained(backbone, given)
     assert all(torch.isfinite(torch.tensor(losses)))
-    assert backbone.size()[0] >= 1
-    for tensor in backbone.tensors().values():
+    assert len(backbone.table) >= 1
+    for tensor in table_tensors(backbone.table).values():
         assert bool(torch.isfinite(tensor.float()).all())
 
 

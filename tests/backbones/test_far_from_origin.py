@@ -53,7 +53,11 @@ def pair(name: str) -> tuple[GS3D | Anchors, GS3D | Anchors, Camera]:
             parameter.copy_(near.table[key])
         far.table[place].copy_((near.table[place].double() + FAR).float())
     assert torch.equal(far.table[place].double() - FAR, near.table[place].double())
-    return near, far, near.cameras[1]
+    return near, far, cameras_of(near_scene())[1]
+
+
+def cameras_of(scene: Scene) -> list[Camera]:
+    return [view.camera for view in scene.train]
 
 
 def splats_of_both(name: str) -> tuple[Splats, Splats, GS3D | Anchors, Camera]:
@@ -99,11 +103,11 @@ def test_harmonics_and_their_gradients_are_those_of_float64() -> None:
 def test_networks_see_the_direction_of_float64() -> None:
     near, far, camera = pair("scaffold")
     assert isinstance(near, Anchors)
-    assert near.heads is not None
+    assert near.table.networks is not None
     anchors = far.table["anchors"].double() - FAR
     with torch.no_grad():
         shown = near.visible(camera, STEP).rows
-        heads = near.heads.double()
+        heads = near.table.networks.modules.double()
         truth = heads(near.table["features"].double()[shown], (anchors - camera.centre)[shown], anchors[shown, :1], -1)
         colours = far.draw(moved(camera), STEP).splats.colours
     chosen = truth[0].flatten() > 0
@@ -118,10 +122,10 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     means = near.table["means"].detach()
     means = (means * 16).round() / 16
     away = (means.double() + FAR).float()
-    far_cameras = [moved(camera) for camera in near.cameras]
-    views, far_views = viewpoints_of(near.cameras), viewpoints_of(far_cameras)
+    far_cameras = [moved(camera) for camera in cameras_of(near_scene())]
+    views, far_views = viewpoints_of(cameras_of(near_scene())), viewpoints_of(far_cameras)
     assert distance_range(away, far_views, 0.9) == pytest.approx(distance_range(means, views, 0.9), rel=1e-6)
-    camera, of = near.cameras[2], near.table["level"]
+    camera, of = cameras_of(near_scene())[2], near.table["level"]
     levels = replace(near.visibility.levels, mode="floor", half_cell=False, views=views)
     ideal = (levels.farthest / (means.double() - camera.centre).norm(dim=1)).log2()
     within = torch.arange(len(means)) % 2 == 0
@@ -133,7 +137,8 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     shares = [seen_fraction(replace(levels, views=v), p, of) for v, p in ((views, means), (far_views, away))]
     assert torch.equal(shares[1], shares[0])
     torch.testing.assert_close(
-        filter_sizes(away, far_cameras, near.options.mip), filter_sizes(means, near.cameras, near.options.mip)
+        filter_sizes(away, far_cameras, near.options.mip),
+        filter_sizes(means, cameras_of(near_scene()), near.options.mip),
     )
 
 

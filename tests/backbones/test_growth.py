@@ -27,7 +27,7 @@ from gsx.backbones.growth import (
 )
 from gsx.backbones.growth_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
-from gsx.core.training.density import ParameterTable
+from gsx.core.training.parameter_table import ParameterTable
 
 PUBLISHED = GrowthOptions(
     observe_from=500, start=1500, stop=15000, every=100, success=0.8, gradient=2e-4, prune_opacity=0.005,
@@ -56,12 +56,13 @@ def cloud(
     generator = torch.Generator().manual_seed(8)
     rows |= {name: torch.randn(rows[name].shape, generator=generator) for name in representation.pooled}
     rows["offsets"] = torch.tensor(offsets)
-    columns = fresh_statistics(count, k, "cpu") | {"anchors": torch.tensor(anchors)}
-    columns["gradient_count"] = torch.full((count, k), seen)
-    columns["gradient_sum"] = torch.tensor(gradients) * seen
+    columns, statistics = {"anchors": torch.tensor(anchors)}, fresh_statistics(count, k, "cpu")
+    statistics["gradient_count"] = torch.full((count, k), seen)
+    statistics["gradient_sum"] = torch.tensor(gradients) * seen
     if levels is not None:
         columns |= {"level": torch.tensor(levels, dtype=torch.int16), "bias": torch.zeros(count)}
-    return ParameterTable({name: Parameter(value) for name, value in rows.items()}, columns), representation
+    parameters = {name: Parameter(value) for name, value in rows.items()}
+    return ParameterTable(parameters, columns, statistics), representation
 
 
 @pytest.fixture
@@ -229,8 +230,8 @@ def random_cloud(seed: int, count: int = 30, k: int = 3, levels: int | None = No
     gradients = torch.empty(count, k).uniform_(0, 1.2e-3, generator=generator)
     of = torch.randint(0, levels, (count,), generator=generator).tolist() if levels else None
     table, neural = cloud(anchors.tolist(), offsets.tolist(), gradients.tolist(), levels=of)
-    table.columns["gradient_count"] = torch.randint(30, 60, (count, k), generator=generator).float()
-    table.columns["gradient_sum"] = gradients * table["gradient_count"]
+    table.statistics["gradient_count"] = torch.randint(30, 60, (count, k), generator=generator).float()
+    table.statistics["gradient_sum"] = gradients * table["gradient_count"]
     return table, neural
 
 
@@ -506,7 +507,7 @@ def by_level_loop(table: ParameterTable, levels: int, inherit: bool) -> list[tup
 @pytest.mark.parametrize("promoted", ["zeros", "max"])
 def test_growth_by_level_is_that_of_a_loop(seed: int, promoted: str) -> None:
     table, neural = random_cloud(seed, levels=3)
-    table.columns["gradient_sum"] = table["gradient_sum"] * 0.4  # most between the thresholds of the levels
+    table.statistics["gradient_sum"] = table["gradient_sum"] * 0.4  # most between the thresholds of the levels
     with torch.no_grad():
         wanted = by_level_loop(table, 3, promoted == "max")
     assert level_up(table, neural, promoted=promoted) == len(wanted) > 0
@@ -567,8 +568,8 @@ def test_statistics_are_sums_over_pictures() -> None:
 
 def test_offsets_are_judged_after_more_than_forty_sightings() -> None:
     table, _ = cloud([[0.0, 0, 0]], [[[0.0] * 3] * 4], [[0.0] * 4])
-    table.columns["gradient_count"] = torch.tensor([[0.0, 40.0, 41.0, 64.0]])
-    table.columns["gradient_sum"] = torch.tensor([[0.0, 40.0, 41.0, 32.0]])
+    table.statistics["gradient_count"] = torch.tensor([[0.0, 40.0, 41.0, 64.0]])
+    table.statistics["gradient_sum"] = torch.tensor([[0.0, 40.0, 41.0, 32.0]])
     enough, mean = eligible(table, 40.0)
     assert enough.tolist() == [[False, False, True, True]]
     assert mean.tolist() == [[0.0, 0.0, 1.0, 0.5]]
@@ -650,7 +651,7 @@ def test_adam_rows_follow_anchors() -> None:
     table.optimiser.step()
     before = {name: dict(table.optimiser.state[table[name]]) for name in table.parameters}
     new = deepen(table, neural)
-    table.columns["visits"][:10] = 100.0
+    table.statistics["visits"][:10] = 100.0
     assert prune(table, PUBLISHED, 80.0) == 10
     for name, old in before.items():
         state = table.optimiser.state[table[name]]

@@ -9,13 +9,14 @@ from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import DrawnGaussians, children
+from gsx.backbones.gs3d_parts import children
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, ScreenStatistics, rasterize
-from gsx.core.training.backbone import Backbone
-from gsx.core.training.density import Statistics
+from gsx.core.training.backbone import Backbone, DrawnSplats
+from gsx.core.training.density import mean_gradient
+from gsx.core.training.parameter_table import gradients, restored_table, size_of, table_tensors, zero_grad
 
 NAMES = ("means", "sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats")
 
@@ -45,7 +46,7 @@ def hand_made(
         table["log_scales"].copy_(torch.tensor(scales).log()[:, None] + torch.tensor([0.0, -0.5, -1.0]))
         table["opacity_logits"].copy_(torch.tensor([logit(o) for o in opacities or [0.5] * count]))
     seen = torch.full((count,), 2.0)
-    backbone.statistics = Statistics(2 * torch.tensor(gradients), seen)
+    table.statistics |= {"gradient": 2 * torch.tensor(gradients), "count": seen}
     return backbone
 
 
@@ -103,7 +104,7 @@ def test_no_points_is_an_error_that_names_the_scene() -> None:
 def test_it_is_a_backbone_of_59_floats_a_primitive() -> None:
     backbone = small_gs3d(small_scene(spread(7)))
     assert isinstance(backbone, Backbone)
-    assert backbone.size() == (7, 7 * 59 * 4)
+    assert size_of(backbone.table) == (7, 7 * 59 * 4)
 
 
 # -- rates, degrees, regulariser ---------------------------------------------------------------------------------------
@@ -120,7 +121,7 @@ def test_first_adam_step_moves_every_parameter_by_its_published_rate(step: int, 
     for name, rate in rates.items():
         moved = before[name] - backbone.table[name].detach()
         torch.testing.assert_close(moved, torch.full_like(moved, rate), rtol=2e-3, atol=1.2e-7, msg=name)
-    assert list(backbone.gradients()) == []
+    assert gradients(backbone.table) == {}
 
 
 def test_sh_degree_rises_every_thousand_steps() -> None:
@@ -171,7 +172,7 @@ def test_explicit_holds_raw_values_and_unit_quaternions() -> None:
 
 def seen_as(
     backbone: GS3D, ids: list[int], radii: list[int], gradients: list[list[float]]
-) -> tuple[DrawnGaussians, Rendering]:
+) -> tuple[DrawnSplats, Rendering]:
     """What is drawn, and a rendering on 24 x 16 px with screen gradients made by hand."""
     shift = torch.zeros(len(ids), 2, requires_grad=True)
     shift.grad = torch.tensor(gradients)
@@ -192,16 +193,16 @@ def test_statistics_are_the_mean_of_norms_over_views_that_saw_the_primitive() ->
     # half the raster is (12, 8) px: the norms are 60, 15 (unseen: radius 0) and then 20 with the opposite sign
     backbone.accumulate(backbone.observe(*seen_as(backbone, [0, 1], [4, 0], [[3.0, 6.0], [1.25, 0.0]]), 1))
     backbone.accumulate(backbone.observe(*seen_as(backbone, [0, 2], [4, 1], [[-1.0, -2.0], [0.0, 0.5]]), 2))
-    assert backbone.statistics.count.tolist() == [2, 0, 1]
+    assert backbone.table.statistics["count"].tolist() == [2, 0, 1]
     expected = torch.tensor([(math.hypot(36, 48) + math.hypot(12, 16)) / 2, 0.0, 4.0])
-    torch.testing.assert_close(backbone.statistics.mean_gradient(), expected)
+    torch.testing.assert_close(mean_gradient(backbone.table), expected)
 
 
 def test_statistics_end_with_density_control() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     backbone.accumulate(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 14999))
     backbone.accumulate(backbone.observe(*seen_as(backbone, [0], [4], [[1.0, 0.0]]), 15000))
-    assert backbone.statistics.count.tolist() == [1, 0, 0]
+    assert backbone.table.statistics["count"].tolist() == [1, 0, 0]
 
 
 # -- clone, split, prune -----------------------------------------------------------------------------------------------
@@ -241,8 +242,8 @@ def test_nothing_happens_between_events() -> None:
 def test_statistics_start_anew_after_an_event() -> None:
     backbone = hand_made([1.0, 0.0, 1.0], [0.001, 0.001, 0.05])
     backbone.densify_and_prune(600)
-    assert backbone.statistics.count.tolist() == [0] * 5
-    assert backbone.statistics.gradient.tolist() == [0.0] * 5
+    assert backbone.table.statistics["count"].tolist() == [0] * 5
+    assert backbone.table.statistics["gradient"].tolist() == [0.0] * 5
 
 
 def test_children_are_drawn_from_their_parent() -> None:
@@ -336,7 +337,7 @@ def test_reset_caps_opacities_and_forgets_their_moments_alone() -> None:
     backbone.update(1)
     faint = backbone.table["opacity_logits"].detach()[2:].clone()
     others = {name: backbone.table[name] for name in NAMES if name != "opacity_logits"}
-    backbone.reset_opacities()
+    backbone.control.reset_opacities(backbone.table, backbone.filter)
     logits = backbone.table["opacity_logits"].detach()
     torch.testing.assert_close(logits[:2], torch.full((2,), -4.5951199))  # logit(0.01)
     torch.testing.assert_close(logits[2:], faint)
@@ -354,7 +355,7 @@ def test_reset_leaves_invisible_primitives_finite() -> None:
     backbone = hand_made([0.0] * 3, [0.01] * 3)
     with torch.no_grad():
         backbone.table["opacity_logits"].copy_(torch.tensor([-200.0, 200.0, 0.0]))
-    backbone.reset_opacities()
+    backbone.control.reset_opacities(backbone.table, backbone.filter)
     expected = torch.tensor([-200.0, -4.5951199, -4.5951199])
     torch.testing.assert_close(backbone.table["opacity_logits"].detach(), expected)
 
@@ -371,7 +372,7 @@ def test_resets_come_when_due(background: float, step: int, resets: bool) -> Non
 
 def test_reset_comes_after_the_event_of_the_same_step() -> None:
     backbone = hand_made([0.0, 1.0, 0.0], [0.01, 0.001, 0.01], [0.9, 0.9, 0.0049])
-    backbone.options = published_options(reset_opacity=0.004)  # below what is pruned: the order shows
+    backbone.control.options = published_options(reset_opacity=0.004).density  # below what is pruned: the order shows
     assert backbone.densify_and_prune(3000) == {"cloned": 1, "split": 0, "pruned": 1, "opacity_resets": 1}
     torch.testing.assert_close(backbone.table["opacity_logits"].detach().sigmoid(), torch.full((3,), 0.004))
 
@@ -418,10 +419,10 @@ def test_a_reset_outside_an_event_costs_only_opacity_its_step() -> None:
 def test_discard_forgets_gradients_without_moving() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2)
     learn(backbone)
-    assert sorted(name for name, _ in backbone.gradients()) == sorted(NAMES)
+    assert sorted(name for name in gradients(backbone.table)) == sorted(NAMES)
     before = snapshot(backbone)
-    backbone.zero_grad()
-    assert list(backbone.gradients()) == []
+    zero_grad(backbone.table)
+    assert gradients(backbone.table) == {}
     assert all(torch.equal(backbone.table[name], before[name]) for name in NAMES)
 
 
@@ -446,15 +447,15 @@ def test_restored_backbone_goes_on_bit_for_bit() -> None:
     first = small_gs3d(small_scene(spread(30), views=2), iterations=300)  # events at 6, 8, ...; a reset at 30
     grown = [step_on(first, step) for step in range(1, 12)]
     assert any(done.get("split", 0) or done.get("cloned", 0) for done in grown)
-    saved = {name: value.clone() for name, value in first.tensors().items()}
+    saved = {name: value.clone() for name, value in table_tensors(first.table).items()}
     second = small_gs3d(small_scene(spread(3), views=2), iterations=300, seed=5)  # another cloud, another size
-    second.restore({name: value.clone() for name, value in saved.items()})
-    assert second.tensors().keys() == saved.keys()
-    assert all(torch.equal(value, saved[name]) for name, value in second.tensors().items())
-    second.generator.set_state(first.generator.get_state())
+    second.table = restored_table(second.table, {name: value.clone() for name, value in saved.items()})
+    assert table_tensors(second.table).keys() == saved.keys()
+    assert all(torch.equal(value, saved[name]) for name, value in table_tensors(second.table).items())
+    second.control.generator.set_state(first.control.generator.get_state())
     for step in (*range(12, 18), 30):
         assert step_on(first, step) == step_on(second, step)
-    left, right = first.tensors(), second.tensors()
+    left, right = table_tensors(first.table), table_tensors(second.table)
     assert left.keys() == right.keys()
     assert len(first.table) > 30
     assert all(torch.equal(left[name], right[name]) for name in left)
@@ -462,6 +463,6 @@ def test_restored_backbone_goes_on_bit_for_bit() -> None:
 
 def test_untrained_backbone_can_be_restored() -> None:
     first, second = small_gs3d(small_scene(spread(5))), small_gs3d(small_scene(spread(9)), seed=1)
-    second.restore(first.tensors())
+    second.table = restored_table(second.table, table_tensors(first.table))
     assert torch.equal(second.table["means"], first.table["means"])
     assert second.table.optimiser.state == {}

@@ -18,7 +18,9 @@ from gsx.core.errors import TrainingError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import RasterSettings, rasterize, touches
+from gsx.core.training.backbone import remove_nonfinite
 from gsx.core.training.guard import Guard
+from gsx.core.training.parameter_table import named_parameters, table_tensors
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import backward, train_step
 
@@ -68,17 +70,17 @@ def guarded() -> Iterator[Plugins]:
 
 def assert_removed(run: Run, plugins: Plugins, caplog: pytest.LogCaptureFixture, what: str) -> None:
     """One primitive goes, with a word, and the run goes on as if it had never been there."""
-    before = run.backbone.size()[0]
+    before = len(run.backbone.table)
     caplog.clear()
     with caplog.at_level(logging.WARNING, "gsx.core.training.trainer"):
         step = train_step(run, plugins)
     assert "removed 1 primitives" in step.skipped, what
     assert f"step {step.number}: removed 1 primitives with values that are not finite" in caplog.text, what
-    assert run.backbone.size()[0] == before - 1, what
+    assert len(run.backbone.table) == before - 1, what
     after = train_step(run, plugins)
     assert not after.skipped, what
     assert after.dropped == 0, what
-    for name, value in run.backbone.tensors().items():
+    for name, value in table_tensors(run.backbone.table).items():
         assert bool(torch.isfinite(value.float()).all()), f"{what}: {name}"
 
 
@@ -131,9 +133,9 @@ def test_anchors_are_not_blamed_for_their_networks(name: str, tmp_path: Path) ->
     run = run_of(name, tmp_path)
     backbone = backbone_of(run)
     assert isinstance(backbone, Anchors)
-    assert backbone.heads is not None
+    assert backbone.table.networks is not None
     with torch.no_grad():
-        backbone.heads.get_submodule("opacity.2").get_parameter("bias")[0] = torch.nan
+        backbone.table.networks.modules.get_submodule("opacity.2").get_parameter("bias")[0] = torch.nan
     count = len(backbone.table)
     with guarded() as plugins:
         for _ in range(2):
@@ -148,9 +150,9 @@ def test_where_nothing_is_removed_nothing_is_touched(name: str, tmp_path: Path) 
     """Parameters stay the same objects, with their gradients: a step goes on after a call in vain."""
     run = run_of(name, tmp_path)
     backward(run)
-    before = {key: (value, value.grad) for key, value in run.backbone.parameters()}
-    assert run.backbone.remove_nonfinite([view.camera for view in run.scene.train], 1) == 0
-    for key, value in run.backbone.parameters():
+    before = {key: (value, value.grad) for key, value in named_parameters(run.backbone.table)}
+    assert remove_nonfinite(run.backbone, [view.camera for view in run.scene.train], 1) == 0
+    for key, value in named_parameters(run.backbone.table):
         assert value is before[key][0]
         assert value.grad is before[key][1]
     assert any(gradient is not None and gradient.any() for _, gradient in before.values())
@@ -162,7 +164,7 @@ def test_a_model_that_is_lost_as_a_whole_is_left_as_it_is(name: str, tmp_path: P
     with torch.no_grad():
         backbone_of(run).table["log_scales"].fill_(torch.nan)
     count = len(backbone_of(run).table)
-    assert run.backbone.remove_nonfinite([run.scene.train[0].camera], 1) == 0
+    assert remove_nonfinite(run.backbone, [run.scene.train[0].camera], 1) == 0
     assert len(backbone_of(run).table) == count
 
 

@@ -16,8 +16,9 @@ from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from gsx.backbones import gs3d
+from gsx.backbones import mip
 from gsx.backbones.gs3d import GS3D
+from gsx.backbones.gs3d_parts import candidates
 from gsx.backbones.mip import MipOptions, filter_sizes, logit_of_log, smoothed
 from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
@@ -30,7 +31,8 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled
-from gsx.core.training.density import Statistics
+from gsx.core.training.density import mean_absolute, mean_gradient, zero_statistics
+from gsx.core.training.parameter_table import gradients, restored_table, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.build import build
@@ -84,7 +86,8 @@ def row_values(
         table["opacity_logits"].copy_((opacity / (1 - opacity)).log())
     seen = torch.full((count,), 2.0)
     sums = 2 * torch.tensor(list(gradients) or [0.0] * count)
-    backbone.statistics = Statistics(sums, seen, 2 * torch.tensor(absolute) if absolute else None)
+    table.statistics |= {"gradient": sums, "count": seen}
+    table.statistics |= {"absolute": 2 * torch.tensor(absolute)} if absolute else {}
     return backbone
 
 
@@ -260,7 +263,7 @@ def test_sizes_are_computed_when_published(monkeypatch: pytest.MonkeyPatch, back
         steps.append(step)
         return filter_sizes(*arguments)
 
-    monkeypatch.setattr(gs3d, "filter_sizes", counted)
+    monkeypatch.setattr(mip, "filter_sizes", counted)
     backbone = mip_gs3d(small_scene(spread(3), background=background))
     for step in range(1, 30001):
         backbone.densify_and_prune(step)
@@ -286,14 +289,14 @@ def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
 
 
 def drawn_opacities(backbone: GS3D) -> Tensor:
-    return backbone.draw(backbone.cameras[0], 1).splats.log_opacities.detach().exp()
+    return backbone.draw(backbone.filter.cameras[0], 1).splats.log_opacities.detach().exp()
 
 
 def test_a_reset_caps_what_is_drawn() -> None:
     backbone = row_values([2.0, 0.1, 3.0, 0.02], [0.9, 0.5, 0.002, 0.9])
     before, raw = drawn_opacities(backbone), backbone.table["opacity_logits"].detach().clone()
     assert [bool(opacity > 0.01) for opacity in before] == [True, False, False, False], "the test needs both kinds"
-    backbone.reset_opacities()
+    backbone.control.reset_opacities(backbone.table, backbone.filter)
     after = backbone.table["opacity_logits"].detach()
     assert torch.equal(after[1:], raw[1:])  # 0.5 and 0.9 raw: drawn fainter than 0.01
     assert drawn_opacities(backbone)[0].item() == pytest.approx(0.01, rel=1e-5)
@@ -311,7 +314,7 @@ def test_a_reset_never_raises_an_opacity(rows: list[tuple[float, float]], highes
         backbone.table["opacity_logits"].copy_(torch.tensor([logit for logit, _ in rows]))
         backbone.table["log_scales"].copy_(torch.tensor([scale for _, scale in rows])[:, None].expand(-1, 3))
     before = backbone.table["opacity_logits"].detach().clone()
-    backbone.reset_opacities()
+    backbone.control.reset_opacities(backbone.table, backbone.filter)
     after = backbone.table["opacity_logits"].detach()
     assert torch.isfinite(after).all()
     assert (after <= before).all()
@@ -329,7 +332,7 @@ def test_without_the_filter_a_reset_caps_raw_opacities() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     with torch.no_grad():
         backbone.table["opacity_logits"].copy_(torch.tensor([2.0, -4.5, -6.0]))
-    backbone.reset_opacities()
+    backbone.control.reset_opacities(backbone.table, backbone.filter)
     expected = torch.tensor([-4.5951199, -4.5951199, -6.0])
     torch.testing.assert_close(backbone.table["opacity_logits"].detach(), expected)
 
@@ -339,7 +342,7 @@ def test_size_and_opacity_tests_are_of_raw_values() -> None:
     backbone = row_values([0.0099, 0.0101, 0.01, 0.099, 0.11], [0.0051, 0.5, 0.0049, 0.5, 0.5], [1.0, 1.0, 0, 0, 0])
     assert float(backbone.table["filter"].min()) > 0.05
     assert float(drawn_opacities(backbone)[0]) < 0.005
-    assert float(backbone.draw(backbone.cameras[0], 1).splats.scales.detach()[3].max()) > 0.1
+    assert float(backbone.draw(backbone.filter.cameras[0], 1).splats.scales.detach()[3].max()) > 0.1
     assert backbone.densify_and_prune(3100) == {"cloned": 1, "split": 1, "pruned": 2}
     assert labels(backbone) == [0, 3, 0, 1, 1]
 
@@ -367,13 +370,15 @@ def test_as_many_again_are_chosen_by_absolute_gradients() -> None:
     # 2 of 5 by mean gradient; the 0.6 quantile of 1 2 3 5 9 lies at place 2.4: 3 + 0.4 * 2 = 3.8
     gradients, sums = [0.1, 0.0002, 0.0001, 0.0, 0.00019], [1.0, 2.0, 9.0, 3.0, 5.0]
     backbone = row_values([0.001] * 5, [0.5] * 5, gradients, sums)
-    chosen = backbone.candidates(backbone.statistics.mean_gradient())
+    chosen = candidates(backbone.table, mean_gradient(backbone.table), backbone.options.density)
     assert chosen.tolist() == [True, True, True, False, True]
     sums[4] = 3.79  # the quantile falls with it: 3 + 0.4 * 0.79
     backbone = row_values([0.001] * 5, [0.5] * 5, gradients, sums)
-    assert backbone.candidates(backbone.statistics.mean_gradient()).tolist() == [True, True, True, False, True]
-    backbone.options = mip_options(absolute=False)
-    assert backbone.candidates(backbone.statistics.mean_gradient()).tolist() == [True, True, False, False, False]
+    chosen = candidates(backbone.table, mean_gradient(backbone.table), backbone.options.density)
+    assert chosen.tolist() == [True, True, True, False, True]
+    options = mip_options(absolute=False)
+    chosen = candidates(backbone.table, mean_gradient(backbone.table), options.density)
+    assert chosen.tolist() == [True, True, False, False, False]
 
 
 def test_both_kinds_of_candidates_meet_the_same_size_test() -> None:
@@ -382,7 +387,7 @@ def test_both_kinds_of_candidates_meet_the_same_size_test() -> None:
     backbone = row_values(scales, [0.5] * 6, [0.0, 0.0, 0.0, 0.0, 1.0, 1.0], sums)
     assert backbone.densify_and_prune(600) == {"cloned": 2, "split": 2, "pruned": 0}
     assert labels(backbone) == [0, 1, 3, 5, 1, 5, 2, 4, 2, 4]
-    assert backbone.statistics.absolute.tolist() == [0.0] * 10
+    assert backbone.table.statistics["absolute"].tolist() == [0.0] * 10
 
 
 def test_without_any_gradient_nothing_is_chosen() -> None:
@@ -403,7 +408,7 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
         backbone.table["opacity_logits"].fill_(2.0)
         backbone.table["log_scales"].add_(1.0)
     truth = torch.zeros(12, dtype=torch.float64)
-    for number, camera in enumerate(backbone.cameras[:2]):
+    for number, camera in enumerate(backbone.filter.cameras[:2]):
         small = camera.resize(12, 8)
         weights = torch.randn(3, 8, 12, generator=torch.Generator().manual_seed(number))
         for pixel in range(96):
@@ -416,18 +421,20 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
         (picture.image * weights).sum().backward()
         backbone.accumulate(backbone.observe(drawn, picture, number + 1))
     assert backbone.absolute_gradient
-    assert backbone.statistics.count.tolist() == [2] * 12
-    torch.testing.assert_close(backbone.statistics.mean_absolute().double(), truth / 2, rtol=1e-4, atol=1e-6)
+    assert backbone.table.statistics["count"].tolist() == [2] * 12
+    torch.testing.assert_close(mean_absolute(backbone.table).double(), truth / 2, rtol=1e-4, atol=1e-6)
     assert float((truth / 2).min()) > 0
-    assert (backbone.statistics.mean_absolute() > 1.2 * backbone.statistics.mean_gradient()).all()
+    assert (mean_absolute(backbone.table) > 1.2 * mean_gradient(backbone.table)).all()
 
 
 def test_absolute_sums_are_saved_and_restored() -> None:
     first, second = (row_values([0.1] * 3, [0.5] * 3, [1.0] * 3, [3.0, 4, 5]) for _ in range(2))
-    second.statistics = Statistics.zeros(3, "cpu", absolute=True)
-    second.restore({name: value.clone() for name, value in first.tensors().items()})
-    assert second.statistics.mean_absolute().tolist() == [3.0, 4, 5]
-    assert second.tensors().keys() >= {"statistics.absolute", "columns.filter"}
+    zero_statistics(second.table)
+    second.table = restored_table(
+        second.table, {name: value.clone() for name, value in table_tensors(first.table).items()}
+    )
+    assert mean_absolute(second.table).tolist() == [3.0, 4, 5]
+    assert table_tensors(second.table).keys() >= {"statistics.absolute", "columns.filter"}
 
 
 # -- rules -------------------------------------------------------------------------------------------------------------
@@ -557,7 +564,7 @@ def test_training_stays_finite(name: str) -> None:
         assert picture.dropped == 0
         assert torch.isfinite(picture.image).all()
         photometric(picture.image, torch.full_like(picture.image, 0.5), 0.2).backward()
-        assert all(torch.isfinite(gradient).all() for _, gradient in backbone.gradients())
+        assert all(torch.isfinite(gradient).all() for gradient in gradients(backbone.table).values())
         backbone.accumulate(backbone.observe(drawn, picture, step))
         backbone.densify_and_prune(step)
         backbone.update(step)

@@ -7,6 +7,7 @@ import torch
 from small_scene import small_scene, spread
 from test_anchors import NAMES, NEURAL, small_anchors, stir
 
+from gsx.backbones.anchor_grids import LevelGrids
 from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
@@ -36,10 +37,10 @@ PUBLISHED = {
 def test_properties_and_bytes_are_the_published_ones(name: str, tmp_path: Path) -> None:
     backbone = small_anchors(name)
     stir(backbone)
-    if backbone.levels is not None:
+    if isinstance(backbone.grid, LevelGrids):
         backbone.table["bias"].uniform_(0, 0.5, generator=torch.Generator().manual_seed(0))
     path = tmp_path / "anchors.ply"
-    write_columns(path, backbone.file(), backbone.export_notes())
+    write_columns(path, backbone.file_columns(), backbone.file_notes())
     data = path.read_bytes()
     header, end = data.split(b"end_header\n")[0].decode(), data.index(b"end_header\n") + len(b"end_header\n")
     assert "format binary_little_endian 1.0" in header
@@ -55,7 +56,7 @@ def test_columns_hold_the_raw_values(name: str, tmp_path: Path) -> None:
     backbone = small_anchors(name)
     stir(backbone)
     path, table = tmp_path / "anchors.ply", backbone.table
-    write_columns(path, backbone.file())
+    write_columns(path, backbone.file_columns())
     columns, k = read_ply(path), backbone.representation.offsets
     for row in (0, 7, len(table) - 1):
         assert [columns[axis][row] for axis in "xyz"] == table["anchors"][row].tolist()
@@ -75,18 +76,18 @@ def test_columns_hold_the_raw_values(name: str, tmp_path: Path) -> None:
                 for band in range(15):
                     found = columns[f"f_rest_{channel * 15 + band}"][row]
                     assert found == table["sh_rest"][row, band, channel].item(), "channel-major"
-        if backbone.levels is not None:
+        if isinstance(backbone.grid, LevelGrids):
             assert columns["level"][row] == int(table["level"][row])
     if name == "octree_scaffold":
         v, farthest = columns["info"][:2]
-        assert (v, farthest) == (pytest.approx(backbone.levels.cell), pytest.approx(backbone.levels.farthest))
+        assert (v, farthest) == (pytest.approx(backbone.grid.levels.cell), pytest.approx(backbone.grid.levels.farthest))
         assert not columns["info"][2:].any()
 
 
 @pytest.mark.parametrize("name", ["octree_scaffold", "octree_gs3d"])
 def test_comments_hold_what_a_viewer_needs_to_choose_levels(name: str) -> None:
     backbone = small_anchors(name)
-    note, levels = backbone.export_notes()[-1], backbone.levels
+    note, levels = backbone.file_notes()[-1], backbone.grid.levels
     assert f"levels {levels.count}, fork 2, standard_dist {levels.farthest!r}" in note
     assert f"init_pos {levels.origin!r}, voxel_size {levels.cell!r}" in note
 
@@ -94,11 +95,11 @@ def test_comments_hold_what_a_viewer_needs_to_choose_levels(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_filter_sizes_follow_where_there_is_a_filter(name: str) -> None:
     backbone = small_anchors(name, "filter=mip")
-    columns = backbone.file()
+    columns = backbone.file_columns()
     assert list(columns)[-1] == "filter_3D"
     assert torch.equal(columns["filter_3D"], backbone.table["filter"])
-    assert "filter_3D" in backbone.export_notes()[0]
-    assert "filter_3D" not in small_anchors(name).file()
+    assert "filter_3D" in backbone.file_notes()[0]
+    assert "filter_3D" not in small_anchors(name).file_columns()
 
 
 @pytest.mark.parametrize("filtered", ["none", "mip"])

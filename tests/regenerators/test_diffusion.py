@@ -22,6 +22,7 @@ from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
@@ -769,7 +770,10 @@ def test_the_whole_run_end_to_end(whole: list[str], tmp_path: Path, monkeypatch:
     tiny_run(tmp_path / "halves", whole, stop_after=33)
     assert main(["resume", str(tmp_path / "halves")]) == 0
     resumed, _ = open_run(tmp_path / "halves", plugins())
-    assert all(torch.equal(value, resumed.backbone.tensors()[name]) for name, value in run.backbone.tensors().items())
+    assert all(
+        torch.equal(value, table_tensors(resumed.backbone.table)[name])
+        for name, value in table_tensors(run.backbone.table).items()
+    )
     one, other = (
         json.loads((tmp_path / name / "pseudo" / "index.json").read_text())["views"] for name in ("whole", "halves")
     )

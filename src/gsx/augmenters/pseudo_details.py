@@ -17,6 +17,7 @@ from gsx.augmenters.timing import event_at, events_of, progress, span_of, steppe
 from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
+from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Checked
 from gsx.core.training.regenerator_context import regenerator_context
@@ -87,8 +88,11 @@ class PseudoDetails:
 
     def plan(self) -> dict[str, Any]:
         """Events and windows in steps of this run."""
-        share = 0.0 if self.options.mode == "direct" else max(self.options.weights)
-        return {"events": self.events, "span": self.span, "share": share}
+        return {"events": self.events, "span": self.span, "share": self.share()}
+
+    def share(self) -> float:
+        """The largest part of the photographs' loss that its terms replace."""
+        return 0.0 if self.options.mode == "direct" else max(self.options.weights)
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
         """The pseudo views of the training view picked at this step, with their weights."""
@@ -113,7 +117,7 @@ class PseudoDetails:
         if not views:
             return None
         share = stepped(options.weights, place, options.weight_split)
-        direct = options.mode == "direct" or (options.mode == "auto" and not list(run.backbone.shared()))
+        direct = options.mode == "direct" or (options.mode == "auto" and not shared_colour(run.backbone.table))
         each = options.gain * (options.direct_weight if direct else share)
         scales, pictures = self.planned()
         count = pictures if options.reduce == "all" else scales

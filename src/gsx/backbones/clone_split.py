@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import pooled_max
+from gsx.backbones.density_control import DensityControl
 from gsx.backbones.growth_options import Quirks
-from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import DrawnGaussians, Shown
+from gsx.backbones.gs3d_parts import Shown
 from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, note_of, thresholds, warnings_of
 from gsx.backbones.sampling import sampled_means
 from gsx.core.data.camera import Camera
@@ -23,7 +23,9 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable, append_rows, detached_rows, withheld, within_room
+from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.density import mean_gradient, withheld, within_room
+from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 
 logger = logging.getLogger(__name__)
 
@@ -184,31 +186,30 @@ class CloneSplitAcrossLevels:
     def __init__(self, visibility: VisibleByLevel, options: LevelDensityOptions, quirks: Quirks) -> None:
         self.visibility, self.options, self.quirks = visibility, options, quirks
 
-    def densify(self, model: GS3D, step: int) -> dict[str, int]:
+    def densify(self, control: DensityControl, table: ParameterTable, step: int) -> dict[str, int]:
         """Parents stay; what too few cameras would draw is not made."""
-        levels, options, table = self.visibility.levels, self.options, model.table
-        gradient = model.statistics.mean_gradient()
+        levels, options, gradient = self.visibility.levels, self.options, mean_gradient(table)
         masks = densify_masks(
             gradient,
             table["log_scales"].detach().exp(),
             table["level"],
             levels,
             options,
-            threshold=model.options.density.gradient,
-            large=model.options.density.split_extent * model.extent,
+            threshold=control.options.gradient,
+            large=control.options.split_extent * control.extent,
             splitting=self.quirks.gate == "open" or levels.highest(step) == levels.count - 1,
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
         raw = detached_rows(table)
-        new = stacked([clones(raw, cloned), small_children(raw, split, levels, options.shrink, model.generator)])
+        new = stacked([clones(raw, cloned), small_children(raw, split, levels, options.shrink, control.generator)])
         seen = kept(levels, new["means"], new["level"])
-        keep = within_room(seen, gradient[torch.cat([cloned, split])], model.room())
+        keep = within_room(seen, gradient[torch.cat([cloned, split])], control.room(table))
         bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)
         append_rows(table, {name: value[keep] for name, value in new.items()})
         done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum())}
         return done | withheld(seen, keep)
 
-    def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
+    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """Mean volume of what was drawn, 0 for nothing."""
         if not self.options.volume_weight:
             return None

@@ -9,14 +9,13 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from gsx.backbones.heads import Heads
-from gsx.backbones.levels import Levels
-from gsx.backbones.mip import logit_of_log, smoothed
+from gsx.backbones.mip import Filter, logit_of_log
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Float, Int
-from gsx.core.training.density import ParameterTable
+from gsx.core.training.parameter_table import ParameterTable
 
 LARGEST_LOG_SCALE = 30.0
 """Lengths are held below e^30 world units, so that their squares stay finite in float32."""
@@ -63,7 +62,7 @@ class Representation(Protocol):
         """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
         ...
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
         """The Gaussians of the anchors drawn, differentiable."""
         ...
 
@@ -75,8 +74,11 @@ class Representation(Protocol):
         """The Gaussians decoded, as a standard splat file holds them."""
         ...
 
-    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
-        """What follows positions and levels in the published file of this representation (Octree-GS, save_ply)."""
+    def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
+        """What follows positions and levels in the published file of this representation (Octree-GS, save_ply).
+
+        `header`: columns of the grid, which files of networks have first.
+        """
         ...
 
 
@@ -125,7 +127,7 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (Scaffold-GS)."""
         rows, k = visible.rows, self.offsets
         anchors = table["anchors"][rows]
@@ -142,8 +144,7 @@ class Neural:
         size = lengths(take_rows(table["log_scales"], rows)).index_select(0, owner)
         shape = take_rows(shapes.reshape(-1, 7), chosen)
         scales, log_opacities = size[:, 3:] * shape[:, :3].sigmoid(), take_rows(opacities.view(-1), chosen).log()
-        if filters is not None:
-            scales, log_opacities = smoothed(scales, log_opacities, filters[owner])
+        scales, log_opacities = filter_.smoothed(scales, log_opacities, table, rows[owner])
         splats = Splats(
             means=anchors[owner] + take_rows(take_rows(table["offsets"], rows).view(-1, 3), chosen) * size[:, :3],
             scales=scales,
@@ -162,18 +163,14 @@ class Neural:
         colours = constant_from_colour(decoded.splats.colours)
         return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
 
-    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+    def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
         """79 floats a row with the position; what never learns has its initial value (Scaffold-GS, create_from_pcd)."""
-        zeros = torch.zeros_like(table["anchors"][:, 0])
-        if levels is None:
-            head = dict.fromkeys(("nx", "ny", "nz"), zeros)
-        else:
-            head = {"info": torch.cat([zeros.new_tensor([levels.cell, levels.farthest]), zeros])[: len(zeros)]}
+        inert = torch.full_like(table["anchors"][:, 0], INERT_LOGIT)
         return (
-            head
+            header
             | numbered("f_offset_", table["offsets"].transpose(1, 2).flatten(1))
             | numbered("f_anchor_feat_", table["features"])
-            | {"opacity": torch.full_like(zeros, INERT_LOGIT)}
+            | {"opacity": inert}
             | numbered("scale_", table["log_scales"])
             | numbered("rot_", self.quats(table))
         )
@@ -200,7 +197,7 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filters: Float[Tensor, "A"] | None) -> Decoded:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
         """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = visible.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
@@ -209,8 +206,7 @@ class Explicit:
         weights = visible.weights.clamp_min(LEAST)
         scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + weights.log()
         opacities = log_opacities.detach().exp()[:, None]
-        if filters is not None:
-            scales, log_opacities = smoothed(scales, log_opacities, filters)
+        scales, log_opacities = filter_.smoothed(scales, log_opacities, table, rows)
         offsets = offsets_from(means, visible.camera.centre)
         splats = Splats(
             means=means,
@@ -230,7 +226,7 @@ class Explicit:
         rows = decoded.slots
         return baked(decoded.splats, table["sh_constant"].detach()[rows, 0], table["sh_rest"].detach()[rows])
 
-    def columns(self, table: ParameterTable, levels: Levels | None) -> dict[str, Float[Tensor, "N"]]:
+    def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
         """67 floats a row with position and level at degree 3; f_rest is channel-major."""
         return (
             numbered("f_offset_", table["offsets"].flatten(1))

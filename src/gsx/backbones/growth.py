@@ -16,7 +16,8 @@ from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.growth_options import GrowthOptions, Quirks
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable, append_rows, keep_rows, mean_of, room_under, within_room
+from gsx.core.training.density import mean_of, room_under, within_room
+from gsx.core.training.parameter_table import ParameterTable, append_rows, keep_rows
 
 LARGEST_CELL = 2.0**53
 """Integers up to this are exact in float64."""
@@ -45,7 +46,7 @@ def observe(
 
     `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets. All
     but gradients, which carry it already, are counted by the picture's weight in the step's loss (see
-    `density.Statistics`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
+    `core.training.density`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
     """
     table["opacity_sum"][rows] += weight * opacities.sum(1)
     table["visits"][rows] += weight
@@ -142,7 +143,7 @@ def add_anchors(
     rows = representation.rows(log_lengths, torch.full_like(new.positions, 0.5))
     if new.inherit:
         rows |= {n: pooled_max(table[n].detach()[new.parents], new.group, count) for n in representation.pooled}
-    rows |= fresh_statistics(count, representation.offsets, like.device) | {"anchors": new.positions}
+    rows["anchors"] = new.positions
     rows |= {name: torch.zeros(count, device=like.device) for name in ("bias", "filter") if name in table.columns}
     if "level" in table.columns:
         rows["level"] = torch.full((count,), new.level, dtype=torch.int16, device=like.device)

@@ -6,16 +6,25 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
-from gsx.backbones.sampling import sampled_means
+from gsx.backbones.gs3d_options import Density
+from gsx.backbones.mip import Filter
+from gsx.backbones.sampling import quantile, sampled_means
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
-from gsx.core.gaussians.splats import Splats
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import ParameterTable, append_rows, detached_rows, keep_rows, withheld, within_room
+from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.density import mean_absolute, mean_gradient, withheld, within_room
+from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
 
 if TYPE_CHECKING:
-    from gsx.backbones.gs3d import GS3D
+    from gsx.backbones.density_control import DensityControl
+
+LARGEST_LOG_SCALE = 30.0
+"""Scales are held below e^30 world units, so that their squares stay finite in float32."""
+LEAST_WEIGHT = 1e-37
+"""A Gaussian that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
 
 
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
@@ -35,18 +44,18 @@ class Shown:
     """Factors of the opacities; None: 1."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DrawnGaussians:
-    """Splats of a camera, and the rows of the table that they come from."""
-
-    splats: Splats
-    rows: Int[Tensor, "M"] | None
-    """None: all of them."""
-
-
 def everything(table: ParameterTable) -> Shown:
     """All Gaussians."""
     return Shown(values={**table.parameters, **table.columns})
+
+
+def extents(table: ParameterTable, shown: Shown, filter_: Filter) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+    """Scales and log-opacities as they are drawn, after the 3D filter if there is one."""
+    scales = shown.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
+    log_opacities = logsigmoid(shown.values["opacity_logits"])
+    if shown.weights is not None:
+        log_opacities = log_opacities + shown.weights.clamp_min(LEAST_WEIGHT).log()
+    return filter_.smoothed(scales, log_opacities, table, shown.rows)
 
 
 @runtime_checkable
@@ -105,11 +114,11 @@ class Densification(Protocol):
     resets: bool
     """Whether opacities are reset while it runs."""
 
-    def densify(self, model: "GS3D", step: int) -> dict[str, int]:
+    def densify(self, control: "DensityControl", table: ParameterTable, step: int) -> dict[str, int]:
         """Clone and split; returns how many of each, and how many a cap has withheld."""
         ...
 
-    def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
+    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """A term of the loss of a view, or None."""
         ...
 
@@ -119,19 +128,37 @@ class CloneSplit:
 
     resets = True
 
-    def densify(self, model: "GS3D", step: int) -> dict[str, int]:
+    def densify(self, control: "DensityControl", table: ParameterTable, step: int) -> dict[str, int]:
         """Split parents go; each leaves two children (3D-GS, densify_and_clone and densify_and_split)."""
-        density, gradient = model.options.density, model.statistics.mean_gradient()
-        wanted = model.candidates(gradient)
-        chosen = within_room(wanted, gradient, model.room())  # each adds one
-        large = model.largest_scales() > density.split_extent * model.extent
+        options, gradient = control.options, mean_gradient(table)
+        wanted = candidates(table, gradient, options)
+        chosen = within_room(wanted, gradient, control.room(table))  # each adds one
+        large = largest_scales(table) > options.split_extent * control.extent
         cloned, split = chosen & ~large, chosen & large
-        clone_and_split(model.table, cloned, split, density.split_shrink, model.generator)
+        clone_and_split(table, cloned, split, options.split_shrink, control.generator)
         return {"cloned": int(cloned.sum()), "split": int(split.sum())} | withheld(wanted, chosen)
 
-    def regulariser(self, drawn: DrawnGaussians) -> Float[Tensor, ""] | None:
+    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """None."""
         return None
+
+
+def candidates(table: ParameterTable, gradient: Float[Tensor, "N"], options: Density) -> Bool[Tensor, "N"]:
+    """Primitives to clone or split: by mean gradient, and as many again by mean absolute gradient (Mip-Splatting).
+
+    Ours: never those without any gradient. Where none has one the published rule would choose all.
+    """
+    chosen = gradient >= options.gradient
+    if not options.absolute:
+        return chosen
+    absolute = mean_absolute(table)
+    quiet = 1 - int(chosen.sum()) / len(chosen)
+    return chosen | ((absolute >= quantile(absolute, quiet)) & (absolute > 0))
+
+
+def largest_scales(table: ParameterTable) -> Float[Tensor, "N"]:
+    """Largest standard deviation of each primitive, world units."""
+    return table["log_scales"].detach().amax(1).exp()
 
 
 def clone_and_split(

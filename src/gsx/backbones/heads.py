@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
-from gsx.core.training.density import ADAM_EPSILON
 
 LEAST_DISTANCE = 1e-8
 """World units; a camera exactly at an anchor has no direction to it (Scaffold-GS, generate_neural_gaussians)."""
@@ -127,9 +126,3 @@ class Heads(nn.Module):
         """The appearance code of a training view, or the one chosen for all other cameras."""
         number = view if view >= 0 else self.options.appearance_code
         return self.appearance.weight[number] if number >= 0 else self.appearance.weight.mean(0)
-
-
-def optimiser_of(heads: Heads) -> torch.optim.Adam:
-    """Adam for the networks, a group each."""
-    groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in heads.named_children()]
-    return torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)

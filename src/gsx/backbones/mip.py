@@ -6,6 +6,7 @@ The 3D filter widens each Gaussian by what the finest training camera can resolv
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -13,7 +14,9 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.schedule import Schedule
 
 FILTERS = ("none", "mip")
 LEAST_DEPTH = 1e-3
@@ -47,15 +50,106 @@ class MipOptions:
             )
 
 
+@runtime_checkable
+class Filter(Protocol):
+    """What is done to Gaussians so that they do not alias."""
+
+    def rules(self, raster: RasterSettings) -> RasterSettings:
+        """The rasterizer's rules with the 2D filter."""
+        ...
+
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
+        """Bring the column `filter`, if there is one, to where the primitives are now."""
+        ...
+
+    def due(self, step: int) -> bool:
+        """Whether to do so at a step without a density event."""
+        ...
+
+    def smoothed(
+        self,
+        scales: Float[Tensor, "M 3"],
+        log_opacities: Float[Tensor, "M"],
+        table: ParameterTable,
+        rows: Int[Tensor, "M"] | None,
+    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+        """Scales and log-opacities after the 3D filter; `rows` of the table, None: all."""
+        ...
+
+
+class NoFilter:
+    """Gaussians as they are."""
+
+    def rules(self, raster: RasterSettings) -> RasterSettings:
+        """Those given."""
+        return raster
+
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
+        """There is no column."""
+
+    def due(self, step: int) -> bool:
+        """Never."""
+        return False
+
+    def smoothed(
+        self,
+        scales: Float[Tensor, "M 3"],
+        log_opacities: Float[Tensor, "M"],
+        table: ParameterTable,
+        rows: Int[Tensor, "M"] | None,
+    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+        """Those given."""
+        return scales, log_opacities
+
+
+@dataclass(frozen=True, kw_only=True)
+class MipFilter:
+    """Both filters of Mip-Splatting; sizes of the 3D filter are a column of the table, world units."""
+
+    options: MipOptions
+    cameras: Sequence[Camera]
+    """Those of the training views."""
+    schedule: Schedule
+    settled: int
+    """Published step at which density control ends: from there on the filter has a clock of its own."""
+
+    def rules(self, raster: RasterSettings) -> RasterSettings:
+        """Dilation by the kernel, with compensated opacities."""
+        return replace(raster, dilation=self.options.kernel, compensate=True)
+
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
+        """Sizes from where the primitives are now (Mip-Splatting, compute_3D_filter)."""
+        table.columns["filter"] = filter_sizes(means.detach(), self.cameras, self.options)
+
+    def due(self, step: int) -> bool:
+        """Every interval between the end of density control and the freezing of the filter (Mip-Splatting)."""
+        options, schedule = self.options, self.schedule
+        inside = schedule.step(self.settled) < step < schedule.step(options.stop)
+        return inside and step % schedule.interval(options.every) == 0
+
+    def smoothed(
+        self,
+        scales: Float[Tensor, "M 3"],
+        log_opacities: Float[Tensor, "M"],
+        table: ParameterTable,
+        rows: Int[Tensor, "M"] | None,
+    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+        """By the column `filter`."""
+        sizes = table["filter"]
+        return smoothed(scales, log_opacities, sizes if rows is None else sizes[rows])
+
+
+def filter_named(name: str, options: MipOptions, cameras: Sequence[Camera], schedule: Schedule, settled: int) -> Filter:
+    """The filter of that name; see `MipFilter`."""
+    if name == "none":
+        return NoFilter()
+    return MipFilter(options=options, cameras=cameras, schedule=schedule, settled=settled)
+
+
 def checked_filter(name: str) -> None:
     """Raise ValueError for a name that is no filter."""
     if name not in FILTERS:
         raise ValueError(f"backbone.filter is '{name}'; choose {' or '.join(FILTERS)}")
-
-
-def filtered_rules(raster: RasterSettings, name: str, options: MipOptions) -> RasterSettings:
-    """The rasterizer's rules with the 2D filter; without one they stay as they are."""
-    return replace(raster, dilation=options.kernel, compensate=True) if name == "mip" else raster
 
 
 def seen_depths(

@@ -27,7 +27,7 @@ def verb_scenes(words: list[str]) -> int:
     given = parser.parse_args(words)
     from gsx.experiments.runs.inspect import describe
 
-    lines = describe(given.path)
+    lines = describe(given.path, plugins())
     sys.stdout.write("\n".join(lines) + "\n")
     return 2 if any(line.startswith("problem") for line in lines) else 0
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class Component:
     """Dataclass of its configuration: types and keys; a YAML file in conf/<kind>/ gives the values."""
     provider: str
     """Plugin it came from."""
+    scene_format: SceneFormat | None = None
+    """Of a scene loader: how it tells its folders, if it reads any."""
 
 
 @dataclass
@@ -50,8 +53,15 @@ class Registry:
     provider: str = "gsx"
     """Plugin that is registering at the moment."""
 
-    def add(self, kind: str, name: str, factory: Callable[..., Any], options: type) -> None:
-        """Register a component.
+    def add(
+        self,
+        kind: str,
+        name: str,
+        factory: Callable[..., Any],
+        options: type,
+        scene_format: SceneFormat | None = None,
+    ) -> None:
+        """Register a component; `scene_format`: see `Component`.
 
         Raises:
             ConfigError: the kind is unknown or the name is taken.
@@ -63,7 +73,12 @@ class Registry:
         if (kind, name) in self.components:
             taken = self.components[kind, name].provider
             raise ConfigError(f"{kind} '{name}' is already registered by {taken}; choose another name")
-        self.components[kind, name] = Component(kind, name, factory, options, self.provider)
+        self.components[kind, name] = Component(kind, name, factory, options, self.provider, scene_format)
+
+    def formats(self) -> list[tuple[Component, SceneFormat]]:
+        """Scene loaders that read folders, the latest first: plugins before what ships with gsx."""
+        scenes = [component for component in self.components.values() if component.kind == "scene"]
+        return [(scene, scene.scene_format) for scene in reversed(scenes) if scene.scene_format is not None]
 
     def names(self, kind: str) -> list[str]:
         """Names of a kind, sorted."""

@@ -1,6 +1,7 @@
 """NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (3D-GS)."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,14 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.images import PhotoSource, image_size
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.shapes import UInt8
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
+    frames_line,
     plain_name,
     pose_from_opengl,
     present_frames,
@@ -200,3 +203,16 @@ def _points(options: BlenderOptions, folder: Path) -> tuple[PointCloud, str]:
         return cloud, f"Starts from {len(cloud)} random points in [-{options.points_bound}, {options.points_bound}]^3."
     cloud = read_points(stored)
     return cloud, f"Starts from the {len(cloud)} points of {stored.name}."
+
+
+def facts(path: Path) -> Iterator[str]:
+    """Images of every split."""
+    return (frames_line(file) for file in sorted(path.glob("transforms_*.json")))
+
+
+FORMAT = SceneFormat(
+    meaning="NeRF-synthetic scene (transforms_train.json)",
+    sign="transforms_train.json",
+    recognise=lambda path: (path / "transforms_train.json").is_file(),
+    facts=facts,
+)

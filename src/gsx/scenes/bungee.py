@@ -21,6 +21,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import checked_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
@@ -272,3 +273,8 @@ def _scale_note(views: Sequence[View], basis: str) -> str:
     counts = sorted(Counter(view.group for view in views).items())
     listed = ", ".join(f"{group}: {count}" for group, count in counts)
     return f"Views of each scale, 1 closest (by {basis}): {listed}."
+
+
+FORMAT = SceneFormat(
+    meaning=f"BungeeNeRF city ({POSES_FILE})", sign=POSES_FILE, recognise=lambda path: (path / POSES_FILE).is_file()
+)

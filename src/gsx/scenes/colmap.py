@@ -1,6 +1,7 @@
 """Scenes from a COLMAP model and its photos (3D-GS, dataset_readers.py and getNerfppNorm and camera_utils.py)."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,13 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View, extent_of
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
-from gsx.scenes.colmap_model import Model, ModelImage, find_model, read_model
+from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.posed import (
+    IMAGES,
     MIN_IMAGES,
     Shot,
     lens_notes,
@@ -175,3 +178,42 @@ def _provenance(model: Model, shots: Sequence[Shot], options: ColmapOptions) -> 
         camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
         undistortion=METHOD if bent else None,
     )
+
+
+def facts(path: Path) -> Iterator[str]:
+    """The model, its cameras, and the images that are there."""
+    folder = find_model(path)[0]
+    model = read_model(folder)
+    yield f"model     {folder}: {len(model.images)} images, mean reprojection error {model.mean_error:.2f} px"
+    cameras = [model.cameras[image.camera_id] for image in model.images]
+    kinds = Counter((camera.model_name, camera.width, camera.height) for camera in cameras)
+    for (name, width, height), count in sorted(kinds.items()):
+        yield f"camera    {name} {width}x{height}, {count} images"
+    images = image_folder(path, model)
+    present = {image.name for image in model.images if (path / images / image.name).is_file()}
+    absent = sorted({image.name for image in model.images} - present)
+    missing = f", absent: {named(absent)}" if absent else ""
+    yield f"images    {len(present)} of {len(model.images)} in {images}{missing}"
+
+
+def overrides(path: Path) -> dict[str, str]:
+    """The folder of the images, where that is another than usual."""
+    images = image_folder(path, read_model(find_model(path)[0]))
+    return {} if images == IMAGES else {"images": images}
+
+
+def image_folder(path: Path, model: Model) -> str:
+    """The folder below `path` with most of the model's images; `images` unless another has more."""
+    others = sorted(folder.name for folder in path.iterdir() if folder.is_dir() and folder.name != IMAGES)
+    return max(
+        (IMAGES, *others, "."), key=lambda folder: sum((path / folder / image.name).is_file() for image in model.images)
+    )
+
+
+FORMAT = SceneFormat(
+    meaning="COLMAP model with photos",
+    sign="COLMAP model (sparse/)",
+    recognise=lambda path: path.is_dir() and bool(model_folders(path)),
+    facts=facts,
+    overrides=overrides,
+)

@@ -3,7 +3,8 @@
 import logging
 import os
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -12,11 +13,12 @@ from typing import Any
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.core.data.images import image_size
 from gsx.core.data.scene import Scene
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
 from gsx.scenes.options import SceneOptions
-from gsx.scenes.posed import named
+from gsx.scenes.posed import IMAGES, named
 
 logger = logging.getLogger(__name__)
 
@@ -172,3 +174,26 @@ def _refuse_nothing(best: Any, folder: Path, sizes: sfm.Sizes) -> None:
 def _colmap_options(options: PhotosOptions, folder: Path) -> colmap.ColmapOptions:
     common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
     return colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)
+
+
+def recognise(path: Path) -> bool:
+    """Whether there are photographs in it, or in its folder `images`."""
+    return path.is_dir() and bool(photos_in(path, "*") or photos_in(path / IMAGES, "**/*"))
+
+
+def facts(path: Path) -> Iterator[str]:
+    """Sizes of the photographs, and what is odd about them."""
+    folder, names = find_photos(path)
+    sizes, notes = readable_sizes(folder, names)
+    for (width, height), count in sorted(Counter(sizes.values()).items()):
+        yield f"images    {count} of {width}x{height} in {folder}"
+    yield from (f"note      {note}" for note in notes)
+
+
+FORMAT = SceneFormat(
+    meaning="photos without poses, which are reconstructed first",
+    sign=f"photos ({', '.join(PHOTO_SUFFIXES)})",
+    recognise=recognise,
+    facts=facts,
+    quick=False,
+)

@@ -19,6 +19,8 @@ from gsx.core.shapes import Float
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
 
+IMAGES = "images"
+"""Folder of the photos, unless a scene says otherwise."""
 MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
@@ -227,3 +229,12 @@ def named(names: Sequence[str]) -> str:
     """The first few names, and how many more there are."""
     more = len(names) - NAMED_AT_MOST
     return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
+
+
+def frames_line(file: Path) -> str:
+    """How many images of a transforms file are there, for `gsx scenes`."""
+    names = [frame["file_path"] for frame in read_frames(file)[1]]
+    absent = [name for name in names if find_photo(file.parent, name) is None]
+    return f"images    {len(names) - len(absent)} of {len(names)} of {file.name}" + (
+        f", absent: {named(absent)}" if absent else ""
+    )

@@ -16,11 +16,13 @@ import torch
 from gsx.core.data.images import image_size
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
+    frames_line,
     lens_notes,
     plain_name,
     pose_from_opengl,
@@ -239,3 +241,11 @@ def _points(
 def _mask_note(frames: Sequence[Mapping[str, Any]]) -> list[str]:
     masked = sum("mask_path" in frame for frame in frames)
     return [f"The masks of {masked} images are not used."] if masked else []
+
+
+FORMAT = SceneFormat(
+    meaning="poses in one transforms.json (nerfstudio, instant-ngp)",
+    sign=FILE,
+    recognise=lambda path: (path / FILE).is_file() or (path.suffix == ".json" and path.is_file()),
+    facts=lambda path: [frames_line(path if path.is_file() else path / FILE)],
+)

@@ -13,13 +13,13 @@ from small_scene import small_gs3d, small_scene, spread
 from torch import Tensor
 
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 
 SIZE = (24, 16)
@@ -52,7 +52,7 @@ class Painted(GS3D):
 
     names: Sequence[str] = tuple(LEVELS)
 
-    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
+    def draw(self, camera: Camera, step: int) -> DrawnSplats:
         name = self.names[round(float(camera.centre[0]) / 0.1)]
         ahead = camera.rotation[2] * torch.tensor([[2.0], [-2.0]])
         splats = Splats(
@@ -62,7 +62,7 @@ class Painted(GS3D):
             log_opacities=torch.full((2,), math.log(0.5)),
             colours=torch.full((2, 3), 2 * LEVELS[name][camera.width // SIZE[0]] / 255),
         )
-        return DrawnGaussians(splats=splats, rows=None)
+        return DrawnSplats(splats=splats, rows=None)
 
 
 def run_of(folder: Path) -> Run:

@@ -8,14 +8,16 @@ import pytest
 import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.errors import TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
+from gsx.core.training.parameter_table import gradients, table_tensors
 from gsx.core.training.run import Run, Sampler, Step, TrainingOptions
 from gsx.core.training.trainer import train, train_step
 
@@ -26,11 +28,11 @@ class Poisoned(GS3D):
     poison: dict[int, str] = {}  # noqa: RUF012
     now = 0
 
-    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
+    def draw(self, camera: Camera, step: int) -> DrawnSplats:
         self.now = step
         return super().draw(camera, step)
 
-    def regulariser(self, drawn: DrawnGaussians) -> Tensor | None:
+    def regulariser(self, drawn: DrawnSplats) -> Tensor | None:
         kind = self.poison.get(self.now)
         if kind is None:
             return None
@@ -80,7 +82,7 @@ def train_guarded(run: Run) -> tuple[Diary, Plugins]:
 
 
 def state(run: Run) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in run.backbone.tensors().items()}
+    return {name: value.clone() for name, value in table_tensors(run.backbone.table).items()}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +108,7 @@ def test_a_poisoned_step_changes_nothing_and_names_the_culprit(
         after = state(run)
         assert after.keys() == before.keys()
         assert all(torch.equal(after[name], before[name]) for name in before)
-        assert list(run.backbone.gradients()) == []
+        assert gradients(run.backbone.table) == {}
         assert train_step(run, plugins).skipped == ""
         assert not torch.equal(state(run)["parameters.means"], before["parameters.means"])
         assert all(torch.isfinite(value).all() for value in state(run).values())
@@ -137,7 +139,8 @@ def test_finite_gradients_of_any_shape_pass_and_others_are_counted_by_row(tmp_pa
     run = run_with({}, tmp_path)
     step = train_step(run, load_plugins([], points=[]))
     odd = torch.ones(3, 4, 2).transpose(0, 1)  # rows that do not lie one after the other in memory
-    run.backbone.gradients = lambda: [("weights", odd)]
+    weights = Parameter(torch.zeros(4, 3, 2))
+    run.backbone.table.parameters["weights"], weights.grad = weights, odd
     assert Guard().gsx_gradients_ready(run, step) is None
     odd[1, 2, 0] = odd[3, 0, 1] = odd[3, 1, 0] = torch.nan
     reason = Guard().gsx_gradients_ready(run, step)
@@ -156,5 +159,5 @@ def test_primitives_that_are_not_finite_are_removed_and_the_run_goes_on(
     assert skipped.skipped == "removed 1 primitives"
     assert not after.skipped
     assert after.rendering.dropped == 0
-    assert len(run.backbone.table) == len(run.backbone.statistics.count) == before - 1
+    assert len(run.backbone.table) == len(run.backbone.table.statistics["count"]) == before - 1
     assert "removed 1 primitives with values that are not finite" in caplog.text

@@ -18,6 +18,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.halves import held_out_renders
+from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.execute import execute
@@ -93,7 +94,7 @@ def test_views_are_rendered_by_a_model_that_never_saw_them(tmp_path: Path) -> No
 
 
 def state_of(run: Run) -> list[Tensor]:
-    values = [value.clone() for value in run.backbone.tensors().values()]
+    values = [value.clone() for value in table_tensors(run.backbone.table).values()]
     return [*values, run.generator.get_state(), torch.random.get_rng_state(), torch.tensor(run.sampler.order)]
 
 
@@ -159,5 +160,5 @@ def test_a_run_killed_after_its_event_makes_the_same_of_it_again(kept: bool, tmp
     assert run.step == 10
     execute(run, settings, plugins())
     assert run.complete
-    again = run.backbone.tensors()
-    assert all(torch.equal(value, again[name]) for name, value in whole.backbone.tensors().items())
+    again = table_tensors(run.backbone.table)
+    assert all(torch.equal(value, again[name]) for name, value in table_tensors(whole.backbone.table).items())

@@ -17,6 +17,14 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
+from gsx.core.training.density import mean_gradient
+from gsx.core.training.parameter_table import (
+    gradients,
+    named_parameters,
+    restored_table,
+    table_tensors,
+    zero_grad,
+)
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import backward, train_step
@@ -45,10 +53,10 @@ def alone(run: Run, view: int, background: Tensor | None = None) -> tuple[Tensor
     return loss.detach(), rendering
 
 
-def gradients(run: Run) -> dict[str, Tensor]:
+def cleared_gradients(run: Run) -> dict[str, Tensor]:
     """Copies of the gradients there are, which are cleared."""
-    found = {name: gradient.clone() for name, gradient in run.backbone.gradients()}
-    run.backbone.zero_grad()
+    found = {name: gradient.clone() for name, gradient in gradients(run.backbone.table).items()}
+    zero_grad(run.backbone.table)
     return found
 
 
@@ -69,10 +77,10 @@ def test_gradients_are_the_mean_of_those_of_single_views(backbone: str, tmp_path
         single = []
         for view in (4, 1)[:batch]:
             loss, _ = alone(run, view)
-            single.append((loss, gradients(run)))
+            single.append((loss, cleared_gradients(run)))
         step = backward(run)
         wanted = {name: sum(found[name] for _, found in single) / batch for name in single[0][1]}
-        assert_same(gradients(run), wanted)  # type: ignore[arg-type]
+        assert_same(cleared_gradients(run), wanted)  # type: ignore[arg-type]
         assert float(step.loss) == pytest.approx(sum(float(loss) for loss, _ in single) / batch, rel=1e-6)
         assert step.view is run.scene.train[4]
         assert [other.view for other in step.others] == [run.scene.train[1]][: batch - 1]
@@ -92,10 +100,10 @@ def test_every_view_has_its_own_background_drawn_in_order(tmp_path: Path) -> Non
     sums: dict[str, Tensor] = {}
     for view in (4, 1, 5):
         alone(run, view, torch.rand(3, generator=ahead))
-        found = gradients(run)
+        found = cleared_gradients(run)
         sums = {name: sums[name] + value if sums else value for name, value in found.items()}
     backward(run)
-    assert_same(gradients(run), {name: value / 3 for name, value in sums.items()})
+    assert_same(cleared_gradients(run), {name: value / 3 for name, value in sums.items()})
     assert torch.equal(run.generator.get_state(), ahead.get_state())
 
 
@@ -124,19 +132,19 @@ class Still:
 def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Path) -> None:
     """The second view's pseudo view leaves the colour network what it has gathered from the first."""
     run = fresh(tmp_path / "run", "backbone=octree_scaffold", "training.batch=2")
-    colour = {name for name, _ in run.backbone.parameters() if name.startswith("heads.colour")}
-    first, one = alone(run, 4)[0], gradients(run)
-    second, two = alone(run, 1)[0], gradients(run)
+    colour = {name for name, _ in named_parameters(run.backbone.table) if name.startswith("heads.colour")}
+    first, one = alone(run, 4)[0], cleared_gradients(run)
+    second, two = alone(run, 1)[0], cleared_gradients(run)
     augmenter = Still((1,))
     pseudo = augmenter.view_of(run, 1)
     splats = run.backbone.draw(pseudo.camera, 1).splats
     image = rasterize(splats, pseudo.camera, run.raster, background=run.background).image
     value = 0.5 * pseudo_loss(image, pseudo)
     value.backward()
-    added = gradients(run)
+    added = cleared_gradients(run)
     run.augmenters = [augmenter]
     step = backward(run)
-    found = gradients(run)
+    found = cleared_gradients(run)
     assert colour
     for name, value_found in found.items():
         wanted = (one[name] + 0.9 * two[name] + (0 if name in colour else added[name])) / 2
@@ -153,7 +161,7 @@ def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Pa
 
 def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) -> None:
     run = fresh(tmp_path / "run", "training.batch=2", "backbone.density.gradient=1e9")
-    count = run.backbone.size()[0]
+    count = len(run.backbone.table)
     sums, seen = torch.zeros(count), torch.zeros(count)
     for view in (4, 1):
         screen = alone(run, view)[1].screen
@@ -161,11 +169,11 @@ def test_statistics_are_those_of_single_views_and_not_diluted(tmp_path: Path) ->
         norms = (screen.means2d_offset.grad * torch.tensor([48, 36]) / 2).norm(dim=1)
         sums[screen.ids[screen.radii > 0]] += norms[screen.radii > 0]
         seen[screen.ids[screen.radii > 0]] += 1
-        gradients(run)
+        cleared_gradients(run)
     train_step(run, plugins())
-    statistics = run.backbone.statistics  # type: ignore[attr-defined]
-    assert torch.equal(statistics.count, seen / 2)
-    torch.testing.assert_close(statistics.mean_gradient(), sums / seen.clamp_min(1), rtol=1e-6, atol=0)
+    statistics = run.backbone.table.statistics
+    assert torch.equal(statistics["count"], seen / 2)
+    torch.testing.assert_close(mean_gradient(run.backbone.table), sums / seen.clamp_min(1), rtol=1e-6, atol=0)
     assert float(sums.max()) > 0
 
 
@@ -176,20 +184,21 @@ class Judge:
         absolute = ("backbone.density.absolute=true",) if backbone == "mip_splatting" else ()
         self.run = fresh(folder, f"backbone={backbone}", *absolute)
         self.run.step = 8
-        self.start = {name: value.clone() for name, value in self.run.backbone.tensors().items()}
+        self.start = {name: value.clone() for name, value in table_tensors(self.run.backbone.table).items()}
 
     def learnt(self, *augmenters: Any, batch: int = 1, steps: int = 1, ssim_weight: float = 0.2) -> dict[str, Tensor]:
         """Statistics after so many steps over views 4, 1, 5, 0 that move nothing."""
         run = self.run
-        run.backbone.restore({name: value.clone() for name, value in self.start.items()})
+        run.backbone.table = restored_table(
+            run.backbone.table, {name: value.clone() for name, value in self.start.items()}
+        )
         run.training = replace(run.training, batch=batch, ssim_weight=ssim_weight)
         run.sampler.order, run.sampler.batch, run.augmenters = [0, 5, 1, 4], batch, augmenters
         for _ in range(steps):
             for seen in backward(run).seen:
                 run.backbone.accumulate(seen)
-            run.backbone.zero_grad()
-        names = ("statistics", "columns.visits", "columns.opacity_sum", "columns.gradient")
-        return {name: value.clone() for name, value in run.backbone.tensors().items() if name.startswith(names)}
+            zero_grad(run.backbone.table)
+        return {name: value.clone() for name, value in run.backbone.table.statistics.items()}
 
 
 @pytest.fixture(scope="module", params=["gs3d", "mip_splatting", "scaffold", "octree_gs3d"])
@@ -206,7 +215,7 @@ def test_a_batch_counts_as_one_step_and_judges_as_its_views_one_by_one(judge: Ju
         for name, value in wanted.items():
             assert value.any(), name
             torch.testing.assert_close(found[name], value / views, rtol=2e-6, atol=0, msg=f"{views} {name}")
-        steps = found["columns.visits"] if "columns.visits" in found else found["statistics.count"]
+        steps = found["visits"] if "visits" in found else found["count"]
         assert float(steps.max()) == 1.0
 
 
@@ -257,11 +266,11 @@ def test_a_primitive_that_any_view_left_out_is_healed_and_the_step_skipped(tmp_p
     run = fresh(tmp_path / "run", "training.batch=2")
     with torch.no_grad():
         run.backbone.table["log_scales"][1] = torch.nan  # type: ignore[attr-defined]
-    count = run.backbone.size()[0]
+    count = len(run.backbone.table)
     step = train_step(run, plugins())
     assert step.skipped == "removed 1 primitives"
-    assert run.backbone.size()[0] == count - 1
-    assert not run.backbone.statistics.count.any()  # type: ignore[attr-defined]
+    assert len(run.backbone.table) == count - 1
+    assert not run.backbone.table.statistics["count"].any()  # type: ignore[attr-defined]
     assert not train_step(run, plugins()).skipped
 
 
@@ -306,7 +315,7 @@ def test_pseudo_views_are_made_for_all_views_of_a_window(tmp_path: Path) -> None
     assert isinstance(augmenter, PseudoDetails)
     assert sorted(augmenter.views) == [1, 2, 4, 5]
     assert step.terms["upscale"] > 0
-    run.backbone.zero_grad()
+    zero_grad(run.backbone.table)
     run.step = 45
     backward(run)
     assert run.sampler.order == [0]

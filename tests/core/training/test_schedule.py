@@ -69,17 +69,17 @@ def steps_when(due: object, iterations: int) -> list[int]:
 
 def test_published_cadence_at_full_length() -> None:
     backbone = small_gs3d(small_scene(spread(4), views=200), iterations=30000)
-    events = steps_when(backbone.density_due, 30000)
+    events = steps_when(backbone.control.due, 30000)
     assert (events[0], events[-1], len(events)) == (600, 14900, 144)
     assert events == list(range(600, 15000, 100))
-    assert steps_when(backbone.reset_due, 30000) == [3000, 6000, 9000, 12000]
+    assert steps_when(backbone.control.reset_due, 30000) == [3000, 6000, 9000, 12000]
 
 
 def test_white_backgrounds_reset_once_more_at_500() -> None:
     white = small_gs3d(small_scene(spread(4), background=1.0), iterations=30000)
-    assert steps_when(white.reset_due, 30000) == [500, 3000, 6000, 9000, 12000]
+    assert steps_when(white.control.reset_due, 30000) == [500, 3000, 6000, 9000, 12000]
     grey = small_gs3d(small_scene(spread(4), background=0.99), iterations=30000)
-    assert steps_when(grey.reset_due, 1000) == []
+    assert steps_when(grey.control.reset_due, 1000) == []
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_white_backgrounds_reset_once_more_at_500() -> None:
 )
 def test_cadence_of_a_tenth_of_the_run(views: int, events: range, resets: list[int]) -> None:
     backbone = small_gs3d(small_scene(spread(4), views=views), iterations=3000)
-    assert steps_when(backbone.density_due, 3000) == list(events)
-    assert steps_when(backbone.reset_due, 3000) == resets
+    assert steps_when(backbone.control.due, 3000) == list(events)
+    assert steps_when(backbone.control.reset_due, 3000) == resets
 
 
 def test_plan_names_the_steps_taken() -> None:

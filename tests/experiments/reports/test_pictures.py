@@ -3,7 +3,6 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.backbones.gs3d_parts import DrawnGaussians
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import image_size, read_image
 from gsx.core.data.resize import linear_from_display
@@ -25,6 +23,8 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer import RasterSettings, Rendering, TiledRendering
+from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.reports import pictures
@@ -45,7 +45,7 @@ WIDTH, HEIGHT = 80, 64
 class FourSplats:
     """A backbone that hands out four fixed splats."""
 
-    def draw(self, camera: Camera, step: int) -> DrawnGaussians:
+    def draw(self, camera: Camera, step: int) -> DrawnSplats:
         splats = Splats(
             means=torch.tensor([[-0.5, 0, 0], [0.4, 0.2, 0.1], [0, -0.4, 0.3], [0.2, 0.5, -0.2]]),
             scales=torch.tensor([[0.2, 0.1, 0.1], [0.05, 0.3, 0.1], [0.15, 0.15, 0.15], [0.1, 0.02, 0.1]]),
@@ -53,14 +53,15 @@ class FourSplats:
             log_opacities=torch.tensor([0.9, 0.8, 0.7, 0.95]).log(),
             colours=torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.3, 0.9], [1, 1, 0.2]]),
         )
-        return DrawnGaussians(splats=splats, rows=None)
+        return DrawnSplats(splats=splats, rows=None)
 
-    def size(self) -> tuple[int, int]:
-        return 4, 4 * 14 * 4
+    table = ParameterTable({"means": Parameter(torch.zeros(4, 3))})
+    raster = RasterSettings()
+    absolute_gradient = False
 
-    def regulariser(self, drawn: DrawnGaussians) -> None: ...
+    def regulariser(self, drawn: DrawnSplats) -> None: ...
 
-    def observe(self, drawn: DrawnGaussians, rendering: Rendering, step: int, weight: float = 1.0) -> dict[str, Tensor]:
+    def observe(self, drawn: DrawnSplats, rendering: Rendering, step: int, weight: float = 1.0) -> dict[str, Tensor]:
         return {}
 
     def accumulate(self, seen: dict[str, Tensor]) -> None: ...
@@ -70,40 +71,8 @@ class FourSplats:
 
     def update(self, step: int) -> None: ...
 
-    def parameters(self) -> Iterator[tuple[str, Parameter]]:
-        return iter(())
-
-    def gradients(self) -> Iterator[tuple[str, Tensor]]:
-        return iter(())
-
-    def shared(self) -> Iterator[Tensor]:
-        return iter(())
-
-    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
-        return 0
-
-    def zero_grad(self) -> None: ...
-
-    raster = RasterSettings()
-    absolute_gradient = False
-    standard_file = False
-
-    def file(self) -> dict[str, Tensor]:
-        return {}
-
-    def export_notes(self) -> list[str]:
-        return []
-
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         raise NotImplementedError
-
-    def plan(self) -> dict[str, Any]:
-        return {}
-
-    def tensors(self) -> dict[str, Tensor]:
-        return {}
-
-    def restore(self, tensors: dict[str, Tensor]) -> None: ...
 
 
 class Stripes:

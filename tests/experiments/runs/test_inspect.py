@@ -8,9 +8,10 @@ import pytest
 import torch
 from synthetic_colmap import synthesize, write_photos, write_scene
 
+from gsx.builtin import plugins
 from gsx.core.data.images import write_image
-from gsx.experiments.runs import inspect
-from gsx.experiments.runs.inspect import describe, detect
+from gsx.experiments.runs.inspect import describe, readable
+from gsx.scenes import colmap, photos
 
 POSE = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
 
@@ -40,7 +41,7 @@ def test_colmap_scene(tmp_path: Path) -> None:
     folder = tmp_path / "my scene"
     write_scene(synthesize("SIMPLE_RADIAL", [80.0, 32.0, 24.0, 0.05], frames=9), folder)
     (folder / "images" / "camera000001_frame000004.png").unlink()
-    lines = describe(folder)
+    lines = describe(folder, plugins())
     assert labelled(lines, "format") == ["colmap: COLMAP model with photos"]
     assert labelled(lines, "also") == ["readable as scene=photos"]
     assert labelled(lines, "camera") == ["SIMPLE_RADIAL 64x48, 9 images"]
@@ -59,7 +60,7 @@ def test_photos_elsewhere_are_found_and_part_of_the_command(tmp_path: Path) -> N
     write_photos(reconstruction, tmp_path / "images_2", (32, 24))
     for file in (tmp_path / "images").iterdir():
         file.unlink()
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert labelled(lines, "images") == ["5 of 5 in images_2"]
     assert labelled(lines, "views") == ["5 of 32x24"]
     assert labelled(lines, "train") == [f"gsx scene=colmap scene.path={tmp_path} scene.images=images_2"]
@@ -68,7 +69,7 @@ def test_photos_elsewhere_are_found_and_part_of_the_command(tmp_path: Path) -> N
 def test_truncated_model_is_a_problem_and_the_command_comes_after(tmp_path: Path) -> None:
     model = write_scene(synthesize(), tmp_path)
     (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:-3])
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     (problem,) = labelled(lines, "problem")
     assert "images.bin is truncated" in problem
     assert labelled(lines, "train") == []
@@ -79,7 +80,7 @@ def test_model_without_any_photo_still_tells_its_cameras(tmp_path: Path) -> None
     write_scene(synthesize(), tmp_path)
     for file in (tmp_path / "images").iterdir():
         file.unlink()
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert labelled(lines, "camera") == ["PINHOLE 64x48, 5 images"]
     assert labelled(lines, "images")[0].startswith("0 of 5 in images")
     assert "None of the 5 images" in labelled(lines, "problem")[0]
@@ -88,7 +89,7 @@ def test_model_without_any_photo_still_tells_its_cameras(tmp_path: Path) -> None
 def test_blender_scene_with_absent_photos(tmp_path: Path) -> None:
     write_transforms(tmp_path, "transforms_train.json", 3)
     write_transforms(tmp_path, "transforms_test.json", 3, absent=1)
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert labelled(lines, "format")[0].startswith("blender")
     assert labelled(lines, "images") == [
         "3 of 4 of transforms_test.json, absent: ./3",
@@ -101,18 +102,18 @@ def test_blender_scene_with_absent_photos(tmp_path: Path) -> None:
 def test_transforms_file_and_its_folder(tmp_path: Path) -> None:
     write_transforms(tmp_path, "transforms.json", 9)
     for path in (tmp_path, tmp_path / "transforms.json"):
-        lines = describe(path)
+        lines = describe(path, plugins())
         assert labelled(lines, "format")[0].startswith("transforms")
         assert labelled(lines, "split") == ["7 to train on, 2 to test on"]
         assert labelled(lines, "train") == [f"gsx scene=transforms scene.path={path}"]
 
 
 def test_folder_of_photos_is_not_reconstructed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inspect.photos, "reconstruct", None)
+    monkeypatch.setattr(photos, "reconstruct", None)
     for name, width in (("a.png", 16), ("b.png", 20), ("c.png", 16)):
         write_image(tmp_path / name, torch.zeros(3, 12, width))
     (tmp_path / "d.jpg").write_bytes(b"")
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert labelled(lines, "images") == [f"2 of 16x12 in {tmp_path}", f"1 of 20x12 in {tmp_path}"]
     assert labelled(lines, "note") == ["Skipped 1 photos that cannot be read: d.jpg."]
     assert labelled(lines, "train") == [f"gsx scene=photos scene.path={tmp_path}"]
@@ -120,7 +121,7 @@ def test_folder_of_photos_is_not_reconstructed(tmp_path: Path, monkeypatch: pyte
 
 def test_bungee_poses_without_photos_are_a_problem(tmp_path: Path) -> None:
     (tmp_path / "poses_enu.json").write_text('{"poses": [[1, 2]]}')
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert labelled(lines, "format")[0].startswith("bungee")
     assert len(labelled(lines, "problem")) == 1
 
@@ -129,7 +130,7 @@ def test_folder_of_scenes_names_them(tmp_path: Path) -> None:
     write_scene(synthesize(), tmp_path / "a")
     (tmp_path / "b").mkdir()
     write_transforms(tmp_path / "b", "transforms_train.json", 2)
-    (problem,) = labelled(describe(tmp_path), "problem")
+    (problem,) = labelled(describe(tmp_path, plugins()), "problem")
     assert "is no scene" in problem
     assert "scenes below it: a (colmap), b (blender)." in problem
 
@@ -143,7 +144,7 @@ def test_rubbish_is_described_without_raising(tmp_path: Path, name: str, content
     file.parent.mkdir(parents=True, exist_ok=True)
     if content is not None:
         file.write_bytes(content)
-    lines = describe(tmp_path)
+    lines = describe(tmp_path, plugins())
     assert len(labelled(lines, "problem")) == 1
     assert bool(labelled(lines, "then")) == (content is not None)
 
@@ -151,7 +152,7 @@ def test_rubbish_is_described_without_raising(tmp_path: Path, name: str, content
 @pytest.mark.parametrize("name", ["nowhere", "file.txt"])
 def test_what_is_no_folder_is_said_to_be_none(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").touch()
-    (line,) = describe(tmp_path / name)
+    (line,) = describe(tmp_path / name, plugins())
     assert line == f"problem   '{tmp_path / name}' is no folder: check the name."
 
 
@@ -160,8 +161,8 @@ def test_unexpected_errors_become_problems(tmp_path: Path, monkeypatch: pytest.M
         raise PermissionError(13, "Permission denied", "sparse")
 
     write_scene(synthesize(), tmp_path)
-    monkeypatch.setattr(inspect, "find_model", fail)
-    (problem,) = labelled(describe(tmp_path), "problem")
+    monkeypatch.setattr(colmap, "find_model", fail)
+    (problem,) = labelled(describe(tmp_path, plugins()), "problem")
     assert problem.startswith("PermissionError: ")
     assert "Permission denied" in problem
 
@@ -169,4 +170,4 @@ def test_unexpected_errors_become_problems(tmp_path: Path, monkeypatch: pytest.M
 def test_poses_come_before_photos_when_both_are_there(tmp_path: Path) -> None:
     write_scene(synthesize(), tmp_path)
     write_transforms(tmp_path, "transforms.json", 1)
-    assert detect(tmp_path) == ["colmap", "transforms", "photos"]
+    assert [loader.name for loader, _ in readable(tmp_path, plugins())] == ["colmap", "transforms", "photos"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsx.builtin import plugins
+from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.trainer import train
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.open import open_run
@@ -36,8 +37,8 @@ def test_an_old_run_goes_on(folder: Path) -> None:
     loaded = plugins()
     run, _ = open_run(folder, loaded, ["iterations=14"], training=True)
     assert run.step == 12
-    before = {name: value.clone() for name, value in run.backbone.tensors().items()}
+    before = {name: value.clone() for name, value in table_tensors(run.backbone.table).items()}
     train(run, loaded)
     assert run.complete
     assert before["adam.offsets.step"] == 11  # one event cost its step
-    assert run.backbone.tensors()["adam.offsets.step"] == 13
+    assert table_tensors(run.backbone.table)["adam.offsets.step"] == 13

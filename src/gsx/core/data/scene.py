@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -22,6 +23,16 @@ class ImageSource(Protocol):
 
     def max_zoom(self, camera: Camera) -> float:
         """The largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
+        ...
+
+
+@runtime_checkable
+class FromFile(Protocol):
+    """A source that reads a file."""
+
+    @property
+    def path(self) -> Path:
+        """Which one; its size and time tell whether it is still the same."""
         ...
 
 
@@ -77,6 +88,16 @@ class Scene:
     """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
+
+
+@runtime_checkable
+class InUnits(Protocol):
+    """Options of a scene whose positions are multiplied when it is loaded."""
+
+    @property
+    def unit(self) -> float:
+        """By how much."""
+        ...
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:

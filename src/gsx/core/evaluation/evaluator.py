@@ -23,6 +23,7 @@ from gsx.core.quality.lpips import LpipsOptions, load_lpips
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer.prepare import path_of
 from gsx.core.shapes import Float
+from gsx.core.training.parameter_table import size_of
 from gsx.core.training.remarks import gathered
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -237,7 +238,7 @@ class Evaluator:
     def evaluate(self, drawing: Drawing | None = None, advance: Advance = silent) -> dict[str, Any]:
         """The content of evaluation.json."""
         run, views = self.run, self.views(advance)
-        primitives, size = run.backbone.size()
+        primitives, size = size_of(run.backbone.table)
         groups = sorted({v["group"] for v in views if v["group"]})
         by_group = {name: [v for v in views if v["group"] == name] for name in groups}
         figures = ("psnr", "ssim", "lpips")

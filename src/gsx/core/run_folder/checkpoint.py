@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError
 from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -37,7 +38,9 @@ def write(run: Run, folder: Path) -> Path:
     """Write a checkpoint of the current step into a folder."""
     from safetensors.torch import save as to_bytes
 
-    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in run.backbone.tensors().items()}
+    tensors = {
+        name: value.detach().cpu().contiguous().clone() for name, value in table_tensors(run.backbone.table).items()
+    }
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
     path = folder / f"step_{run.step:07d}.safetensors"
@@ -127,7 +130,7 @@ def restore(run: Run) -> None:
     meta, tensors = newest(run.folder)
     refuse_other_views(run, meta["views"])
     run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
-    run.backbone.restore(tensors)
+    run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
     run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted

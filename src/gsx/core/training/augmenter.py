@@ -8,7 +8,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Augmenter
 
-__all__ = ["Augmenter", "AugmenterContext", "Foretold", "Telling"]
+__all__ = ["Augmenter", "AugmenterContext", "Foretold", "Replacing", "Telling"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,6 +30,15 @@ class Telling(Protocol):
     def told(self, step: int) -> dict[str, Any]:
         """At the first step that asks for new pictures their `event`, and by scale how many were `asked` for, how many
         `dropped`, and `warned` of by check; else empty. JSON-serialisable."""
+        ...
+
+
+@runtime_checkable
+class Replacing(Protocol):
+    """An augmenter whose terms take the place of a part of the photographs' own loss."""
+
+    def share(self) -> float:
+        """The largest part, from 0; those of all augmenters of a run add up to less than 1."""
         ...
 
 

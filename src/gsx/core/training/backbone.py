@@ -1,19 +1,19 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import RasterSettings, Rendering
-from gsx.core.shapes import Float
+from gsx.core.rasterizer import RasterSettings, Rendering, drawable
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.parameter_table import ParameterTable, finite_rows, keep_rows
 from gsx.core.training.schedule import Schedule
 
 Observation: TypeAlias = dict[str, Tensor]
@@ -57,8 +57,21 @@ class Drawn(Protocol):
 
     @property
     def splats(self) -> Splats:
-        """Explicit Gaussians, differentiable."""
+        """M explicit Gaussians, differentiable."""
         ...
+
+    @property
+    def rows(self) -> Int[Tensor, "M"] | None:
+        """Row of the table that each splat comes from; None: splat n is row n."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnSplats:
+    """Splats and their rows, for backbones that need no more."""
+
+    splats: Splats
+    rows: Int[Tensor, "M"] | None = None
 
 
 D = TypeVar("D", bound=Drawn)
@@ -70,17 +83,15 @@ class Backbone(Protocol[D]):
 
     A step calls, in this order: for each view `draw`, `regulariser`, (backward), `observe`; for each observation
     `accumulate`; `densify_and_prune`, `update`. Gradients of the views add up in between. Steps count from 1.
+    Checkpoints, sizes, gradients and the removal of what is not finite follow from the table.
     """
 
-    @property
-    def raster(self) -> RasterSettings:
-        """The rules its splats are drawn by: those of the context, with filters of its own."""
-        ...
-
-    @property
-    def absolute_gradient(self) -> bool:
-        """Whether `observe` wants absolute gradients in training renders."""
-        ...
+    table: ParameterTable
+    """Everything that it learns, and all that it needs to go on exactly."""
+    raster: RasterSettings
+    """The rules its splats are drawn by: those of the context, with filters of its own."""
+    absolute_gradient: bool
+    """Whether `observe` wants absolute gradients in training renders."""
 
     def draw(self, camera: Camera, step: int) -> D:
         """The splats of this camera, as the model stands at this step."""
@@ -94,7 +105,7 @@ class Backbone(Protocol[D]):
         """What density control learns from a render of what was drawn, after its backward pass.
 
         `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
-        photograph (`density.Statistics`).
+        photograph (`density`).
         """
         ...
 
@@ -103,39 +114,11 @@ class Backbone(Protocol[D]):
         ...
 
     def densify_and_prune(self, step: int) -> dict[str, int]:
-        """Change the number of primitives; returns what was done, for the log, empty when nothing."""
+        """Change the number of rows; returns what was done, for the log, empty when nothing."""
         ...
 
     def update(self, step: int) -> None:
         """Let the optimiser move the parameters, by the learning rates of this step, and clear their gradients."""
-        ...
-
-    def parameters(self) -> Iterable[tuple[str, Parameter]]:
-        """Name and value of everything that is learnt, in the same order on every process."""
-        ...
-
-    def gradients(self) -> Iterable[tuple[str, Tensor]]:
-        """Name and gradient of every parameter that has one."""
-        ...
-
-    def remove_nonfinite(self, cameras: Sequence[Camera], step: int) -> int:
-        """Remove primitives with values that are not finite, or that one of the cameras cannot draw; returns how many.
-
-        Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
-        gradients included; nor where nothing would be left.
-        """
-        ...
-
-    def zero_grad(self) -> None:
-        """Clear the gradients without moving anything."""
-        ...
-
-    def shared(self) -> Iterable[Tensor]:
-        """Parameters of colour that all primitives share (a colour network); pseudo views may leave them alone."""
-        ...
-
-    def size(self) -> tuple[int, int]:
-        """(primitives, bytes of the parameters needed to render)."""
         ...
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
@@ -146,27 +129,55 @@ class Backbone(Protocol[D]):
         """
         ...
 
-    @property
-    def standard_file(self) -> bool:
-        """Whether `file` is a standard splat file of 3D-GS."""
-        ...
 
-    def file(self) -> dict[str, Float[Tensor, "N"]]:
-        """Columns of the backbone's own splat file, in order."""
-        ...
-
-    def export_notes(self) -> list[str]:
-        """Comments for the export: what a viewer must know beside the screen dilation."""
-        ...
+@runtime_checkable
+class Planned(Protocol):
+    """A backbone with a schedule to tell."""
 
     def plan(self) -> dict[str, Any]:
         """The rescaled schedule in absolute steps, for the log and the report."""
         ...
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything needed to go on exactly: parameters, optimiser state, statistics."""
+
+@runtime_checkable
+class WithOwnFile(Protocol):
+    """A backbone whose published code writes splat files with more in them than standard ones."""
+
+    def file_columns(self) -> dict[str, Float[Tensor, "N"]] | None:
+        """Columns of that file, in order; None: as it is composed, a standard file says everything."""
         ...
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take back what `tensors` gave, whatever its number of primitives."""
+    def file_notes(self) -> list[str]:
+        """Comments of any file of it: what a viewer must know beside the screen dilation."""
         ...
+
+
+@torch.no_grad()
+def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: int) -> int:
+    """Remove rows with values that are not finite, or that one of the cameras cannot draw; returns how many.
+
+    Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
+    gradients included; nor where nothing would be left.
+    """
+    kept = finite_rows(backbone.table)
+    for camera in cameras:
+        kept &= drawable_rows(backbone, camera, step)
+    if bool(kept.all()) or not bool(kept.any()):
+        return 0
+    keep_rows(backbone.table, kept)
+    return int((~kept).sum())
+
+
+def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Tensor, "N"]:
+    """Rows that the camera draws or has no business with: False for splats or volumes that are out of range.
+
+    Where none of those in view can be drawn networks are to blame, if there are any, and no row.
+    """
+    drawn, table = backbone.draw(camera, step), backbone.table
+    splats = drawn.splats
+    good = drawable(splats, camera, backbone.raster) & torch.isfinite(splats.scales.prod(1))
+    if drawn.rows is None:
+        return good
+    everyone = torch.ones(len(table), dtype=torch.bool, device=good.device)
+    found = everyone.index_fill(0, drawn.rows[~good], False)
+    return everyone if table.networks is not None and not bool(found[drawn.rows].any()) else found

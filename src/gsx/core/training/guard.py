@@ -10,6 +10,7 @@ import torch
 
 from gsx.core.errors import Disagreement, TrainingError
 from gsx.core.plugins import hookimpl
+from gsx.core.training.parameter_table import gradients, table_tensors
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ def culprit(run: Run, step: Step) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
     if not bool(torch.isfinite(step.loss)):
         return f"the loss is {float(step.loss)}"
-    for name, gradient in run.backbone.gradients():
+    for name, gradient in gradients(run.backbone.table).items():
         if not bool(torch.isfinite(gradient.sum())):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
             if rows == 0:  # every value is finite, only their sum overflowed
@@ -79,6 +80,6 @@ class Agreement:
 def digest(run: Run) -> str:
     """Of everything that the next steps depend on."""
     content = hashlib.sha256(repr((run.sampler.order, run.sampler.begun)).encode())
-    for name, value in sorted({"generator": run.generator.get_state(), **run.backbone.tensors()}.items()):
+    for name, value in sorted({"generator": run.generator.get_state(), **table_tensors(run.backbone.table)}.items()):
         content.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

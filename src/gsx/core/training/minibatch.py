@@ -1,17 +1,16 @@
 """Several views in one step, on one process or on several: gradients, losses and observations become those of one.
 
 Every view's own loss is sent back, and the sums are divided in the end. An observation counts by its weight in the
-mean loss (`density.Statistics`), so that published thresholds hold for any number of views.
+mean loss (`density`), so that published thresholds hold for any number of views.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
-from gsx.core.training.backbone import Backbone
+from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
 from gsx.core.training.run import Run, Step
 
 
@@ -31,13 +30,12 @@ def next_views(run: Run) -> Iterator[list[int]]:
 
 
 @contextmanager
-def gradients_added(backbone: Backbone[Any]) -> Iterator[None]:
+def gradients_added(table: ParameterTable) -> Iterator[None]:
     """A view begins without gradients, because its terms may forget some, and ends with the sums of all so far."""
-    before = dict(backbone.gradients())
-    for _, parameter in backbone.parameters():
-        parameter.grad = None
+    before = gradients(table)
+    zero_grad(table)
     yield
-    for name, parameter in backbone.parameters():
+    for name, parameter in named_parameters(table):
         if name in before:
             parameter.grad = before[name] if parameter.grad is None else before[name].add_(parameter.grad)
 
@@ -59,7 +57,7 @@ def account_of(run: Run, steps: Sequence[Step]) -> Account:
         losses=[float(step.loss) for step in steps],
         terms=[step.terms for step in steps],
         dropped=sum(step.dropped for step in steps),
-        learnt={name for name, _ in run.backbone.gradients()},
+        learnt=set(gradients(run.backbone.table)),
     )
 
 
@@ -80,12 +78,12 @@ def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
 
 def average(run: Run, learnt: set[str]) -> None:
     """Turn sums of gradients on each rank into the mean over the batch on all; `learnt`: parameters that have any."""
-    moved = [parameter for name, parameter in run.backbone.parameters() if name in learnt]
+    moved = [parameter for name, parameter in named_parameters(run.backbone.table) if name in learnt]
     for parameter in moved:
         parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-    gradients = [parameter.grad for parameter in moved if parameter.grad is not None]
-    run.ranks.add(gradients)
-    for gradient in gradients:
+    summed = [parameter.grad for parameter in moved if parameter.grad is not None]
+    run.ranks.add(summed)
+    for gradient in summed:
         gradient /= run.training.batch
 
 

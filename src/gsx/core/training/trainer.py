@@ -17,8 +17,9 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
 from gsx.core.training.augmenter import Telling
-from gsx.core.training.backbone import Drawn, Observation
+from gsx.core.training.backbone import Drawn, Observation, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, next_views
+from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
 
@@ -41,7 +42,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
     step = backward(run)
     reason = veto(run, step, plugins)
     if reason:
-        run.backbone.zero_grad()
+        zero_grad(run.backbone.table)
     else:
         for seen in step.seen:
             run.backbone.accumulate(seen)
@@ -62,9 +63,8 @@ def veto(run: Run, step: Step, plugins: Plugins) -> str:
 
 def remove_lost(run: Run, step: Step) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
-    removed = run.backbone.remove_nonfinite(
-        [run.scene.train[number].camera for number in run.sampler.taken], step.number
-    )
+    cameras = [run.scene.train[number].camera for number in run.sampler.taken]
+    removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed:
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
@@ -81,7 +81,7 @@ def backward(run: Run) -> Step:
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
         steps = []
         for view, added, colour in zip(picked, terms, colours, strict=True):
-            with gradients_added(run.backbone):
+            with gradients_added(run.backbone.table):
                 steps.append(view_loss(run, number, run.scene.train[view], added, colour))
         step = steps[0] if len(batch) == 1 else merge_gradients(run, steps)
         return replace(step, pseudo=asked_for(run, number))
@@ -172,7 +172,7 @@ def pseudo_term(run: Run, term: Term, number: int, seen: list[Observation]) -> f
         if term.observed and math.isfinite(total) and finite_shift(rendering):
             seen.append(observation(run, drawn, rendering, number, weight))
     if not term.shared:
-        for parameter in run.backbone.shared():
+        for parameter in shared_colour(run.backbone.table):
             parameter.grad = None
     return total
 

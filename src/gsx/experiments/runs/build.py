@@ -10,8 +10,8 @@ from gsx.core.cache import cache_root
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
 from gsx.core.rasterizer.prepare import decide
-from gsx.core.training.augmenter import Augmenter, AugmenterContext
-from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
+from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
@@ -89,7 +89,8 @@ def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
             regenerator=regenerator,
         )
         out.append(chosen.component.factory(chosen.options, context))
-    shares = {name: float(a.plan().get("share", 0)) for name, a in zip(settings.augmenters, out, strict=True)}
+    replacing = [(name, a) for name, a in zip(settings.augmenters, out, strict=True) if isinstance(a, Replacing)]
+    shares = {name: augmenter.share() for name, augmenter in replacing}
     if sum(shares.values()) >= 1:
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
         raise ConfigError(f"augmenters take the whole loss of the photographs ({listed}): lower their weights")
@@ -99,4 +100,5 @@ def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
 def plan_of(run: Run) -> dict[str, Any]:
     """The rescaled schedules of the backbone and of the augmenters."""
     names = run.config.get("augmenter") or {}
-    return run.backbone.plan() | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}
+    own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
+    return own | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}

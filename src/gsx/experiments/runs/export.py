@@ -3,12 +3,16 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from torch import Tensor
+
 from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.shapes import Float
+from gsx.core.training.backbone import WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.load_scene import unit_of
@@ -20,17 +24,23 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
 
     The comments hold the conventions that a viewer must know.
     """
+    columns = None if camera else own_columns(run)
     comments = [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
-        *run.backbone.export_notes(),
-        *([f"SplatRenderMode: {render_mode(run.raster)}"] if camera is not None or run.backbone.standard_file else []),
+        *(run.backbone.file_notes() if isinstance(run.backbone, WithOwnFile) else ()),
+        *([f"SplatRenderMode: {render_mode(run.raster)}"] if columns is None else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
-    if camera is None:
-        write_columns(path, run.backbone.file(), comments)
-    else:
+    if columns is None:
         write_gaussians(path, run.backbone.explicit(camera, run.model_step), comments)
+    else:
+        write_columns(path, columns, comments)
+
+
+def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:
+    """Columns of the backbone's own splat file; None: that is a standard one."""
+    return run.backbone.file_columns() if isinstance(run.backbone, WithOwnFile) else None
 
 
 def render_mode(raster: RasterSettings) -> str:

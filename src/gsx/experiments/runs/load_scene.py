@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from gsx.core.data.camera import offsets_from
-from gsx.core.data.scene import Scene, View
+from gsx.core.data.scene import InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import Settings
@@ -19,8 +19,9 @@ def load_scene(settings: Settings) -> Scene:
     Raises:
         InputError: it cannot be loaded, the split leaves no test views, or cameras and points are all in one place.
     """
-    loaded = settings.scene.component.factory(settings.scene.options)
-    scene = warned_of_units(measured(in_units(loaded, getattr(settings.scene.options, "unit", 1.0))))
+    options = settings.scene.options
+    loaded = settings.scene.component.factory(options)
+    scene = warned_of_units(measured(in_units(loaded, options.unit if isinstance(options, InUnits) else 1.0)))
     if not scene.test:
         raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
     if not scene.extent > 0:

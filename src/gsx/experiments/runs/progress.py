@@ -111,7 +111,7 @@ class Progress:
 
     def line(self, run: Run) -> str:
         """The line as shown."""
-        a, primitives, memory = self.averages, run.backbone.size()[0], peak_memory_mb(run.device)
+        a, primitives, memory = self.averages, len(run.backbone.table), peak_memory_mb(run.device)
         megabytes = "" if memory is None else f"{memory:,.0f} MB  "
         return (
             f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
@@ -166,7 +166,7 @@ class MetricsLog:
             "seconds": round(run.seconds, 3),
             "loss": float(step.loss),
             "psnr": step.psnr(),
-            "primitives": run.backbone.size()[0],
+            "primitives": len(run.backbone.table),
             "pairs": step.rendering.pairs,
             "memory_mb": None if memory is None else round(memory, 1),
             **({"terms": step.terms} if step.terms else {}),

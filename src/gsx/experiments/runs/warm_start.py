@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_revision, trim
+from gsx.core.data.scene import FromFile
 from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
@@ -60,10 +61,10 @@ def seen_by(run: Run) -> str:
     digest = hashlib.sha256(run.scene.points.positions.numpy().tobytes())
     digest.update(run.scene.points.colours.numpy().tobytes())
     for view in run.scene.train:
-        camera, path = view.camera, getattr(view.source, "path", None)
+        camera = view.camera
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
-        digest.update(repr(file_stamp(Path(path)) if path is not None else "").encode())
+        digest.update(repr(file_stamp(view.source.path) if isinstance(view.source, FromFile) else "").encode())
     return digest.hexdigest()
 
 

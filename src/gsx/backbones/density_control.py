@@ -1,0 +1,93 @@
+"""Adaptive density control of free Gaussians: when it acts, and what every way of making new ones shares (3D-GS)."""
+
+import math
+from typing import Any
+
+import torch
+from torch.nn.functional import logsigmoid
+
+from gsx.backbones.gs3d_options import Density
+from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
+from gsx.backbones.mip import Filter, logit_of_log
+from gsx.core.training.backbone import BackboneContext
+from gsx.core.training.density import room_under, zero_statistics
+from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column
+from gsx.core.training.schedule import Schedule
+
+
+class DensityControl:
+    """Densifies, prunes and resets opacities (Kerbl et al. 2023, section 5)."""
+
+    def __init__(
+        self, options: Density, cap: int, context: BackboneContext, schedule: Schedule, densification: Densification
+    ) -> None:
+        self.options, self.cap, self.schedule, self.densification = options, cap, schedule, densification
+        self.extent, self.generator = context.scene.extent, context.generator
+        self.white = bool((context.scene.background == 1).all())
+
+    # -- when ----------------------------------------------------------------------------------------------------
+
+    def ends(self) -> int:
+        """Step from which nothing is densified, pruned or observed."""
+        return self.schedule.step(self.options.stop)
+
+    def due(self, step: int) -> bool:
+        """After `start`, before `stop`, every interval."""
+        begun = self.schedule.step(self.options.start) < step < self.ends()
+        return begun and step % self.schedule.interval(self.options.every) == 0
+
+    def reset_interval(self) -> int:
+        """Steps between opacity resets."""
+        return self.schedule.interval(self.options.reset_every, self.options.reset_passes)
+
+    def reset_due(self, step: int) -> bool:
+        """Every reset interval while density control runs, and once early on a white background; or never."""
+        if not self.densification.resets:
+            return False
+        regular = step % self.reset_interval() == 0 and step < self.ends()
+        return regular or (self.white and step == self.white_reset())
+
+    def white_reset(self) -> int:
+        """Step of the extra reset."""
+        return max(1, self.schedule.step(self.options.white_reset))
+
+    # -- what ----------------------------------------------------------------------------------------------------
+
+    def densify(self, table: ParameterTable, step: int) -> dict[str, int]:
+        """Clone and split, then prune; begin to count anew (3D-GS, densify_and_prune: the order in one event)."""
+        done = self.densification.densify(self, table, step)
+        done["pruned"] = self.prune(table, step)
+        zero_statistics(table)
+        return done
+
+    def room(self, table: ParameterTable) -> int:
+        """Primitives that may be added under the cap."""
+        return room_under(self.cap, len(table))
+
+    def prune(self, table: ParameterTable, step: int) -> int:
+        """Remove faint primitives, and after the first reset huge ones; returns how many."""
+        doomed = table["opacity_logits"].sigmoid() < self.options.prune_opacity
+        if step > self.reset_interval():
+            doomed |= largest_scales(table) > self.options.prune_extent * self.extent
+        if bool(doomed.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
+            return 0
+        keep_rows(table, ~doomed)
+        return int(doomed.sum())
+
+    def reset_opacities(self, table: ParameterTable, filter_: Filter) -> None:
+        """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting)."""
+        logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
+        excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0)
+        lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
+        reset_column(table, "opacity_logits", lowered)
+
+    def plan(self) -> dict[str, Any]:
+        """The schedule in steps of this run."""
+        every = self.schedule.interval(self.options.every)
+        resets = {"every": self.reset_interval(), "until": self.ends()}
+        resets |= {"white_background": self.white_reset()} if self.white else {}
+        return {
+            "densify": {"from": self.schedule.step(self.options.start), "until": self.ends(), "every": every},
+            **({"opacity_reset": resets} if self.densification.resets else {}),
+            "prune_huge": {"from": self.reset_interval()},
+        }

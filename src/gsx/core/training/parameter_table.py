@@ -1,0 +1,237 @@
+"""What a model learns: rows of parameters with their Adam state, edited together, and networks that all rows share.
+
+Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments and
+removed with their moments; a group's step count is never reset (3D-GS). A parameter touched by surgery
+is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from gsx.core.errors import CheckpointError
+from gsx.core.shapes import Bool
+
+ADAM_EPSILON = 1e-15
+"""Gradients of a mean loss are tiny (3D-GS, training_setup)."""
+
+
+@dataclass(eq=False)
+class Networks:
+    """Networks that all primitives share, and the Adam that moves them, with a group for each."""
+
+    modules: nn.Module
+    colour: nn.Module
+    """Of them the one that makes colours, which pseudo views may leave alone."""
+    optimiser: torch.optim.Adam = field(init=False)
+
+    def __post_init__(self) -> None:
+        parts = self.modules.named_children()
+        groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in parts]
+        self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+    def named(self) -> Iterator[tuple[str, Parameter]]:
+        """Parameters by the names that they are saved under."""
+        return ((f"heads.{name}", parameter) for name, parameter in self.modules.named_parameters())
+
+
+@dataclass(eq=False)
+class ParameterTable:
+    """Everything a model learns and knows: N rows of each parameter and of what belongs to them, and networks."""
+
+    parameters: dict[str, Parameter]
+    columns: dict[str, Tensor] = field(default_factory=dict)
+    """Values with N rows that are not learnt, but drawn with: levels, filter sizes, positions on a grid."""
+    statistics: dict[str, Tensor] = field(default_factory=dict)
+    """Values with N rows that density control gathers; new rows begin with 0."""
+    networks: Networks | None = None
+    optimiser: torch.optim.Adam = field(init=False)
+
+    def __post_init__(self) -> None:
+        groups = [{"params": [parameter], "name": name, "lr": 0.0} for name, parameter in self.parameters.items()]
+        self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.parameters.values())))
+
+    def __getitem__(self, name: str) -> Tensor:
+        return next(kind[name] for kind in (self.parameters, self.columns, self.statistics) if name in kind)
+
+    def set_rate(self, name: str, rate: float) -> None:
+        """Learning rate of one parameter."""
+        self.group(name)["lr"] = rate
+
+    def group(self, name: str) -> dict:
+        """The Adam group of one parameter."""
+        return next(group for group in self.optimiser.param_groups if group["name"] == name)
+
+
+def edit(
+    table: ParameterTable, name: str, change: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]
+) -> None:
+    """Replace a parameter by `change` of it and its Adam moments by `moments` of them."""
+    old = table.parameters[name]
+    new = Parameter(change(old.detach()).contiguous())
+    state = table.optimiser.state.pop(old, None)
+    if state:
+        table.optimiser.state[new] = {
+            "step": state["step"],
+            "exp_avg": moments(state["exp_avg"]).contiguous(),
+            "exp_avg_sq": moments(state["exp_avg_sq"]).contiguous(),
+        }
+    table.group(name)["params"] = [new]
+    table.parameters[name] = new
+
+
+def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
+    """A function that appends `new` to the rows of a tensor."""
+    return lambda old: torch.cat([old, new])
+
+
+def append_rows(table: ParameterTable, rows: dict[str, Tensor]) -> None:
+    """Append rows to every parameter and column; `rows` names all of them. Moments and statistics begin with 0."""
+    count = len(next(iter(rows.values())))
+    for name in table.parameters:
+        edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
+    for name, column in table.columns.items():
+        table.columns[name] = torch.cat([column, rows[name]])
+    for name, sums in table.statistics.items():
+        table.statistics[name] = torch.cat([sums, sums.new_zeros(count, *sums.shape[1:])])
+
+
+def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
+    """Keep the marked rows of every parameter, with their moments, of every column, and of the statistics."""
+    for name in table.parameters:
+        edit(table, name, lambda old: old[kept], lambda moment: moment[kept])
+    for name, column in table.columns.items():
+        table.columns[name] = column[kept]
+    for name, sums in table.statistics.items():
+        table.statistics[name] = sums[kept]
+
+
+def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
+    """All parameters and columns by name, without gradient: what `append_rows` wants rows of."""
+    return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+
+
+def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
+    """Replace all values of one parameter and zero its moments."""
+    edit(table, name, lambda old: values, torch.zeros_like)
+
+
+def finite_rows(table: ParameterTable) -> Bool[Tensor, "N"]:
+    """Rows whose parameters are finite in every value."""
+    flat = [parameter.detach().reshape(len(parameter), -1) for parameter in table.parameters.values()]
+    return torch.stack([torch.isfinite(values).all(1) for values in flat]).all(0)
+
+
+def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
+    """Adam's step count and moments of one parameter, by the names they are saved under; none before its first step."""
+    return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
+
+
+def restore_adam(
+    name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor], device: torch.device
+) -> None:
+    """Take back what `adam_tensors` gave."""
+    if f"adam.{name}.step" in tensors:
+        state = {key: tensors[f"adam.{name}.{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+        optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
+
+
+def named_parameters(table: ParameterTable) -> list[tuple[str, Parameter]]:
+    """Name and value of everything that is learnt, in the same order on every process."""
+    return [*table.parameters.items(), *(table.networks.named() if table.networks else ())]
+
+
+def gradients(table: ParameterTable) -> dict[str, Tensor]:
+    """Gradients by name, of the parameters that have one."""
+    return {name: parameter.grad for name, parameter in named_parameters(table) if parameter.grad is not None}
+
+
+def shared_colour(table: ParameterTable) -> list[Parameter]:
+    """Parameters of colour that all primitives share; pseudo views may leave them alone."""
+    return [] if table.networks is None else list(table.networks.colour.parameters())
+
+
+def zero_grad(table: ParameterTable) -> None:
+    """Clear all gradients without moving anything."""
+    for _, parameter in named_parameters(table):
+        parameter.grad = None
+
+
+def take_adam_step(table: ParameterTable) -> None:
+    """Move everything that has a gradient by the learning rates set; then clear the gradients."""
+    table.optimiser.step()
+    if table.networks is not None:
+        table.networks.optimiser.step()
+    zero_grad(table)
+
+
+def size_of(table: ParameterTable) -> tuple[int, int]:
+    """(rows, bytes of what a render needs: parameters, columns and networks)."""
+    needed = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
+    return len(table), sum(value.numel() * value.element_size() for value in needed)
+
+
+# -- checkpoints -------------------------------------------------------------------------------------------------------
+
+
+def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
+    """Everything of a table, by the names it is saved under."""
+    out = {f"columns.{name}": column for name, column in table.columns.items()}
+    out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
+    for name, parameter in table.parameters.items():
+        out[f"parameters.{name}"] = parameter.detach()
+        out |= adam_tensors(name, parameter, table.optimiser)
+    return out | (networks_tensors(table.networks) if table.networks else {})
+
+
+def networks_tensors(networks: Networks) -> dict[str, Tensor]:
+    """Values and Adam states of networks, by the names they are saved under."""
+    out: dict[str, Tensor] = {}
+    for name, parameter in networks.named():
+        out[name] = parameter.detach()
+        out |= adam_tensors(name, parameter, networks.optimiser)
+    return out
+
+
+def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
+    """The table that `table_tensors` saw, whatever its number of rows: with all that `like` has, on its device.
+
+    Raises:
+        CheckpointError: something of it was not saved: the run had other options.
+    """
+    found = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
+    device = next(iter(like.parameters.values())).device
+    rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}
+    parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
+    table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks)
+    for name, parameter in table.parameters.items():
+        restore_adam(name, parameter, table.optimiser, tensors, device)
+    if table.networks is not None:
+        restore_networks(table.networks, tensors, device)
+    return table
+
+
+def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The saved values of one kind, by name; older checkpoints hold some statistics as columns."""
+    names = {name: next((key for key in (f"{kind}.{name}", f"columns.{name}") if key in tensors), "") for name in like}
+    missing = [name for name, key in names.items() if not key]
+    if missing:
+        raise CheckpointError(
+            f"the checkpoint holds no {' and no '.join(missing)}: it was trained with other options of the backbone; "
+            "go on with those, or train anew"
+        )
+    return {name: tensors[key] for name, key in names.items()}
+
+
+@torch.no_grad()
+def restore_networks(networks: Networks, tensors: dict[str, Tensor], device: torch.device) -> None:
+    """Take back values and Adam states of networks."""
+    for name, parameter in networks.named():
+        parameter.copy_(tensors[name])
+        restore_adam(name, parameter, networks.optimiser, tensors, device)
