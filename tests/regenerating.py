@@ -14,7 +14,8 @@ from gsx.core.data.reduction import as_blocks, box_average
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.training.augmenter import AugmenterContext
-from gsx.core.training.regenerator import Checks, RegeneratorContext, Request
+from gsx.core.training.checked_regenerator import CheckedRegenerator, Checks, Tally
+from gsx.core.training.regenerator import Regenerator, RegeneratorContext, Request
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import typed
 
@@ -84,6 +85,12 @@ def through_an_autoencoder(request: Request) -> Tensor:
 
 def noisy(options: PseudoOptions, name: str, run: Run) -> PseudoDetails:
     """An augmenter by these options on the scene of a run, redrawn through an autoencoder."""
-    made = Made(through_an_autoencoder)
-    context = AugmenterContext(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=lambda role: made)
+    made = of_role(Made(through_an_autoencoder), options.checks, name)
+    context = AugmenterContext(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=made)
     return PseudoDetails(options, context)
+
+
+def of_role(made: Regenerator, checks: Checks, name: str = "upscale") -> Callable[[str], CheckedRegenerator]:
+    """What a context hands out: this regenerator for every role."""
+    checked = CheckedRegenerator(inner=made, checks=checks, tally=Tally(name=name))
+    return lambda role: checked

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from regenerating import of_role
 from torch import Tensor
 
-import gsx.augmenters.redraw as redraw
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.quality.metrics import psnr
-from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
+from gsx.core.training import checked_regenerator
+from gsx.core.training.checked_regenerator import displacement
+from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train
@@ -87,7 +89,7 @@ def trained(folder: Path, pixels: float | None) -> Seen:
     if pixels is not None:
         (augmenter,) = run.augmenters
         assert isinstance(augmenter, PseudoDetails)
-        context = replace(augmenter.context, regenerator=lambda role: Displaced(pixels))
+        context = replace(augmenter.context, regenerator=of_role(Displaced(pixels), augmenter.options.checks))
         run = replace(run, augmenters=[PseudoDetails(augmenter.options, context)])
     train(run, plugins())
     return seen(run)
@@ -98,7 +100,7 @@ def test_on_training_views_true_pixels_help_the_more_the_closer_and_displaced_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half a pixel of displacement, let through: the checks that would drop it have tests of their own."""
-    monkeypatch.setattr(redraw, "strayed", lambda request, result, checks: {})
+    monkeypatch.setattr(checked_regenerator, "strayed", lambda request, result, checks: {})
     control, perfect, displaced = (
         trained(tmp_path / name, pixels) for name, pixels in (("control", None), ("perfect", 0.0), ("displaced", 0.5))
     )

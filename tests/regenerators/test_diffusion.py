@@ -22,8 +22,9 @@ from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.training.checked_regenerator import displacement
 from gsx.core.training.parameter_table import table_tensors
-from gsx.core.training.regenerator import RegeneratorContext, Request, displacement
+from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
 from gsx.regenerators.diffusion.cascade import Cascade

@@ -12,7 +12,8 @@ from gsx.core.data.reduction import Reduction, box_average
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.core.training.regenerator import Regenerator, RegeneratorContext, strayed, unusable
+from gsx.core.training.checked_regenerator import strayed, unusable
+from gsx.core.training.regenerator import Regenerator, RegeneratorContext
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 
 CPU = torch.device("cpu")

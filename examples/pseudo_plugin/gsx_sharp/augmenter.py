@@ -22,7 +22,7 @@ class SteadyOptions:
 class SteadyZoom:
     def __init__(self, options: SteadyOptions, context: AugmenterContext) -> None:
         self.options, self.context = options, context
-        self.views: dict[int, PseudoView] = {}
+        self.views: dict[int, list[PseudoView]] = {}
 
     def begins(self) -> int:
         return round(self.options.start * self.context.iterations)
@@ -37,16 +37,21 @@ class SteadyZoom:
             self.context.regenerator("upscale").prepare(regenerator_context(run, self.context.seed))
         if view not in self.views:
             self.views[view] = self.zoomed(view)
-        parts = [(self.views[view], self.options.weight)]
+        parts = [(pseudo, self.options.weight) for pseudo in self.views[view]]
         return Term(name=self.context.name, parts=parts, replaces=0.0, observed=False, shared=True)
 
-    def zoomed(self, number: int) -> PseudoView:
-        """The middle half of a photograph, redrawn; it depends on nothing else, so a resumed run makes it again."""
+    def zoomed(self, number: int) -> list[PseudoView]:
+        """The middle half of a photograph, redrawn; it depends on nothing else, so a resumed run makes it again.
+
+        Nothing where the picture is dropped: whatever a regenerator returns has been checked and counted.
+        """
         view = self.context.scene.train[number]
         camera = view.camera.narrow(0.5)
         request = Request(
             image=view.source.image(camera).float() / 255, scale=2, camera=camera, view=view, number=number,
             photo=True, seed=self.context.seed, strength=0.0, strongest=0.0, prompt="", step=0,
         )  # fmt: skip
-        (picture,) = self.context.regenerator("upscale").regenerate([request])
-        return PseudoView(camera=camera.zoom(2), target=to_uint8(picture), parent=number)
+        (redrawn,) = self.context.regenerator("upscale").redraw([request])
+        if redrawn.image is None:
+            return []
+        return [PseudoView(camera=camera.zoom(2), target=to_uint8(redrawn.image.clamp(0, 1)), parent=number)]

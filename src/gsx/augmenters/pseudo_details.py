@@ -19,7 +19,6 @@ from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term
-from gsx.core.training.regenerator import Checked
 from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
@@ -41,20 +40,19 @@ class PseudoDetails:
             views=len(context.scene.train),
         )
         self.events, self.span = events_of(options.timing, self.schedule), span_of(options.timing, self.schedule)
+        self.regenerator = context.regenerator(options.role)
+        if max(options.scales) > 1 and options.project == "none":
+            self.regenerator.tally.remedies.append(f"augmenter.{context.name}.project=exact")
         self.refuse_impossible()
         self.planner = Planner(
             name=context.name, options=options, seed=context.seed, extent=context.scene.extent, events=self.events
         )
         self.store = Store(name=context.name, iterations=context.iterations, events=self.events, span=self.span)
         self.redrawer = Redrawer(
-            name=context.name,
-            options=options,
-            regenerator=context.regenerator(options.role),
-            schedule=self.schedule,
+            name=context.name, options=options, regenerator=self.regenerator, schedule=self.schedule
         )
         self.event = 0
         self.views: dict[int, list[PseudoView]] = {}
-        self.facts: dict[str, Any] = {}
 
     def refuse_impossible(self) -> None:
         """Now, not when half of the run is over.
@@ -76,9 +74,7 @@ class PseudoDetails:
                         f"augmenter.{name}: at scale {scale} and narrow {options.narrow:g} windows of '{view.name}' "
                         f"are {width} x {height} px; {LEAST_WINDOW} px are the least: lower scales or raise narrow"
                     )
-        regenerator = self.context.regenerator(options.role)
-        if isinstance(regenerator, Checked):
-            regenerator.check(self.context.scene.train, options.scales, options.variants > 0)
+        self.regenerator.refuse(self.context.scene.train, options.scales, options.variants > 0)
         if not self.events:
             logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
 
@@ -98,11 +94,10 @@ class PseudoDetails:
         """The pseudo views of the training view picked at this step, with their weights."""
         event = event_at(step, self.events, self.span)
         if event is None:
-            self.views, self.event, self.facts = {}, 0, {}
+            self.views, self.event = {}, 0
             return None
         if event != self.event:
-            found, self.facts = self.of_event(run, event, view)
-            self.views, self.event = by_parent(found), event
+            self.views, self.event = by_parent(self.of_event(run, event, view)), event
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
         return self.weighted(run, self.views.get(view, []), place, inside)
@@ -138,14 +133,8 @@ class PseudoDetails:
         coarser = len(options.coarser)
         return scales + coarser, scales * (options.variants + options.base) + coarser
 
-    def told(self, step: int) -> dict[str, Any]:
-        """Pictures asked for, dropped and warned of by scale, at the first step that asks for them; else nothing."""
-        if not self.facts or step != self.event + 1:
-            return {}
-        return {key: self.facts[key] for key in ("event", "asked", "dropped", "warned")}
-
-    def of_event(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views, facts) of an event: made now, or as the run made them before it was interrupted.
+    def of_event(self, run: Run, event: int, view: int) -> list[PseudoView]:
+        """The pseudo views of an event: made now, or as the run made them before it was interrupted.
 
         Only those that steps of its window will ask for, the first of them for `view` and the rest of its batch: the
         others are never looked at. Of several processes the first makes them all.
@@ -159,12 +148,12 @@ class PseudoDetails:
             run.ranks.all_gather(None)  # the others wait for the file
         return self.store.recalled(run, event) if made is None else made
 
-    def written(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views, facts) of an event that begins with this step, made and written to its file."""
+    def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
+        """The pseudo views of an event that begins with this step, made and written to its file."""
         steps = min(self.span, run.iterations - event)
         views, facts = self.made(run, event, {view, *run.sampler.taken} | run.sampler.coming(steps - 1))
         self.store.write(run, event, views, facts)
-        return views, facts
+        return views
 
     def made(self, run: Run, event: int, parents: Set[int]) -> tuple[list[PseudoView], dict[str, Any]]:
         """(pseudo views of some training views, facts) of an event, from the model as it is now.
@@ -172,14 +161,12 @@ class PseudoDetails:
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
-        regenerator = self.context.regenerator(self.options.role)
-        learnt = regenerator.prepare(regenerator_context(run, self.context.seed))
+        learnt = self.regenerator.prepare(regenerator_context(run, self.context.seed))
         if learnt:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)
         specs = list(self.planner.specs(run, event, parents))
-        drawn = self.redrawer.all_drawn(run, event, specs)
-        views = [one.view for one in drawn if one.view is not None]
+        views = self.redrawer.all_drawn(run, event, specs)
         views += [
             self.redrawer.coarser_view(run, event, parent, factor)
             for parent in sorted({spec.parent for spec in specs})
@@ -190,7 +177,7 @@ class PseudoDetails:
             "iterations": self.context.iterations,
             "made": len(views),
             "learnt": learnt,
-            **self.redrawer.judged(event, drawn),
+            **self.regenerator.tally.account(event),
         }
         counted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from gsx.augmenters.cameras import KEPT, NOISES, WINDOWS
 from gsx.augmenters.pixel_weights import WeightMap, sampled_better, seen_alike
 from gsx.augmenters.timing import SPLITS, Timing, events_of
-from gsx.core.training.regenerator import Checks
+from gsx.core.training.checked_regenerator import Checks
 from gsx.core.training.schedule import Schedule
 
 ZOOMS = ("intrinsics", "none")

@@ -1,12 +1,10 @@
-"""Pictures of pseudo views: requested, redrawn, checked, weighed (the paper, Practical Implementation)."""
+"""Pictures of pseudo views: requested, redrawn, weighed (the paper, Practical Implementation)."""
 
 import hashlib
 import logging
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,13 +15,13 @@ from gsx.augmenters.planner import PseudoViewSpec, reduced
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
 from gsx.augmenters.timing import ramp
 from gsx.core.data.images import write_image
-from gsx.core.data.reduction import Reduction, as_blocks, projected
+from gsx.core.data.reduction import Reduction, as_blocks
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.window import Window
-from gsx.core.errors import TrainingError
 from gsx.core.shapes import Float, UInt8
+from gsx.core.training.checked_regenerator import CheckedRegenerator
 from gsx.core.training.pseudo_views import PseudoView, picture_name
-from gsx.core.training.regenerator import Regenerator, Request, colour_matched, strayed, unusable
+from gsx.core.training.regenerator import Request
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
@@ -32,71 +30,41 @@ logger = logging.getLogger(__name__)
 
 BATCH = 64
 """Pictures redrawn between two lines of progress."""
-MOST_DROPPED = 0.5
-"""An event that loses more than this share of its pictures at one scale is an error."""
 SHOWN = 3
 """Training views of an event whose pictures are kept to be looked at."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RedrawnView:
-    """What has become of a planned pseudo view."""
-
-    scale: int
-    view: PseudoView | None
-    """None: its picture is dropped."""
-    problem: str
-    """Why it is dropped."""
-    warnings: dict[str, str]
-    """By check, what is told of a picture that is kept."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Redrawer:
-    """Asks a regenerator for the pictures of pseudo views, and keeps those that stand up to the checks."""
+    """Asks a regenerator for the pictures of pseudo views, and weighs those that stood up to the checks."""
 
     name: str
     options: PseudoOptions
-    regenerator: Regenerator
+    regenerator: CheckedRegenerator
     schedule: Schedule
 
-    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[RedrawnView]:
-        """What has become of each planned view, told batch by batch."""
-        drawn: list[RedrawnView] = []
+    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[PseudoView]:
+        """The pseudo views of what was planned, but for those whose pictures are dropped; told batch by batch."""
+        views: list[PseudoView] = []
         shown = sorted({spec.parent for spec in specs})[:SHOWN]
         for first in range(0, len(specs), BATCH):
-            drawn += self.drawn(run, event, specs[first : first + BATCH], shown)
-            logger.info("%s at step %d: %d of %d pictures", self.name, event, len(drawn), len(specs))
-        return drawn
+            batch = specs[first : first + BATCH]
+            views += self.drawn(run, event, batch, shown)
+            logger.info("%s at step %d: %d of %d pictures", self.name, event, first + len(batch), len(specs))
+        return views
 
-    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[RedrawnView]:
-        """What becomes of each planned view; pictures of the training views `shown` are kept to be looked at."""
-        regenerator = self.regenerator
+    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[PseudoView]:
+        """The pseudo views of some plans; pictures of the training views `shown` are kept to be looked at."""
+        options, views = self.options, []
         requests = [self.request(run, event, spec) for spec in specs]
-        samples = [regenerator.regenerate([again(r, n) for r in requests]) for n in range(self.options.samples)]
-        out: list[RedrawnView] = []
-        for spec, request, *results in zip(specs, requests, *samples, strict=True):
-            result = torch.stack([result.detach().cpu().float() for result in results]).mean(0)
-            one = self.checked(run, event, spec, request, result)
-            if one.view is not None and spec.parent in shown:
-                self.show(run.folder / "pseudo", spec, request, one.view)
-            out.append(one)
-        return out
-
-    def checked(self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Tensor) -> RedrawnView:
-        """The pseudo view of a result, if it may be used."""
-        problem, found = unusable(request, result), dict[str, str]()
-        if not problem:
-            result = colour_matched(request, result)
-            if self.options.project == "exact" and request.scale > 1:
-                result = projected(result, request.image.cpu(), request.scale, request.reduction)
-            found = strayed(request, result, self.options.checks)
-            dropped = [told for check, told in found.items() if getattr(self.options.checks, check).action == "drop"]
-            problem = "; ".join(dropped)
-        named = problem and f"{request.view.name}: {problem}"
-        view = None if problem else self.view(run, event, spec, request, result)
-        warnings = {} if problem else {check: f"{request.view.name}: {told}" for check, told in found.items()}
-        return RedrawnView(scale=spec.scale, view=view, problem=named, warnings=warnings)
+        redrawn = self.regenerator.redraw(requests, samples=options.samples, project=options.project == "exact")
+        for spec, request, one in zip(specs, requests, redrawn, strict=True):
+            if one.image is not None:
+                view = self.view(run, event, spec, request, one.image)
+                views.append(view)
+                if spec.parent in shown:
+                    self.show(run.folder / "pseudo", spec, request, view)
+        return views
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
@@ -116,12 +84,6 @@ class Redrawer:
             prompt=self.options.prompt.replace("{scene}", run.scene.name),
             step=event,
         )
-
-    @property
-    def remedy(self) -> str:
-        """What else helps where a regenerator strays too far."""
-        enlarging = max(self.options.scales) > 1 and self.options.project == "none"
-        return f", or augmenter.{self.name}.project=exact" if enlarging else ""
 
     def view(
         self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"]
@@ -206,38 +168,3 @@ class Redrawer:
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.name, view), torch.cat([given, result, difference], 2))
-
-    def judged(self, event: int, drawn: Sequence[RedrawnView]) -> dict[str, Any]:
-        """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
-
-        Raises:
-            TrainingError: more than half of the pictures of a scale could not be used.
-        """
-        name = self.name
-        asked, dropped = by_scale(drawn), by_scale([one for one in drawn if one.view is None])
-        warned: dict[str, dict[str, int]] = {}
-        for scale, count in dropped.items():
-            reason = next(one.problem for one in drawn if one.problem and str(one.scale) == scale)
-            logger.warning("%s: %d of %d x%s pictures dropped: %s", name, count, asked[scale], scale, reason)
-            if count > MOST_DROPPED * asked[scale]:
-                raise TrainingError(
-                    f"augmenter {name} lost {count} of {asked[scale]} pictures at x{scale}, step {event}: {reason}; "
-                    f"choose another regenerator/{self.options.role}, or loosen augmenter.{name}.checks{self.remedy}"
-                )
-        for check in dict.fromkeys(check for one in drawn for check in one.warnings):
-            strays = [one for one in drawn if check in one.warnings]
-            warned[check] = by_scale(strays)
-            first = strays[0].warnings[check]
-            logger.warning("%s: %d of %d pictures kept although %s", name, len(strays), len(drawn), first)
-        return {"asked": asked, "dropped": dropped, "warned": warned}
-
-
-def again(request: Request, number: int) -> Request:
-    """The request for its n-th sample."""
-    return replace(request, seed=request.seed + number)
-
-
-def by_scale(drawn: Sequence[RedrawnView]) -> dict[str, int]:
-    """How many there are at each scale; keys as JSON has them."""
-    counts = Counter(one.scale for one in drawn)
-    return {str(scale): counts[scale] for scale in sorted(counts)}

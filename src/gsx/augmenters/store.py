@@ -48,8 +48,8 @@ class Store:
             if path not in kept:
                 path.unlink()
 
-    def recalled(self, run: Run, event: int) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views, facts) that the run had made before it was interrupted.
+    def recalled(self, run: Run, event: int) -> list[PseudoView]:
+        """The pseudo views that the run had made before it was interrupted.
 
         None where it was made longer since, so that its events and windows lie elsewhere: the next one goes on.
 
@@ -61,8 +61,8 @@ class Store:
         try:
             if latest and (found := load_views(latest[0]))[1]["iterations"] != self.iterations:
                 logger.info("%s rests until its next event: the run has become longer", self.name)
-                return [], {}
-            return found if latest == [path] else load_views(path)
+                return []
+            return found[0] if latest == [path] else load_views(path)[0]
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "

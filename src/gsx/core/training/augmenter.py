@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from gsx.core.data.scene import Scene
-from gsx.core.training.regenerator import Regenerator
+from gsx.core.training.checked_regenerator import CheckedRegenerator
 from gsx.core.training.run import Augmenter
 
-__all__ = ["Augmenter", "AugmenterContext", "Foretold", "Replacing", "Telling"]
+__all__ = ["Augmenter", "AugmenterContext", "Foretold", "Replacing"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -19,18 +19,8 @@ class AugmenterContext:
     scene: Scene
     iterations: int
     seed: int
-    regenerator: Callable[[str], Regenerator]
+    regenerator: Callable[[str], CheckedRegenerator]
     """The regenerator of a role, `upscale` or `restore`."""
-
-
-@runtime_checkable
-class Telling(Protocol):
-    """An augmenter that tells what became of the pictures it asked for; metrics.jsonl and evaluations count them."""
-
-    def told(self, step: int) -> dict[str, Any]:
-        """At the first step that asks for new pictures their `event`, and by scale how many were `asked` for, how many
-        `dropped`, and `warned` of by check; else empty. JSON-serialisable."""
-        ...
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, Observation
+from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.pseudo_views import Term
 
@@ -123,6 +124,8 @@ class Run:
     """A backbone of the same options at step 0, for a scene, so many steps and a generator; None: the run is only
     looked at."""
     augmenters: Sequence[Augmenter] = ()
+    tallies: Sequence[Tally] = ()
+    """What has become of the pictures that each augmenter asked for."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     step: int = 0
@@ -173,7 +176,7 @@ class Step:
     terms: dict[str, float] = field(default_factory=dict)
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
     pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """By augmenter, what became of the pictures that it asked for at this step (`pseudo.Telling`); mostly none."""
+    """By augmenter, what became of the pictures that it asked for at this step (`Tally`); mostly none."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 

@@ -16,7 +16,6 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
-from gsx.core.training.augmenter import Telling
 from gsx.core.training.backbone import Drawn, Observation, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, next_views
 from gsx.core.training.parameter_table import shared_colour, zero_grad
@@ -89,8 +88,7 @@ def backward(run: Run) -> Step:
 
 def asked_for(run: Run, number: int) -> dict[str, dict[str, Any]]:
     """By augmenter, what became of the pictures that it asked for at this step."""
-    named = zip(run.config.get("augmenter") or {}, run.augmenters, strict=False)
-    told = {name: augmenter.told(number) for name, augmenter in named if isinstance(augmenter, Telling)}
+    told = {tally.name: tally.told(number) for tally in run.tallies}
     return {name: facts for name, facts in told.items() if facts}
 
 

@@ -12,10 +12,11 @@ from gsx.core.errors import ConfigError
 from gsx.core.rasterizer.prepare import decide
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
+from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
-from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.settings import Chosen, Settings
 
 
 def choose_device(name: str) -> torch.device:
@@ -50,6 +51,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         return settings.backbone.component.factory(settings.backbone.options, context)
 
     backbone = anew(scene, general.iterations, generator)
+    augmenters = build_augmenters(settings, scene) if training else []
     return Run(
         config=settings.resolved,
         folder=folder,
@@ -62,39 +64,59 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
         anew=anew,
-        augmenters=build_augmenters(settings, scene) if training else [],
+        augmenters=[augmenter for augmenter, _ in augmenters],
+        tallies=[tally for _, tally in augmenters],
         ranks=ranks,
     )
 
 
-def build_augmenters(settings: Settings, scene: Scene) -> list[Augmenter]:
-    """The augmenters of a run, in order; they share regenerators by role."""
+def build_augmenters(settings: Settings, scene: Scene) -> list[tuple[Augmenter, Tally]]:
+    """The augmenters of a run, in order, and what becomes of their pictures; they share regenerators by role.
+
+    Raises:
+        ConfigError: together they replace the whole loss of the photographs.
+    """
     built: dict[str, Regenerator] = {}
-
-    def regenerator(role: str) -> Regenerator:
-        if role not in settings.regenerators:
-            raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
-        if role not in built:
-            chosen = settings.regenerators[role]
-            built[role] = chosen.component.factory(chosen.options)
-        return built[role]
-
-    out = []
-    for name, chosen in settings.augmenters.items():
-        context = AugmenterContext(
-            name=name,
-            scene=scene,
-            iterations=settings.general.iterations,
-            seed=settings.general.seed,
-            regenerator=regenerator,
-        )
-        out.append(chosen.component.factory(chosen.options, context))
-    replacing = [(name, a) for name, a in zip(settings.augmenters, out, strict=True) if isinstance(a, Replacing)]
-    shares = {name: augmenter.share() for name, augmenter in replacing}
+    out = [augmenter_of(name, chosen, settings, scene, built) for name, chosen in settings.augmenters.items()]
+    shares = {tally.name: augmenter.share() for augmenter, tally in out if isinstance(augmenter, Replacing)}
     if sum(shares.values()) >= 1:
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
         raise ConfigError(f"augmenters take the whole loss of the photographs ({listed}): lower their weights")
     return out
+
+
+def augmenter_of(
+    name: str, chosen: Chosen, settings: Settings, scene: Scene, built: dict[str, Regenerator]
+) -> tuple[Augmenter, Tally]:
+    """An augmenter, and the tally of its pictures; `built`: regenerators by role, so far."""
+    own, tally = chosen.options if isinstance(chosen.options, WithChecks) else None, Tally(name=name)
+
+    def regenerator(role: str) -> CheckedRegenerator:
+        inner = built[role] = built.get(role) or regenerator_of(role, settings)
+        where = f"augmenter.{name}.checks" if own else f"checks.{role}"
+        tally.remedies = [f"choose another regenerator/{role}", f"loosen {where}"]
+        return CheckedRegenerator(inner=inner, checks=own.checks if own else settings.checks[role], tally=tally)
+
+    context = AugmenterContext(
+        name=name,
+        scene=scene,
+        iterations=settings.general.iterations,
+        seed=settings.general.seed,
+        regenerator=regenerator,
+    )
+    return chosen.component.factory(chosen.options, context), tally
+
+
+def regenerator_of(role: str, settings: Settings) -> Regenerator:
+    """The regenerator chosen for a role.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if role not in settings.regenerators:
+        raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
+    chosen = settings.regenerators[role]
+    return chosen.component.factory(chosen.options)
 
 
 def plan_of(run: Run) -> dict[str, Any]:

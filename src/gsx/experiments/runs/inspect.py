@@ -107,7 +107,7 @@ def command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:
     """The options that this command means."""
     with hydra_session(plugins):
-        asked = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path), **overrides})
+        asked = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
     return typed(loader.options, OmegaConf.to_container(asked), "scene")
 
 

@@ -14,7 +14,7 @@ from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.evaluation.evaluator import EvalOptions
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.regenerator import Checks
+from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.run import TrainingOptions
 
 COMPONENT_KINDS = ("scene", "backbone")
@@ -108,6 +108,8 @@ class Settings:
     """By name, in the order of the command line."""
     regenerators: dict[str, Chosen]
     """By role: upscale, restore. Only those that an augmenter asks for are built."""
+    checks: dict[str, Checks]
+    """By role: what its pictures have to keep, for augmenters without checks of their own."""
     dataset: Dataset | None
     trackers: dict[str, Chosen]
     """By name, in the order of the command line."""
@@ -139,8 +141,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}
-    for role, node in named_nodes(values.pop("checks", None), "checks").items():
-        typed(Checks, node, f"checks.{role}")  # augmenters have taken theirs over
+    checks = {r: typed(Checks, n, f"checks.{r}") for r, n in named_nodes(values.pop("checks", None), "checks").items()}
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)
     if budget is not None:
         typed(Budget, budget, "budget")
@@ -148,6 +149,8 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     trackers = named_nodes(values.pop("tracker", None), "tracker")
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
+    found = {name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()}
+    idle = () if any(not isinstance(one.options, WithChecks) for one in found.values()) else ("checks",)
     return Settings(
         general=typed(GeneralOptions, values, ""),
         training=typed(TrainingOptions, parts["training"], "training"),
@@ -155,11 +158,12 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
         scene=chosen("scene", parts["scene"], plugins),
         backbone=chosen("backbone", parts["backbone"], plugins),
-        augmenters={name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()},
+        augmenters=found,
         regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
         trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
-        resolved={key: value for key, value in raw.items() if key not in ("experiment", "checks")},  # type: ignore[misc]
+        checks={role: checks.get(role) or strict_checks() for role in regenerators},
+        resolved={key: value for key, value in raw.items() if key not in ("experiment", *idle)},  # type: ignore[misc]
     )
 
 
@@ -296,10 +300,20 @@ def add_newer_settings(config: Any) -> None:
     augmenters = config.get("augmenter")
     for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
         if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
-            with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
-                node.checks = OmegaConf.load(path)
+            node.checks = strict_node()
     density = OmegaConf.select(config, "backbone.clone_split.level_density")
     if isinstance(density, DictConfig) and "gate" in density:
         waits = density.pop("gate")
         if config.backbone.densification == "clone_split":
             OmegaConf.update(config, "backbone.quirks.gate", "closed" if waits else "open", force_add=True)
+
+
+def strict_node() -> Any:
+    """conf/checks/strict.yaml."""
+    with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
+        return OmegaConf.load(path)
+
+
+def strict_checks() -> Checks:
+    """The checks of regenerators that promise consistency, and of all that say nothing."""
+    return typed(Checks, OmegaConf.to_container(strict_node()), "checks")

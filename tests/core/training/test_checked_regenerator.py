@@ -1,15 +1,26 @@
 """Checks that every regenerator's pictures pass: size, colour, agreement, displacement."""
 
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import pytest
 import torch
-from regenerating import request, strict_checks
+from regenerating import Made, request, strict_checks
 from torch import Tensor
 
-from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.data.reduction import Reduction, as_blocks, box_average
 from gsx.core.data.resize import resize, to_uint8
-from gsx.core.training.regenerator import Check, Request, colour_matched, displacement, strayed, unusable
+from gsx.core.errors import TrainingError
+from gsx.core.training.checked_regenerator import (
+    Check,
+    CheckedRegenerator,
+    Tally,
+    colour_matched,
+    displacement,
+    strayed,
+    unusable,
+)
+from gsx.core.training.regenerator import Request
 
 STRICT = strict_checks()
 BICUBIC = Reduction(filter="bicubic")
@@ -124,3 +135,65 @@ def test_box_averages() -> None:
     image = torch.arange(16.0).view(1, 4, 4)
     assert box_average(image, 2).tolist() == [[[2.5, 4.5], [10.5, 12.5]]]
     assert torch.equal(box_average(image, 1), image)
+
+
+# -- the whole: put right, checked, counted ----------------------------------------------------------------------------
+
+
+def checked(enlarge: Callable[[Request], Tensor]) -> CheckedRegenerator:
+    tally = Tally(name="mine", remedies=["choose another regenerator/upscale", "loosen checks.upscale"])
+    return CheckedRegenerator(inner=Made(enlarge), checks=STRICT, tally=tally)
+
+
+def spoilt_where(spoilt: Collection[int]) -> Callable[[Request], Tensor]:
+    """The input in blocks; not finite for those numbers."""
+    return lambda asked: as_blocks(asked.image, asked.scale) * (torch.nan if asked.number in spoilt else 1.0)
+
+
+def test_whoever_asks_gets_checked_pictures_and_their_tally(caplog: pytest.LogCaptureFixture) -> None:
+    """One of three is lost: it has no picture and a reason; told once, at the step that asked for it."""
+    regenerator = checked(spoilt_where({1}))
+    drawn = regenerator.redraw([replace(request(texture()), number=number) for number in range(3)])
+    assert [one.image is None for one in drawn] == [False, True, False]
+    assert drawn[1].problem == "a: it holds values that are not finite"
+    told = {"event": 6, "asked": {"2": 3}, "dropped": {"2": 1}, "warned": {}}
+    assert regenerator.tally.told(7) == told
+    assert "mine: 1 of 3 x2 pictures dropped: a: it holds values that are not finite" in caplog.text
+    assert regenerator.tally.told(8) == {}
+
+
+def test_losing_most_pictures_is_an_error_that_names_remedies() -> None:
+    regenerator = checked(spoilt_where({0, 1}))
+    regenerator.redraw([replace(request(texture()), number=number) for number in range(3)])
+    with pytest.raises(TrainingError, match=r"lost 2 of 3 pictures at x2, step 6: .*, or loosen checks\.upscale"):
+        regenerator.tally.account(6)
+
+
+def test_one_bad_picture_among_those_asked_for_now_and_then_ends_nothing() -> None:
+    """The first 4 of 8 are lost, which is half; then the ninth is lost too."""
+    regenerator = checked(spoilt_where({0, 1, 2, 3, 8}))
+    for number in range(8):
+        regenerator.redraw([replace(request(texture()), number=number)])
+        assert regenerator.tally.told(number + 1)["dropped"] == ({"2": 1} if number < 4 else {})
+    regenerator.redraw([replace(request(texture()), number=8)])
+    with pytest.raises(TrainingError, match="lost 5 of 9 pictures at x2, step 8"):
+        regenerator.tally.told(9)
+
+
+def test_the_mean_of_samples_counts_and_is_projected_where_that_is_asked_for() -> None:
+    """Samples of 0.6 and 0 off have a mean of 0.3 in half of each block: 16 dB, which no shift of the colour mends."""
+
+    def uneven(asked: Request) -> Tensor:
+        out = as_blocks(asked.image, asked.scale).clone()
+        off = 0.6 if asked.seed % 2 else 0.0
+        out[:, ::4] -= off
+        out[:, 2::4] += off
+        return out
+
+    asked = request(torch.full((3, 8, 8), 0.5))
+    (plain,) = checked(uneven).redraw([asked], samples=2)
+    assert plain.image is None
+    assert plain.problem.startswith("a: reduced it is 16.5 dB from its input")
+    (moved,) = checked(uneven).redraw([asked], samples=2, project=True)
+    assert moved.image is not None
+    torch.testing.assert_close(box_average(moved.image, 2), asked.image)

@@ -1,0 +1,259 @@
+"""Regenerators as augmenters get them: whatever they make is put right, checked, counted and told."""
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.reduction import projected
+from gsx.core.data.scene import View
+from gsx.core.errors import TrainingError
+from gsx.core.quality.metrics import psnr
+from gsx.core.shapes import Float
+from gsx.core.training.regenerator import Checked, Regenerator, RegeneratorContext, Request
+
+logger = logging.getLogger(__name__)
+
+MOST_DROPPED = 0.5
+"""Losing more than this share of the pictures at one scale is an error."""
+FEWEST = 8
+"""Of pictures that are asked for now and then, at least so many are awaited before that is said."""
+LARGEST_DRIFT = 2 / 255
+"""Mean colours that differ by more are put right."""
+LEAST_SLOPE = 1e-3
+"""Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
+ACTIONS = ("drop", "warn", "off")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """A limit, and what happens to a picture beyond it."""
+
+    limit: float
+    action: str
+    """drop; warn: it is kept, counted and told; off: nothing is looked at."""
+
+    def __post_init__(self) -> None:
+        if self.action not in ACTIONS:
+            raise ValueError(f"the action of a check is '{self.action}'; choose drop, warn or off (in YAML 'off')")
+        if not self.limit >= 0:
+            raise ValueError(f"the limit of a check is {self.limit}; give at least 0")
+
+    @property
+    def active(self) -> bool:
+        """Whether anything happens beyond the limit."""
+        return self.action != "off"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checks:
+    """What a redrawn picture has to keep of what it was made from; values in conf/checks."""
+
+    colour: Check
+    """Largest change of the mean colour, 8-bit levels, after `colour_matched`."""
+    agreement: Check
+    """Least PSNR between an enlarged picture, reduced again, and its input, dB."""
+    displacement: Check
+    """Largest displacement, px of the input."""
+
+
+@runtime_checkable
+class WithChecks(Protocol):
+    """Options of an augmenter that has checks of its own; the others get those of the regenerator's role."""
+
+    @property
+    def checks(self) -> Checks:
+        """What a redrawn picture has to keep."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Redrawn:
+    """What has become of a request."""
+
+    scale: int
+    image: Float[Tensor, "3 H W"] | None
+    """Values may lie beyond [0, 1]; None: it is dropped."""
+    problem: str = ""
+    """Why it is dropped."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """By check, what is told of a picture that is kept."""
+
+
+@dataclass(eq=False, kw_only=True)
+class Tally:
+    """What has become of the pictures that an augmenter asked for."""
+
+    name: str
+    """Of the augmenter."""
+    remedies: list[str] = field(default_factory=list)
+    """What helps where too many are lost."""
+    pending: list[Redrawn] = field(default_factory=list)
+    """Those that no account has been given of; without their pictures."""
+    latest: dict[str, Any] = field(default_factory=dict)
+    """The last account."""
+    asked: Counter[str] = field(default_factory=Counter)
+    """All so far, by scale."""
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    def account(self, event: int, whole: bool = True) -> dict[str, Any]:
+        """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
+
+        `whole`: they are all of an event; otherwise losses are judged over the run.
+
+        Raises:
+            TrainingError: more than half of the pictures of a scale could not be used.
+        """
+        drawn, self.pending = self.pending, []
+        asked, dropped = by_scale(drawn), by_scale([one for one in drawn if one.problem])
+        self.asked.update(asked)
+        self.dropped.update(dropped)
+        for scale, count in dropped.items():
+            reason = next(one.problem for one in drawn if one.problem and str(one.scale) == scale)
+            logger.warning("%s: %d of %d x%s pictures dropped: %s", self.name, count, asked[scale], scale, reason)
+            lost, of = (count, asked[scale]) if whole else (self.dropped[scale], self.asked[scale])
+            if lost > MOST_DROPPED * of and (whole or of >= FEWEST):
+                raise TrainingError(
+                    f"augmenter {self.name} lost {lost} of {of} pictures at x{scale}, step {event}: {reason}; "
+                    f"{', or '.join(self.remedies)}"
+                )
+        self.latest = {"event": event, "asked": asked, "dropped": dropped, "warned": self.warned(drawn)}
+        return self.latest
+
+    def warned(self, drawn: Sequence[Redrawn]) -> dict[str, dict[str, int]]:
+        """Pictures that are kept although a check warns of them, by check and scale."""
+        counts: dict[str, dict[str, int]] = {}
+        for check in dict.fromkeys(check for one in drawn for check in one.warnings):
+            strays = [one for one in drawn if check in one.warnings]
+            counts[check] = by_scale(strays)
+            first = strays[0].warnings[check]
+            logger.warning("%s: %d of %d pictures kept although %s", self.name, len(strays), len(drawn), first)
+        return counts
+
+    def told(self, step: int) -> dict[str, Any]:
+        """The account of the pictures asked for at this step; empty where there were none."""
+        if self.pending:
+            self.account(step - 1, whole=False)
+        return self.latest if self.latest.get("event") == step - 1 else {}
+
+
+def by_scale(drawn: Sequence[Redrawn]) -> dict[str, int]:
+    """How many there are at each scale; keys as JSON has them."""
+    counts = Counter(one.scale for one in drawn)
+    return {str(scale): counts[scale] for scale in sorted(counts)}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckedRegenerator:
+    """A regenerator, the checks of its pictures, and their tally."""
+
+    inner: Regenerator
+    checks: Checks
+    tally: Tally
+
+    def refuse(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """Before training: raise ConfigError or InputError if it can say already that it will not do (`Checked`)."""
+        if isinstance(self.inner, Checked):
+            self.inner.check(views, scales, moved)
+
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
+        """Learn from the scene, if there is anything to learn; figures for the log. To be called at every event."""
+        return self.inner.prepare(context)
+
+    def redraw(self, requests: Sequence[Request], *, samples: int = 1, project: bool = False) -> list[Redrawn]:
+        """What becomes of each request, in order.
+
+        `samples`: of each the mean of so many results counts. `project`: enlarged pictures are moved to the nearest
+        one that reduces to the request's.
+        """
+        results = [self.inner.regenerate([again(request, n) for request in requests]) for n in range(samples)]
+        drawn = []
+        for request, *of_one in zip(requests, *results, strict=True):
+            mean = torch.stack([result.detach().cpu().float() for result in of_one]).mean(0)
+            drawn.append(self.checked(request, mean, project))
+        self.tally.pending += [replace(one, image=None) for one in drawn]
+        return drawn
+
+    def checked(self, request: Request, result: Tensor, project: bool) -> Redrawn:
+        """The result, put right, if it may be used."""
+        name, problem = request.view.name, unusable(request, result)
+        if problem:
+            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {problem}")
+        result = colour_matched(request, result)
+        if project and request.scale > 1:
+            result = projected(result, request.image.cpu(), request.scale, request.reduction)
+        found = strayed(request, result, self.checks)
+        dropped = [told for check, told in found.items() if getattr(self.checks, check).action == "drop"]
+        if dropped:
+            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {'; '.join(dropped)}")
+        return Redrawn(
+            scale=request.scale, image=result, warnings={check: f"{name}: {told}" for check, told in found.items()}
+        )
+
+
+def again(request: Request, number: int) -> Request:
+    """The request for its n-th sample."""
+    return replace(request, seed=request.seed + number)
+
+
+def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3"]:
+    """By how much the mean colour of a result differs from that of its input."""
+    return result.cpu().float().mean((1, 2)) - request.image.cpu().mean((1, 2))
+
+
+def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """The result, its mean colour put right where it is more than LARGEST_DRIFT off."""
+    drift = colour_drift(request, result)
+    return result if float(drift.abs().max()) <= LARGEST_DRIFT else result.cpu() - drift[:, None, None]
+
+
+def unusable(request: Request, result: Tensor) -> str:
+    """Why a result is no picture of what was asked for; empty for one that is."""
+    expected = (3, *request.result_size)
+    if tuple(result.shape) != expected:
+        return f"it is {tuple(result.shape)} and should be {expected}"
+    if not bool(torch.isfinite(result).all()):
+        return "it holds values that are not finite"
+    return ""
+
+
+def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
+    """How a result differs from its input by more than a check allows, in words by the check's name.
+
+    Looked at without the rim of the window, which was reduced from pixels beyond it.
+    """
+    reduction = request.reduction
+    low = reduction.inner(reduction.reduce(result.cpu().float().clamp(0, 1), request.scale))
+    given = reduction.inner(request.image.cpu())
+    drift = 255 * float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
+    agreement = psnr(low, given) if request.scale > 1 else math.inf
+    shift = displacement(low, given) if checks.displacement.active else 0.0
+    words = {
+        "colour": (drift > checks.colour.limit, f"its mean colour is {drift:.1f} levels off"),
+        "agreement": (agreement < checks.agreement.limit, f"reduced it is {agreement:.1f} dB from its input"),
+        "displacement": (shift > checks.displacement.limit, f"it is displaced by {shift:.2f} px"),
+    }
+    return {name: told for name, (beyond, told) in words.items() if beyond and getattr(checks, name).active}
+
+
+def displacement(image: Float[Tensor, "3 h w"], reference: Float[Tensor, "3 h w"]) -> float:
+    """Length of the shift that explains their difference best to first order, px; 0 where nothing could show one.
+
+    The least-squares solution of image - reference = shift . gradient (Lucas and Kanade 1981).
+    """
+    if min(reference.shape[1:]) < 3:
+        return 0.0
+    grey, other = reference.double().mean(0), image.double().mean(0)
+    dx = (grey[1:-1, 2:] - grey[1:-1, :-2]) / 2
+    dy = (grey[2:, 1:-1] - grey[:-2, 1:-1]) / 2
+    difference = (other - grey)[1:-1, 1:-1]
+    slopes = torch.stack([dx.flatten(), dy.flatten()])
+    system, right = slopes @ slopes.T, slopes @ difference.flatten()
+    if float(torch.linalg.eigvalsh(system)[0]) < LEAST_SLOPE**2 * slopes.shape[1]:
+        return 0.0
+    return float(torch.linalg.solve(system, right).norm())
