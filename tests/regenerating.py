@@ -92,5 +92,7 @@ def noisy(options: PseudoOptions, name: str, run: Run) -> PseudoDetails:
 
 def of_role(made: Regenerator, checks: Checks, name: str = "upscale") -> Callable[[str], CheckedRegenerator]:
     """What a context hands out: this regenerator for every role."""
-    checked = CheckedRegenerator(inner=made, checks=checks, tally=Tally(name=name))
+    checked = CheckedRegenerator(
+        inner=made, checks=checks, tally=Tally(name=name, remedies=["choose another regenerator/upscale"])
+    )
     return lambda role: checked

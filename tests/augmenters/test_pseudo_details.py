@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from regenerating import of_role
 from safetensors.torch import load_file
 from tiny import tiny_run, tiny_settings
 from torch import Tensor
@@ -497,7 +498,7 @@ SPOILT = {
 
 def with_regenerator(run: Run, regenerator: Any) -> PseudoDetails:
     old = augmenter_of(run)
-    return PseudoDetails(old.options, replace(old.context, regenerator=lambda role: regenerator))
+    return PseudoDetails(old.options, replace(old.context, regenerator=of_role(regenerator, old.options.checks)))
 
 
 @pytest.mark.parametrize("reason", SPOILT)
@@ -533,7 +534,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
     for samples in (1, 16):
         old = augmenter_of(run)
         options = replace(old.options, samples=samples, seeds="per_view")
-        noisy = PseudoDetails(options, replace(old.context, regenerator=lambda role: Noisy(10**9, None)))
+        noisy = PseudoDetails(options, replace(old.context, regenerator=of_role(Noisy(10**9, None), options.checks)))
         noisy.term(run, 45, 0)
         pairs = [(a.target.float(), b.target.float()) for a, b in zip(plain.views[0], noisy.views[0], strict=True)]
         errors.append(float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean()))

@@ -281,6 +281,12 @@ def test_statistics_that_were_saved_as_columns_are_found() -> None:
     assert restored_table(empty, saved)["visits"].tolist() == [3, 4]
 
 
+def test_learning_rates_that_are_set_once_outlive_a_restart() -> None:
+    table = ParameterTable({"flat": Parameter(torch.ones(2))})
+    table.set_rate("flat", 0.5)
+    assert restored_table(table, table_tensors(table)).group("flat")["lr"] == 0.5
+
+
 def small_networks() -> Networks:
     torch.manual_seed(0)
     modules = nn.ModuleDict({"opacity": nn.Linear(2, 1), "colour": nn.Linear(2, 3)})

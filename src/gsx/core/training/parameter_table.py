@@ -200,7 +200,7 @@ def networks_tensors(networks: Networks) -> dict[str, Tensor]:
 
 
 def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
-    """The table that `table_tensors` saw, whatever its number of rows: with all that `like` has, on its device.
+    """The table that `table_tensors` saw, whatever its number of rows, with all that `like` has and its learning rates.
 
     Raises:
         CheckpointError: something of it was not saved: the run had other options.
@@ -211,6 +211,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
     table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks)
     for name, parameter in table.parameters.items():
+        table.set_rate(name, like.group(name)["lr"])
         restore_adam(name, parameter, table.optimiser, tensors, device)
     if table.networks is not None:
         restore_networks(table.networks, tensors, device)
