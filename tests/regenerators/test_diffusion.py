@@ -726,7 +726,7 @@ def test_a_damaged_adapter_in_the_cache_is_learnt_again(
 
 def test_packages_that_are_not_installed_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the command; those that only tuning needs, only for it."""
-    monkeypatch.setattr("gsx.regenerators.diffusion.models.find_spec", lambda name: None)
+    monkeypatch.setattr("gsx.core.packages.find_spec", lambda name: None)
     views = small_scene(spread(4)).train
     told = r"needs diffusers, transformers, accelerate{}: pip install 'gsx\[diffusion\]'"
     for name, more in (("sd_x4", ""), ("sdxl_turbo_raw", ""), ("sdxl_turbo", ", peft")):

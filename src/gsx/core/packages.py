@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.util import find_spec
 
 from gsx.core.errors import ConfigError, first_line
 
 
 def require(what: str, packages: Sequence[str], extra: str) -> None:
-    """Raise ConfigError if a package cannot be imported; `extra`: what pip is to install."""
+    """Raise ConfigError if a package is not installed, or cannot be imported; `extra`: what pip is to install."""
+    missing = [package for package in packages if find_spec(package.partition(".")[0]) is None]
+    if missing:
+        raise ConfigError(f"{what} needs {', '.join(missing)}: pip install '{extra}'")
     for package in packages:
         try:
             import_module(package)
         except ImportError as error:
-            remedy = f"pip install '{extra}'"
-            raise ConfigError(f"{what} needs {package} ({first_line(error)}): {remedy}") from error
+            raise ConfigError(f"{what} needs {package} ({first_line(error)}): pip install '{extra}'") from error

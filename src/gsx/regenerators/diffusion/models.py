@@ -3,17 +3,15 @@
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gsx.core.cache import content_key, source_digest
-from gsx.core.errors import ConfigError, InputError, TrainingError, first_line
+from gsx.core.errors import InputError, TrainingError, first_line
 from gsx.regenerators.diffusion.model_specs import ModelSpec
 from gsx.regenerators.diffusion.options import DiffusionOptions
 
@@ -23,13 +21,6 @@ INDEX = "model_index.json"
 PACKAGES = ("diffusers", "transformers", "accelerate")
 CHUNK = 1 << 24
 """Bytes read at a time."""
-
-
-def require(name: str, packages: Sequence[str]) -> None:
-    """Raise ConfigError if a package is not installed."""
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise ConfigError(f"regenerator {name} needs {', '.join(missing)}: pip install 'gsx[diffusion]'")
 
 
 def located(options: DiffusionOptions, spec: ModelSpec) -> Path:

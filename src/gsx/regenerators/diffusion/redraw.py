@@ -19,6 +19,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError, InputError, TrainingError
+from gsx.core.packages import require
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.classical import refuse_enlarging
@@ -31,7 +32,6 @@ from gsx.regenerators.diffusion.models import (
     number_type,
     opened,
     place,
-    require,
 )
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
 from gsx.regenerators.diffusion.pace import Pace
@@ -77,7 +77,8 @@ class Diffusion:
         for scale in scales:
             rounds_to(scale, self.spec, self.options)
         tuning = self.options.tuning.steps if isinstance(self.options, RestorerOptions) else 0
-        require(self.options.name, (*PACKAGES, *(("peft",) if tuning else ())))
+        packages = (*PACKAGES, *(("peft",) if tuning else ()))
+        require(f"regenerator {self.options.name}", packages, "gsx[diffusion]")
         if tuning and len(views) < 2:
             raise InputError(
                 f"regenerator {self.options.name} needs at least 2 training views to be tuned, there is {len(views)}: "
