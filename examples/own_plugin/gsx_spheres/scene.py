@@ -12,6 +12,7 @@ from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
+from gsx.core.options import without_effect
 
 FILE = "snapshots.json"
 FORMAT = SceneFormat(meaning=f"snapshots ({FILE})", sign=FILE, recognise=lambda path: (path / FILE).is_file())
@@ -20,7 +21,7 @@ FORMAT = SceneFormat(meaning=f"snapshots ({FILE})", sign=FILE, recognise=lambda 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotOptions:
     name: str
-    path: str
+    path: str = without_effect()  # a run is named by what lies there
     every: int
     points: int
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from gsx.core.options import without_effect
+
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
@@ -11,10 +13,10 @@ class SceneOptions:
     """Name of the format, which is also the name of its file in conf/scene."""
     background: list[float]
     """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (3D-GS, dataset_readers.py)."""
-    iterations: int = 0
+    iterations: int = without_effect(default=0)
     """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
     published one."""
-    path: str = ""
+    path: str = without_effect(default="")
     """Folder of the scene."""
     downscale: int = 1
     """Train on images reduced by this factor; the originals stay the truth of zoomed-in views (3D-GS)."""
@@ -29,7 +31,7 @@ class SceneOptions:
     unit: float = 1.0
     """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
     0.2, least distances, limits of scales) expect scenes of a few units."""
-    cache_gb: float = 2.0
+    cache_gb: float = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     split: str = "every:8"
     """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""

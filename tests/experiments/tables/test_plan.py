@@ -107,7 +107,8 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
     with Compositions(plugins()) as compositions:
 
         def key(*words: str) -> str:
-            return composition_key(compositions.settings(["scene=demo", *words]).resolved, "")
+            settings = compositions.settings(["scene=demo", *words])
+            return composition_key(settings.resolved, "", settings.idle)
 
         plain = key()
         for word in ("output=elsewhere", "device=cpu", "init=trunk", "trunk_at=[3]", "eval.zoom=[1,2]", "reuse=true",
@@ -121,9 +122,10 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         assert key("augmenter=upscale", "regenerator/restore=identity") == upscaled  # nobody asks for it
         assert key("augmenter=upscale", "regenerator/upscale=lanczos") != upscaled
         assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
-        config = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"]).resolved
-    assert place_of(config, "s") == Path("o/my_scene/gs3d") / composition_key(config, "s")
-    assert place_of(config, "s") != place_of(config, "t")
+        settings = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"])
+    config, idle = settings.resolved, settings.idle
+    assert place_of(config, "s", idle) == Path("o/my_scene/gs3d") / composition_key(config, "s", idle)
+    assert place_of(config, "s", idle) != place_of(config, "t", idle)
 
 
 def own_scene(root: Path, content: str) -> Path:
@@ -141,8 +143,8 @@ def test_a_scene_is_what_its_folder_holds(tmp_path: Path) -> None:
 
         def place(root: str, *words: str) -> Path:
             given = ["dataset=own", "+dataset.scenes.yard=Yard", "dataset.scene=yard", f"data_root={tmp_path / root}"]
-            config = compositions.settings([*given, f"output={tmp_path / 'out'}", *words]).resolved
-            return place_of(config, scene_stamp(config))
+            settings = compositions.settings([*given, f"output={tmp_path / 'out'}", *words])
+            return place_of(settings.resolved, scene_stamp(settings.resolved), settings.idle)
 
         own_scene(tmp_path / "a", "one")
         photo = own_scene(tmp_path / "b", "another")
@@ -168,10 +170,11 @@ def test_a_run_is_compared_with_what_it_was_trained_on(tmp_path: Path) -> None:
     (cell,) = cells(table, tmp_path)
     finish(cell)
     files = read_run(cell.folder)
-    assert finished(files, cell.config, "")
+    idle = cell.settings.idle
+    assert finished(files, cell.config, "", idle)
     (cell.folder / "environment.json").write_text(json.dumps({"scene": {"stamp": "earlier"}}))
-    assert not finished(read_run(cell.folder), cell.config, "")
-    assert finished(read_run(cell.folder), cell.config, "earlier")
+    assert not finished(read_run(cell.folder), cell.config, "", idle)
+    assert finished(read_run(cell.folder), cell.config, "earlier", idle)
 
 
 def test_a_folder_is_claimed_by_one_at_a_time(tmp_path: Path) -> None:

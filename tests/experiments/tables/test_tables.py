@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from gsx.core.cache import source_revision
+from gsx.core.options import IdleKeys
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published
 from gsx.experiments.tables.table import Table, protocol_differences, table_of
@@ -160,10 +161,11 @@ def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: 
     own = {**paper, "iterations": 4, "eval": {"zoom": [1, 2], "ssim": "inria"}, "output": "y", "seed": 3,
            "regenerator": {"upscale": {"name": "lanczos"}, "restore": {"name": "other"}},
            "scene": {"name": "colmap", "path": "/b", "max_width": 400}, "training": {"log_every": 1}}  # fmt: skip
-    assert protocol_differences([(paper, paper)]) == []
-    longer = ({**own, "iterations": 5}, {**paper, "iterations": 50})
-    assert "iterations=4, 5 (paper: 40, 50)" in protocol_differences([(own, paper), longer])
-    assert sorted(protocol_differences([(own, paper), (own, paper)])) == [
+    idle = IdleKeys(scene=frozenset({"path"}), training=frozenset({"log_every"}))
+    assert protocol_differences([(paper, paper, idle)]) == []
+    longer = ({**own, "iterations": 5}, {**paper, "iterations": 50}, idle)
+    assert "iterations=4, 5 (paper: 40, 50)" in protocol_differences([(own, paper, idle), longer])
+    assert sorted(protocol_differences([(own, paper, idle), (own, paper, idle)])) == [
         "iterations=4 (paper: 40)",
         "regenerator.upscale.name=lanczos (paper: sd)",  # of another component only its name; restore is not used
         "scene.max_width=400 (paper: 1600)",

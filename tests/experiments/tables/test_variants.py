@@ -170,7 +170,7 @@ def test_where_pseudo_views_begin_is_foretold(composed: dict[str, Settings]) -> 
 def test_the_same_training_has_the_same_key_and_no_other(composed: dict[str, Settings]) -> None:
     keys: dict[str, list[str]] = {}
     for name, settings in composed.items():
-        keys.setdefault(composition_key(settings.resolved, ""), []).append(name)
+        keys.setdefault(composition_key(settings.resolved, "", settings.idle), []).append(name)
     assert [names for names in keys.values() if len(names) > 1] == [["octree_ub", "octree_ub_infer_1"]]
 
 

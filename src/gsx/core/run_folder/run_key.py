@@ -1,7 +1,7 @@
 """Which run a composition is: one name for one training, wherever and however it is carried out."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -9,30 +9,28 @@ from typing import IO, Any
 from gsx.core.cache import content_key, tree_stamp
 from gsx.core.errors import InputError
 from gsx.core.locks import lock
+from gsx.core.options import IdleKeys, fields_with
 from gsx.core.run_folder.files import RunFiles, part
+from gsx.core.run_folder.general_options import GeneralOptions
 
-WHERE = ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
+WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
 """Keys that say where and how a run is carried out."""
-NAMES = ("variant", "length", "budget", "dataset")
+NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 """Keys that name what other keys hold."""
 JUDGING = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
-OPERATING = ("cache_gb", "download", "offload", "batch_pixels", "slicing")
-"""Keys of scenes and regenerators that say with which means, and change no result."""
-WATCHING = ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")
-"""Keys of `training` that change nothing at all."""
-ELSEWHERE = ("path", "iterations")
-"""Keys of scenes that count as what they lead to: what lies in the folder (`scene_stamp`), the length of the run."""
 
 
-def trained(config: dict[str, Any]) -> dict[str, Any]:
-    """What of a resolved composition decides what is trained, beside what its scene holds (`scene_stamp`)."""
+def trained(config: dict[str, Any], idle: IdleKeys) -> dict[str, Any]:
+    """What of a resolved composition decides what is trained, beside what its scene holds (`scene_stamp`).
+
+    `idle`: what its options say to have no effect. The folder of a scene is among it: what lies there counts.
+    """
     told = (*WHERE, *NAMES, *JUDGING, "regenerator")
     kept = {key: value for key, value in config.items() if key not in told}
-    kept["regenerator"] = {role: without(node, OPERATING) for role, node in asked_for(config).items()}
-    scene = without(part(config, "scene"), OPERATING)
-    kept["scene"] = {key: value for key, value in scene.items() if key not in ELSEWHERE}
-    kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
+    kept["regenerator"] = without(asked_for(config), idle.regenerator)
+    kept["scene"] = without(part(config, "scene"), idle.scene)
+    kept["training"] = without(part(config, "training"), idle.training)
     return kept
 
 
@@ -43,7 +41,7 @@ def asked_for(config: dict[str, Any]) -> dict[str, Any]:
     return {role: node for role, node in part(config, "regenerator").items() if roles & {role, None}}
 
 
-def without(node: Any, keys: tuple[str, ...]) -> Any:
+def without(node: Any, keys: Collection[str]) -> Any:
     """A node without some keys, at any depth."""
     if not isinstance(node, dict):
         return node
@@ -86,9 +84,9 @@ def other_revision(files: RunFiles, this: str) -> str:
     return "" if revision == this else revision
 
 
-def composition_key(config: dict[str, Any], stamp: str) -> str:
+def composition_key(config: dict[str, Any], stamp: str, idle: IdleKeys) -> str:
     """A short digest: compositions that train the same have the same; `stamp`: of the scene (`scene_stamp`)."""
-    return content_key(sorted_items(trained(config)), stamp)
+    return content_key(sorted_items(trained(config, idle)), stamp)
 
 
 def sorted_items(value: Any) -> Any:
@@ -104,13 +102,13 @@ def sorted_items(value: Any) -> Any:
     return [sorted_items(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def place_of(config: dict[str, Any], stamp: str) -> Path:
+def place_of(config: dict[str, Any], stamp: str, idle: IdleKeys) -> Path:
     """The folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
     scene = part(config, "scene")
     name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
     backbone = str(part(config, "backbone").get("name"))
     output = Path(str(config.get("output", "outputs")))
-    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config, stamp)
+    return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config, stamp, idle)
 
 
 def judging(config: dict[str, Any]) -> dict[str, Any]:
@@ -118,14 +116,14 @@ def judging(config: dict[str, Any]) -> dict[str, Any]:
     return {key: config.get(key) for key in JUDGING}
 
 
-def finished(files: RunFiles, config: dict[str, Any], stamp: str) -> bool:
+def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: IdleKeys) -> bool:
     """Whether a run folder holds all that a composition asks for: trained to the end, just so and on a scene of that
     stamp, and judged the same."""
     return (
         files.status.get("state") == "ok"
         and files.evaluation.get("step") == config["iterations"]
         and files.evaluation.get("judged") == judging(config)
-        and composition_key(files.config, trained_on(files)) == composition_key(config, stamp)
+        and composition_key(files.config, trained_on(files), idle) == composition_key(config, stamp, idle)
     )
 
 

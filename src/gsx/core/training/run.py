@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.scene import Scene, View
+from gsx.core.options import IdleKeys, without_effect
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
@@ -25,10 +26,10 @@ class TrainingOptions:
 
     ssim_weight: float
     random_background: bool
-    log_every: int
-    checkpoint_every: int
-    checkpoints_kept: int
-    test_points: int
+    log_every: int = without_effect()
+    checkpoint_every: int = without_effect()
+    checkpoints_kept: int = without_effect()
+    test_points: int = without_effect()
     batch: int = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
 
@@ -126,6 +127,8 @@ class Run:
     augmenters: Sequence[Augmenter] = ()
     tallies: Sequence[Tally] = ()
     """What has become of the pictures that each augmenter asked for."""
+    idle: IdleKeys = IdleKeys()
+    """Keys of the configuration that change nothing of what is trained."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     step: int = 0

@@ -66,6 +66,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         anew=anew,
         augmenters=[augmenter for augmenter, _ in augmenters],
         tallies=[tally for _, tally in augmenters],
+        idle=settings.idle,
         ranks=ranks,
     )
 

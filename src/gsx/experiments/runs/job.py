@@ -102,7 +102,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     if processes() > 1:
         raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
     stamp = scene_stamp(settings.resolved)
-    folder = place_of(settings.resolved, stamp)
+    folder = place_of(settings.resolved, stamp, settings.idle)
     folders.append(folder)
     with claimed(folder) as alone:
         if not alone:

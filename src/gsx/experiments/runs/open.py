@@ -130,16 +130,16 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[P
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
     """
-    folder = place_of(settings.resolved, stamp)
+    folder = place_of(settings.resolved, stamp, settings.idle)
     files = read_run(folder)
-    if finished(files, settings.resolved, stamp):
+    if finished(files, settings.resolved, stamp, settings.idle):
         logger.info("finished earlier%s: %s", by_another(files), folder)
         return folder, None
     at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:
         if not checkpoint.sidecars(folder / "checkpoints"):
             raise CheckpointError(f"{folder} holds no checkpoint")
-        if composition_key(files.config, trained_on(files)) != folder.name:
+        if composition_key(files.config, trained_on(files), settings.idle) != folder.name:
             raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
         run = restored(settings, folder, training=True)
     except CheckpointError as error:

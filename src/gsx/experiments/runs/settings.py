@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -12,46 +12,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.evaluation.evaluator import EvalOptions
+from gsx.core.options import IdleKeys, idle_keys
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.run_folder.general_options import GeneralOptions
 from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.run import TrainingOptions
 
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GeneralOptions:
-    """Top-level values; conf/config.yaml gives them."""
-
-    iterations: int
-    seed: int
-    device: str
-    output: str
-    folder: str
-    length: int = 0
-    """Iterations of the whole run, of which a budget takes a share: the variant's, the scene's or the backbone's."""
-    variant: str = ""
-    """Name of the published method that is composed; empty for others."""
-    data_root: str = ""
-    """Where datasets lie."""
-    reuse: bool = False
-    """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
-    init: str = "scratch"
-    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
-    trunk_at: list[int] = field(default_factory=list)
-    """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
-    trunk_gb: float = 10.0
-    """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
-
-    def __post_init__(self) -> None:
-        if self.init not in ("scratch", "trunk"):
-            raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
-        if self.reuse and self.folder:
-            raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")
-        if not self.trunk_gb >= 0:
-            raise ValueError(f"trunk_gb is {self.trunk_gb}; give 10^9 bytes from 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +84,8 @@ class Settings:
     """By name, in the order of the command line."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
+    idle: IdleKeys
+    """What of them changes nothing of what is trained."""
 
 
 def dotted(node: Any, prefix: str = "") -> Iterator[str]:
@@ -149,6 +120,8 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     trackers = named_nodes(values.pop("tracker", None), "tracker")
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
+    loader = chosen("scene", parts["scene"], plugins)
+    redrawing = {role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()}
     found = {name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()}
     idle = () if any(not isinstance(one.options, WithChecks) for one in found.values()) else ("checks",)
     return Settings(
@@ -156,14 +129,17 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         training=typed(TrainingOptions, parts["training"], "training"),
         evaluation=typed(EvalOptions, evaluation, "eval"),
         raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
-        scene=chosen("scene", parts["scene"], plugins),
+        scene=loader,
         backbone=chosen("backbone", parts["backbone"], plugins),
         augmenters=found,
-        regenerators={role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()},
+        regenerators=redrawing,
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
         trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
         checks={role: checks.get(role) or strict_checks() for role in regenerators},
         resolved={key: value for key, value in raw.items() if key not in ("experiment", *idle)},  # type: ignore[misc]
+        idle=idle_keys(
+            loader.component.options, [one.component.options for one in redrawing.values()], TrainingOptions
+        ),
     )
 
 

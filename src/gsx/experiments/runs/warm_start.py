@@ -41,7 +41,7 @@ def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
     """Where states of runs like this one are kept; `plugins`: versions of those installed."""
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
-        json.dumps(trained(without_augmenters(run.config)), sort_keys=True, default=str),
+        json.dumps(trained(without_augmenters(run.config), run.idle), sort_keys=True, default=str),
         scene_stamp(run.config),  # test views are among the lines that are kept with a state
         seen_by(run),
         source_revision(),

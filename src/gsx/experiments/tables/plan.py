@@ -83,12 +83,12 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Where its run lies; other cells with the same composition share it."""
-        return place_of(self.config, self.stamp)
+        return place_of(self.config, self.stamp, self.settings.idle)
 
     @property
     def finished(self) -> bool:
         """Whether its run is done."""
-        return finished(read_run(self.folder), self.config, self.stamp)
+        return finished(read_run(self.folder), self.config, self.stamp, self.settings.idle)
 
     @property
     def begins(self) -> int:
@@ -100,7 +100,7 @@ class Cell:
     @property
     def trunk(self) -> str:
         """What runs share that can branch from each other."""
-        return content_key(sorted_items(trained(without_augmenters(self.config))), self.stamp)
+        return content_key(sorted_items(trained(without_augmenters(self.config), self.settings.idle)), self.stamp)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

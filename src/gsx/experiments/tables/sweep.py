@@ -172,7 +172,7 @@ def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Com
         variant = experiment.rows[cell.row]
         return compositions.settings([f"dataset={name}", f"variant={variant}", *experiment.overrides]).resolved
 
-    return protocol_differences([(cell.config, published(cell)) for cell in of_rows])
+    return protocol_differences([(cell.config, published(cell), cell.settings.idle) for cell in of_rows])
 
 
 def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[str, str], str]:

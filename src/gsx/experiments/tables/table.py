@@ -8,8 +8,9 @@ from typing import Any
 
 from gsx.core.cache import source_revision
 from gsx.core.files import read_json
+from gsx.core.options import IdleKeys
 from gsx.core.run_folder.files import RunFiles, is_number, part, read_run, state_of
-from gsx.core.run_folder.run_key import NAMES, OPERATING, WATCHING, WHERE, asked_for, flattened, other_revision, without
+from gsx.core.run_folder.run_key import NAMES, WHERE, asked_for, flattened, other_revision, without
 from gsx.core.training.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
 from gsx.experiments.runs.warm_start import BRANCH
@@ -328,11 +329,14 @@ def share_of(row: str, revision: str, cells: Sequence[Cell], found: dict[Path, s
     return f"{row} ({count} of {len(own)} runs)" if count else ""
 
 
-def protocol_differences(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:
-    """In which keys compositions (as run, as published) differ, each with its values, those of most rows first."""
+def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any], IdleKeys]]) -> list[str]:
+    """In which keys compositions (as run, as published) differ, each with its values, those of most rows first.
+
+    `compared`: both, and what of them has no effect.
+    """
     found: dict[str, list[tuple[str, str]]] = {}
-    for own, paper in pairs:
-        for key, value, published in differing(own, paper):
+    for own, paper, idle in compared:
+        for key, value, published in differing(own, paper, idle):
             found.setdefault(key, []).append((value, published))
     ranked = sorted(found, key=lambda key: -len(found[key]))
     told = []
@@ -348,9 +352,9 @@ def listed(values: Sequence[str]) -> str:
     return ", ".join(dict.fromkeys(values))
 
 
-def differing(own: dict[str, Any], paper: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+def differing(own: dict[str, Any], paper: dict[str, Any], idle: IdleKeys) -> Iterator[tuple[str, str, str]]:
     """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
-    mine, theirs = (flattened(judged(config)) for config in (own, paper))
+    mine, theirs = (flattened(judged(config, idle)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
     for key in dict.fromkeys([*mine, *theirs]):
         inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)
@@ -358,12 +362,12 @@ def differing(own: dict[str, Any], paper: dict[str, Any]) -> Iterator[tuple[str,
             yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
 
 
-def judged(config: dict[str, Any]) -> dict[str, Any]:
+def judged(config: dict[str, Any], idle: IdleKeys) -> dict[str, Any]:
     """What of a composition makes its protocol: all but where it runs, its seed, and which zooms are looked at."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, *NAMES, "seed")}
     kept["dataset"] = part(config, "dataset").get("title")
     kept["eval"] = {key: value for key, value in part(config, "eval").items() if key not in ("zoom", "tile_pixels")}
-    kept["training"] = {key: value for key, value in part(config, "training").items() if key not in WATCHING}
-    kept["scene"] = {k: v for k, v in part(config, "scene").items() if k not in ("path", "cache_gb", "iterations")}
+    kept["training"] = without(part(config, "training"), idle.training)
+    kept["scene"] = without(part(config, "scene"), idle.scene)
     kept["metrics"] = {key: part(part(config, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
-    return kept | {"regenerator": without(asked_for(config), (*OPERATING, *PLACES))}
+    return kept | {"regenerator": without(asked_for(config), (*idle.regenerator, *PLACES))}

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+from gsx.core.options import without_effect
+
 DTYPES = ("auto", "float32", "bfloat16", "float16")
 OFFLOADS = ("none", "model", "sequential")
 
@@ -18,19 +20,19 @@ class DiffusionOptions:
     """Of an id: branch, tag or commit."""
     variant: str
     """Part of the names of weight files, such as fp16; empty: none."""
-    download: bool
+    download: bool = without_effect()
     """Whether an id that is not on this machine is fetched; else nothing ever asks the network."""
     dtype: str
     """auto: bfloat16 on a GPU, float32 on the CPU."""
-    offload: str
+    offload: str = without_effect()
     """What stays in main memory while it is not needed: none, model (whole networks), sequential (layers; slow)."""
-    slicing: bool
+    slicing: bool = without_effect()
     """Encode and decode one picture of a batch at a time."""
     tiling: bool
     """Encode and decode large pictures in overlapping tiles; changes results slightly."""
-    batch_pixels: int
+    batch_pixels: int = without_effect()
     """Pixels of the results of one call; one picture at least."""
-    cache_gb: float
+    cache_gb: float = without_effect()
     """Disk for results, which runs with the same pictures share, 10^9 bytes; 0: none are kept."""
     guidance: float
     """1: none (no second pass without the prompt)."""

@@ -1,0 +1,38 @@
+"""Options of a run as a whole."""
+
+from dataclasses import dataclass
+
+from gsx.core.options import label, without_effect
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneralOptions:
+    """Top-level values; conf/config.yaml gives them."""
+
+    iterations: int
+    seed: int
+    device: str = without_effect()
+    output: str = without_effect()
+    folder: str = without_effect()
+    length: int = label(default=0)
+    """Iterations of the whole run, of which a budget takes a share: the variant's, the scene's or the backbone's."""
+    variant: str = label(default="")
+    """Name of the published method that is composed; empty for others."""
+    data_root: str = without_effect(default="")
+    """Where datasets lie."""
+    reuse: bool = without_effect(default=False)
+    """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
+    init: str = without_effect(default="scratch")
+    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
+    trunk_at: list[int] = without_effect(default_factory=list)
+    """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
+    trunk_gb: float = without_effect(default=10.0)
+    """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
+
+    def __post_init__(self) -> None:
+        if self.init not in ("scratch", "trunk"):
+            raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
+        if self.reuse and self.folder:
+            raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")
+        if not self.trunk_gb >= 0:
+            raise ValueError(f"trunk_gb is {self.trunk_gb}; give 10^9 bytes from 0")
