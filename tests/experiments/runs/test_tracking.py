@@ -28,7 +28,7 @@ from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.settings import read_config, write_config
 from gsx.experiments.runs.tracking import Tracking, build_trackers
-from gsx.experiments.runs.warm_start import trunk_folder
+from gsx.experiments.runs.warm_start import warm_start_folder
 from gsx.trackers.figures import evaluation_figures, line_figures
 
 ROOT = Path(__file__).parents[3]
@@ -218,12 +218,12 @@ def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path) -> None:
 def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
     settings = tiny_settings(tmp_path / "run", "iterations=2")
     run = start(settings, plugins())
-    folder = trunk_folder(run, {})
+    folder = warm_start_folder(run, {})
     key, config = key_of(read_run(run.folder)), flattened(run.config)
     write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *BOTH).resolved)
     run.config = compose(words(run.folder, "iterations=2", *BOTH), plugins()).resolved
     assert "mlflow" in run.config["tracker"]
-    assert trunk_folder(run, {}) == folder
+    assert warm_start_folder(run, {}) == folder
     assert key_of(read_run(run.folder)) == key
     assert flattened(run.config) == config
 

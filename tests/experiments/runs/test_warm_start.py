@@ -1,4 +1,4 @@
-"""Branching from a common trunk: the same bits as from scratch, and only what is common."""
+"""Branching from a common beginning: the same bits as from scratch, and only what is common."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from torch import Tensor
 from gsx.builtin import plugins
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.warm_start import trunk_folder
+from gsx.experiments.runs.warm_start import warm_start_folder
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
        "training.checkpoint_every=100", "training.log_every=2")  # fmt: skip
@@ -66,7 +66,7 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
     """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
     run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=trunk"))
-    assert sorted(path.stem for path in trunk_folder(run, plugins().versions).glob("step_*.json")) == [
+    assert sorted(path.stem for path in warm_start_folder(run, plugins().versions).glob("step_*.json")) == [
         f"step_{step:07d}" for step in (10, 15, 20, 22)
     ]
     tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=trunk"))
@@ -106,7 +106,7 @@ def test_resumed_runs_leave_nothing_behind(tmp_path: Path, caplog: pytest.LogCap
 def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     run = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=16)
-    (trunk_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
+    (warm_start_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
     tiny_run(tmp_path / "second", (*RUN, "init=trunk"), stop_after=17)
     assert "truncated or altered" in caplog.text
     assert "branching at step 10" in caplog.text
@@ -127,5 +127,5 @@ def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
     first = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
     second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=trunk", "trunk_gb=0"), stop_after=12)
-    folders = [trunk_folder(run, plugins().versions) for run in (first, second)]
+    folders = [warm_start_folder(run, plugins().versions) for run in (first, second)]
     assert [folder.is_dir() for folder in folders] == [False, True]

@@ -133,7 +133,7 @@ class Run:
     """The processes that train it together."""
     step: int = 0
     """Steps done."""
-    trunk: Path | None = None
+    warm_starts: Path | None = None
     """Where states are kept that other runs may branch from; None: nowhere, as for all runs that were resumed."""
     seconds: float = 0.0
     """Time spent in training steps, without evaluation and files."""

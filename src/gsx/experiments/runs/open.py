@@ -75,7 +75,7 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     build_trackers(settings.trackers)  # the same: a missing package
     run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins))
-    if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of a trunk
+    if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run)
     return run
 
@@ -87,8 +87,8 @@ def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
         write_config(run.folder / "config.yaml", settings.resolved)
         write_json(run.folder / "environment.json", environment(run, plugins))
         if settings.general.init == "trunk":
-            run.trunk = warm_start.trunk_folder(run, plugins.versions)
-            warm_start.adopt(run, run.trunk)
+            run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
+            warm_start.adopt(run, run.warm_starts)
             run.curves = read_curves(run.folder)
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
@@ -148,7 +148,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[P
     logger.info("going on with %s at step %d", folder, run.step)
     write_config(folder / "config.yaml", settings.resolved)
     if settings.general.init == "trunk":
-        run.trunk = warm_start.trunk_folder(run, plugins.versions)
+        run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
     return folder, run
 
 

@@ -37,7 +37,7 @@ def common_steps(run: Run) -> int:
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
 
 
-def trunk_folder(run: Run, plugins: Mapping[str, str]) -> Path:
+def warm_start_folder(run: Run, plugins: Mapping[str, str]) -> Path:
     """Where states of runs like this one are kept; `plugins`: versions of those installed."""
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
@@ -106,7 +106,7 @@ def lines_of(sidecar: Path) -> list[dict[str, Any]]:
     return read_json(path)["lines"] if path.is_file() else []
 
 
-class TrunkKeeper:
+class WarmStartKeeper:
     """Listener: keeps states that other runs can branch from."""
 
     def __init__(self, folder: Path, budget: float, steps: Collection[int] = ()) -> None:

@@ -98,7 +98,7 @@ class Cell:
         return min([iterations, *told])
 
     @property
-    def trunk(self) -> str:
+    def beginning(self) -> str:
         """What runs share that can branch from each other."""
         return content_key(sorted_items(trained(without_augmenters(self.config), self.settings.idle)), self.stamp)
 
@@ -164,7 +164,7 @@ def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Ce
     due = [cell for cell in cells if runs[cell.folder] is cell and not cell.finished]
     groups: dict[str, list[Cell]] = {}
     for cell in due:
-        groups.setdefault(cell.trunk, []).append(cell)
+        groups.setdefault(cell.beginning, []).append(cell)
     first: list[list[str]] = []
     second: list[list[str]] = []
     shared = 0
