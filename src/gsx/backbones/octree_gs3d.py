@@ -1,6 +1,6 @@
 """Octree-GS on explicit Gaussians in both forms: on anchors, as reported, and free with clone and split."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from gsx.backbones.anchor_options import ExplicitOptions
 from gsx.backbones.anchors import Anchors, explicit_anchors
@@ -63,19 +63,8 @@ def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions,
             f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which means nothing to "
             f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
         )
-    gaussians = GS3DOptions(
-        name=options.name,
-        filter=options.filter,
-        published_iterations=options.published_iterations,
-        sh_degree=options.sh_degree,
-        sh_every=options.sh_every,
-        initial_opacity=options.initial_opacity,
-        max_primitives=options.max_primitives,
-        rates=own.rates,
-        density=own.density,
-        mip=options.mip,
-        decay_until=options.decay_until,
-    )
+    both = vars(options) | {"rates": own.rates, "density": own.density}
+    gaussians = GS3DOptions(**{field.name: both[field.name] for field in fields(GS3DOptions)})
     levels = faithful(options.levels, options.fidelity)
     assert levels is not None
     return gaussians, levels, own.level_density

@@ -22,7 +22,7 @@ def refuse_suffix(path: Path) -> None:
     """Raise InputError if the name promises a format that is not written."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {path.stem}{SUFFIXES[0]}"
+            f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {path.with_suffix(SUFFIXES[0])}"
         )
 
 
