@@ -76,6 +76,9 @@ def test_its_augmenter_trains_with_its_regenerator(site: Path, tmp_path: Path) -
     assert all(line["terms"]["steady_zoom"] > 0 for line in lines[10:])
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert evaluation["psnr"] > 5
+    asked = [line["pseudo"]["steady_zoom"]["asked"]["2"] for line in lines if "pseudo" in line]
+    assert sum(asked) == 6, "each training view once: told without a word of the augmenter's"
+    assert evaluation["pseudo"]["steady_zoom"]["asked"] == {"2": 6}
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from gsx.builtin import plugins
-from gsx.core.options import IdleKeys, fields_with, idle_keys, label, without_effect
-from gsx.core.run_folder.run_key import NAMES, WHERE
-from gsx.core.training.run import TrainingOptions
+from gsx.core.options import fields_with, idle_keys, label, without_effect
+from gsx.core.run_folder.run_key import NAMES, WHERE, without
+from gsx.experiments.runs.compose import compose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,8 +23,18 @@ class Outer:
     other: Inner | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Idle:
+    steps: int = without_effect(default=3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    path: str = without_effect(default="")
+
+
 def test_fields_inside_count_too() -> None:
-    assert fields_with("none", Outer) == {"folder", "cache_gb"}
+    assert fields_with("none", Outer) == {"folder", "inner.cache_gb", "other.cache_gb"}
     assert fields_with("label", Outer) == {"title"}
     assert Outer(name="a", title="b", inner=Inner(strength=1.0, cache_gb=2.0)).folder == "here"
 
@@ -35,11 +45,21 @@ def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
         ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
     )
     assert sorted(NAMES) == sorted(("variant", "length", "budget", "dataset"))
-    scene, diffusion = (
-        plugins().registry.find(*key).options for key in (("scene", "photos"), ("regenerator", "sd_by_scale"))
+    settings = compose(
+        ["scene=photos", "regenerator/upscale=sd_by_scale", "regenerator/restore=scene_restorer"], plugins()
     )
-    assert idle_keys(scene, [diffusion], TrainingOptions) == IdleKeys(
-        scene=frozenset({"path", "iterations", "cache_gb"}),
-        regenerator=frozenset({"cache_gb", "download", "offload", "batch_pixels", "slicing"}),
-        training=frozenset({"log_every", "checkpoint_every", "checkpoints_kept", "test_points"}),
-    )
+    own = {f"training.{name}" for name in ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")}
+    own |= {f"scene.{name}" for name in ("path", "iterations", "cache_gb")}
+    for model in ("x2", "x4"):
+        for name in ("cache_gb", "download", "offload", "batch_pixels", "slicing"):
+            own.add(f"regenerator.upscale.{model}.{name}")
+    assert settings.idle == own
+
+
+def test_keys_are_left_out_where_they_are_meant_and_nowhere_else() -> None:
+    """A plugin's `steps` without effect is not the `steps` of another regenerator."""
+    config = {"scene": {"path": "/a", "inner": {"path": "b"}}, "regenerator": {"up": {"steps": 3}, "re": {"steps": 5}}}
+    assert without(config, idle_keys({"regenerator.up": Idle, "scene": Placed})) == {
+        "scene": {"inner": {"path": "b"}},
+        "regenerator": {"up": {}, "re": {"steps": 5}},
+    }

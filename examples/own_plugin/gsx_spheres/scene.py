@@ -30,7 +30,13 @@ def load(options: SnapshotOptions) -> Scene:
     folder, cache = Path(options.path), ImageCache(10**9)
     if not (folder / FILE).is_file():
         raise InputError(f"'{folder}' has no {FILE}: set scene.path to a folder with one")
-    views = [view(folder, entry, cache) for entry in json.loads((folder / FILE).read_text())]
+    try:
+        views = [view(folder, entry, cache) for entry in json.loads((folder / FILE).read_text())]
+    except (KeyError, TypeError, ValueError) as error:
+        needed = "file, fx and camera_from_world (3 rows of 4) of every picture"
+        raise InputError(f"'{folder / FILE}' cannot be read ({error!r}): it must give {needed}") from error
+    if options.every < 2:
+        raise InputError(f"scene.every is {options.every}: give at least 2, so that views are left to train on")
     train = [taken for number, taken in enumerate(views) if number % options.every]
     extent = extent_of([taken.camera for taken in train])
     generator = torch.Generator().manual_seed(0)
@@ -39,11 +45,12 @@ def load(options: SnapshotOptions) -> Scene:
         train=train,
         test=views[:: options.every],
         points=PointCloud(
-            positions=extent * (torch.rand(options.points, 3, generator=generator) - 0.5),
+            positions=(extent * (torch.rand(options.points, 3, generator=generator) - 0.5)).float(),
             colours=torch.full((options.points, 3), 128, dtype=torch.uint8),
         ),
         background=torch.zeros(3),
         extent=extent,
+        provenance={"format": options.name, "every": options.every},
     )
 
 

@@ -22,6 +22,8 @@ class SteadyOptions:
 class SteadyZoom:
     def __init__(self, options: SteadyOptions, context: AugmenterContext) -> None:
         self.options, self.context = options, context
+        self.regenerator = context.regenerator("upscale")
+        self.regenerator.refuse(context.scene.train, [2], moved=False)
         self.views: dict[int, list[PseudoView]] = {}
 
     def begins(self) -> int:
@@ -34,7 +36,7 @@ class SteadyZoom:
         if step <= self.begins():
             return None
         if not self.views:
-            self.context.regenerator("upscale").prepare(regenerator_context(run, self.context.seed))
+            self.regenerator.prepare(regenerator_context(run, self.context.seed))
         if view not in self.views:
             self.views[view] = self.zoomed(view)
         parts = [(pseudo, self.options.weight) for pseudo in self.views[view]]
@@ -51,7 +53,7 @@ class SteadyZoom:
             image=view.source.image(camera).float() / 255, scale=2, camera=camera, view=view, number=number,
             photo=True, seed=self.context.seed, strength=0.0, strongest=0.0, prompt="", step=0,
         )  # fmt: skip
-        (redrawn,) = self.context.regenerator("upscale").redraw([request])
+        (redrawn,) = self.regenerator.redraw([request])
         if redrawn.image is None:
             return []
         return [PseudoView(camera=camera.zoom(2), target=to_uint8(redrawn.image.clamp(0, 1)), parent=number)]

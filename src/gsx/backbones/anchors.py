@@ -183,8 +183,9 @@ class Anchors:
         for name in self.table.parameters:
             unit = self.extent if name == "offsets" else 1.0
             self.table.set_rate(name, unit * getattr(self.options.rates, name).at(step, steps))
-        for group in self.table.networks.optimiser.param_groups if self.table.networks else ():
-            group["lr"] = getattr(self.network_rates, group["name"]).at(step, steps)
+        if networks := self.table.networks:
+            for name in networks.names():
+                networks.set_rate(name, getattr(self.network_rates, name).at(step, steps))
 
     def update(self, step: int) -> None:
         """One Adam step of anchors and networks. Unused SH bands take part with zero gradients, as in 3D-GS."""
@@ -234,8 +235,8 @@ class Anchors:
 
     def file_notes(self) -> list[str]:
         """Where the 3D filter is, and what chooses the levels at a distance (Octree-GS, save_ply)."""
-        fused = "3D filter fused into scales and opacities of Gaussians; anchors have its size in filter_3D"
-        return [fused if self.options.filter == "mip" else "no 3D filter", *self.grid.notes()]
+        filtered = f"{self.filter.note} of Gaussians; anchors have its size in filter_3D"
+        return [filtered if self.filter.note else "no 3D filter", *self.grid.notes()]
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run, and what was derived from the scene."""

@@ -24,7 +24,7 @@ LARGEST_CELL = 2.0**53
 
 
 def fresh_statistics(count: int, offsets: int, device: torch.device | str) -> dict[str, Tensor]:
-    """Columns of `count` anchors that nothing has been seen of."""
+    """Statistics of `count` anchors that nothing has been seen of."""
     return {
         "opacity_sum": torch.zeros(count, device=device),
         "visits": torch.zeros(count, device=device),

@@ -155,7 +155,7 @@ class GS3D:
     def gaussians(self, shown: Shown) -> Gaussians:
         """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (Mip-Splatting)."""
         raw = {name: shown.values[name].detach() for name in self.table.parameters}
-        if self.options.filter == "mip" or shown.weights is not None:
+        if self.filter.note or shown.weights is not None:
             scales, log_opacities = extents(self.table, shown, self.filter)
             raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
         raw["sh_constant"] = raw["sh_constant"][:, 0]
@@ -172,8 +172,7 @@ class GS3D:
 
     def file_notes(self) -> list[str]:
         """Whether the 3D filter is in the file, and what visibility has to say."""
-        filtered = "3D filter fused into scales and opacities" if self.options.filter == "mip" else "no 3D filter"
-        return [filtered, *self.visibility.notes()]
+        return [self.filter.note or "no 3D filter", *self.visibility.notes()]
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""

@@ -54,6 +54,11 @@ class MipOptions:
 class Filter(Protocol):
     """What is done to Gaussians so that they do not alias."""
 
+    @property
+    def note(self) -> str:
+        """A splat file's comment on the 3D filter; empty: there is none."""
+        ...
+
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """The rasterizer's rules with the 2D filter."""
         ...
@@ -79,6 +84,8 @@ class Filter(Protocol):
 
 class NoFilter:
     """Gaussians as they are."""
+
+    note = ""
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """Those given."""
@@ -112,6 +119,7 @@ class MipFilter:
     schedule: Schedule
     settled: int
     """Published step at which density control ends: from there on the filter has a clock of its own."""
+    note: str = "3D filter fused into scales and opacities"
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """Dilation by the kernel, with compensated opacities."""

@@ -4,9 +4,9 @@ A run is named by what it trains. Fields made by `without_effect` and `label` do
 plugins just as in those of gsx itself.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, get_args
+from collections.abc import Mapping
+from dataclasses import field, fields, is_dataclass
+from typing import Any, get_args, get_type_hints
 
 EFFECT = "effect"
 
@@ -21,27 +21,16 @@ def label(**default: Any) -> Any:
     return field(metadata={EFFECT: "label"}, **default)
 
 
-def fields_with(effect: str, options: type) -> frozenset[str]:
-    """Names of the fields of a dataclass, and of those inside it, that say this of their effect."""
-    names = {entry.name for entry in fields(options) if entry.metadata.get(EFFECT) == effect}
-    kinds = [kind for entry in fields(options) for kind in (entry.type, *get_args(entry.type))]
-    inner = [kind for kind in kinds if isinstance(kind, type) and is_dataclass(kind)]
-    return frozenset(names).union(*(fields_with(effect, kind) for kind in inner))
+def fields_with(effect: str, options: type, prefix: str = "") -> frozenset[str]:
+    """Dotted names of the fields of a dataclass, and of those inside it, that say this of their effect."""
+    found = {f"{prefix}{entry.name}" for entry in fields(options) if entry.metadata.get(EFFECT) == effect}
+    for name, hint in get_type_hints(options).items():
+        for kind in (hint, *get_args(hint)):
+            if isinstance(kind, type) and is_dataclass(kind):
+                found |= fields_with(effect, kind, f"{prefix}{name}.")
+    return frozenset(found)
 
 
-@dataclass(frozen=True, kw_only=True)
-class IdleKeys:
-    """Keys of a composition that change nothing of what is trained."""
-
-    scene: frozenset[str] = frozenset()
-    regenerator: frozenset[str] = frozenset()
-    training: frozenset[str] = frozenset()
-
-
-def idle_keys(scene: type, regenerators: Iterable[type], training: type) -> IdleKeys:
-    """As the options of the components say."""
-    return IdleKeys(
-        scene=fields_with("none", scene),
-        regenerator=frozenset().union(*(fields_with("none", options) for options in regenerators)),
-        training=fields_with("none", training),
-    )
+def idle_keys(options: Mapping[str, type]) -> frozenset[str]:
+    """Dotted keys of a composition that change nothing of what is trained; `options`: schemas by key."""
+    return frozenset[str]().union(*(fields_with("none", schema, f"{key}.") for key, schema in options.items()))

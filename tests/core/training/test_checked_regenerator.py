@@ -15,6 +15,7 @@ from gsx.core.training.checked_regenerator import (
     Check,
     CheckedRegenerator,
     Tally,
+    added_accounts,
     colour_matched,
     displacement,
     strayed,
@@ -178,6 +179,18 @@ def test_one_bad_picture_among_those_asked_for_now_and_then_ends_nothing() -> No
     regenerator.redraw([replace(request(texture()), number=8)])
     with pytest.raises(TrainingError, match="lost 5 of 9 pictures at x2, step 8"):
         regenerator.tally.told(9)
+
+
+def test_accounts_of_processes_add_up_and_outlive_an_interruption() -> None:
+    first = {"mine": {"event": 3, "asked": {"1": 2, "2": 2}, "dropped": {"2": 1}, "warned": {"colour": {"1": 1}}}}
+    second = {"mine": {"event": 3, "asked": {"2": 6}, "dropped": {"2": 2}, "warned": {"colour": {"2": 3}}}}
+    total = added_accounts([first, second, {}])
+    assert total == {
+        "mine": {"event": 3, "asked": {"1": 2, "2": 8}, "dropped": {"2": 3}, "warned": {"colour": {"1": 1, "2": 3}}}
+    }
+    tally = Tally(name="mine")
+    tally.recall([{"step": 4, "pseudo": total}, {"step": 5}, {"step": 6, "pseudo": {"other": {}}}])
+    assert (tally.asked, tally.dropped) == ({"1": 2, "2": 8}, {"2": 3})
 
 
 def test_the_mean_of_samples_counts_and_is_projected_where_that_is_asked_for() -> None:

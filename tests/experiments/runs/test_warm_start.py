@@ -12,7 +12,7 @@ from torch import Tensor
 from gsx.builtin import plugins
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.warm_start import warm_start_folder
+from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
        "training.checkpoint_every=100", "training.log_every=2")  # fmt: skip
@@ -129,3 +129,9 @@ def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.Mon
     second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=trunk", "trunk_gb=0"), stop_after=12)
     folders = [warm_start_folder(run, plugins().versions) for run in (first, second)]
     assert [folder.is_dir() for folder in folders] == [False, True]
+
+
+def test_the_control_of_an_augmenter_that_takes_the_checks_of_its_role_is_that_of_the_others() -> None:
+    """Such a composition keeps `checks`, which nothing without augmenters asks for."""
+    whole = {"seed": 0, "augmenter": {"own": {}}, "regenerator": {"upscale": {}}, "checks": {"upscale": {}}}
+    assert without_augmenters(whole) == {"seed": 0}

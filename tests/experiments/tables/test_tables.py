@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from gsx.core.cache import source_revision
-from gsx.core.options import IdleKeys
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published
 from gsx.experiments.tables.table import Table, protocol_differences, table_of
@@ -161,7 +160,7 @@ def test_the_protocol_differs_by_what_is_trained_and_judged_not_by_where(table: 
     own = {**paper, "iterations": 4, "eval": {"zoom": [1, 2], "ssim": "inria"}, "output": "y", "seed": 3,
            "regenerator": {"upscale": {"name": "lanczos"}, "restore": {"name": "other"}},
            "scene": {"name": "colmap", "path": "/b", "max_width": 400}, "training": {"log_every": 1}}  # fmt: skip
-    idle = IdleKeys(scene=frozenset({"path"}), training=frozenset({"log_every"}))
+    idle = frozenset({"scene.path", "training.log_every"})
     assert protocol_differences([(paper, paper, idle)]) == []
     longer = ({**own, "iterations": 5}, {**paper, "iterations": 50}, idle)
     assert "iterations=4, 5 (paper: 40, 50)" in protocol_differences([(own, paper, idle), longer])

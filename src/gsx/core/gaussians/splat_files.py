@@ -21,9 +21,8 @@ SUFFIXES = (".ply",)
 def refuse_suffix(path: Path) -> None:
     """Raise InputError if the name promises a format that is not written."""
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(
-            f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {path.with_suffix(SUFFIXES[0])}"
-        )
+        better = path.parent / f"{path.stem or 'model'}{SUFFIXES[0]}"
+        raise InputError(f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {better}")
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:

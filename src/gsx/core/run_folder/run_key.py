@@ -9,7 +9,7 @@ from typing import IO, Any
 from gsx.core.cache import content_key, tree_stamp
 from gsx.core.errors import InputError
 from gsx.core.locks import lock
-from gsx.core.options import IdleKeys, fields_with
+from gsx.core.options import fields_with
 from gsx.core.run_folder.files import RunFiles, part
 from gsx.core.run_folder.general_options import GeneralOptions
 
@@ -21,17 +21,14 @@ JUDGING = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
 
 
-def trained(config: dict[str, Any], idle: IdleKeys) -> dict[str, Any]:
+def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     """What of a resolved composition decides what is trained, beside what its scene holds (`scene_stamp`).
 
-    `idle`: what its options say to have no effect. The folder of a scene is among it: what lies there counts.
+    `idle`: dotted keys that their options say to have no effect. The folder of a scene is among them: what lies there
+    counts.
     """
-    told = (*WHERE, *NAMES, *JUDGING, "regenerator")
-    kept = {key: value for key, value in config.items() if key not in told}
-    kept["regenerator"] = without(asked_for(config), idle.regenerator)
-    kept["scene"] = without(part(config, "scene"), idle.scene)
-    kept["training"] = without(part(config, "training"), idle.training)
-    return kept
+    kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *JUDGING)}
+    return kept | {"regenerator": asked_for(kept)}
 
 
 def asked_for(config: dict[str, Any]) -> dict[str, Any]:
@@ -41,11 +38,11 @@ def asked_for(config: dict[str, Any]) -> dict[str, Any]:
     return {role: node for role, node in part(config, "regenerator").items() if roles & {role, None}}
 
 
-def without(node: Any, keys: Collection[str]) -> Any:
-    """A node without some keys, at any depth."""
+def without(node: Any, keys: Collection[str], prefix: str = "") -> Any:
+    """A node without some dotted keys."""
     if not isinstance(node, dict):
         return node
-    return {key: without(value, keys) for key, value in node.items() if key not in keys}
+    return {key: without(value, keys, f"{prefix}{key}.") for key, value in node.items() if f"{prefix}{key}" not in keys}
 
 
 def scene_stamp(config: dict[str, Any]) -> str:
@@ -84,7 +81,7 @@ def other_revision(files: RunFiles, this: str) -> str:
     return "" if revision == this else revision
 
 
-def composition_key(config: dict[str, Any], stamp: str, idle: IdleKeys) -> str:
+def composition_key(config: dict[str, Any], stamp: str, idle: Collection[str]) -> str:
     """A short digest: compositions that train the same have the same; `stamp`: of the scene (`scene_stamp`)."""
     return content_key(sorted_items(trained(config, idle)), stamp)
 
@@ -102,7 +99,7 @@ def sorted_items(value: Any) -> Any:
     return [sorted_items(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def place_of(config: dict[str, Any], stamp: str, idle: IdleKeys) -> Path:
+def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
     """The folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
     scene = part(config, "scene")
     name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
@@ -116,7 +113,7 @@ def judging(config: dict[str, Any]) -> dict[str, Any]:
     return {key: config.get(key) for key in JUDGING}
 
 
-def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: IdleKeys) -> bool:
+def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collection[str]) -> bool:
     """Whether a run folder holds all that a composition asks for: trained to the end, just so and on a scene of that
     stamp, and judged the same."""
     return (

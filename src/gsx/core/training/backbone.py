@@ -105,7 +105,7 @@ class Backbone(Protocol[D]):
         """What density control learns from a render of what was drawn, after its backward pass.
 
         `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
-        photograph (`density`).
+        photograph (`core.training.density`).
         """
         ...
 

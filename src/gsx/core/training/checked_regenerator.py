@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,7 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.errors import TrainingError
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import Checked, Regenerator, RegeneratorContext, Request
+from gsx.core.training.regenerator import Refusing, Regenerator, RegeneratorContext, Request
 
 logger = logging.getLogger(__name__)
 
@@ -100,6 +100,14 @@ class Tally:
     asked: Counter[str] = field(default_factory=Counter)
     """All so far, by scale."""
     dropped: Counter[str] = field(default_factory=Counter)
+    """Of these."""
+
+    def recall(self, lines: Sequence[Mapping[str, Any]]) -> None:
+        """Count what a run asked for before it was interrupted, from lines of metrics.jsonl."""
+        for account in (line.get("pseudo", {}).get(self.name) for line in lines):
+            if account:
+                self.asked.update(account["asked"])
+                self.dropped.update(account["dropped"])
 
     def account(self, event: int, whole: bool = True) -> dict[str, Any]:
         """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
@@ -136,10 +144,37 @@ class Tally:
         return counts
 
     def told(self, step: int) -> dict[str, Any]:
-        """The account of the pictures asked for at this step; empty where there were none."""
+        """The account of the pictures asked for at this step; empty where there were none.
+
+        Raises:
+            TrainingError: more than half of the pictures of a scale could not be used, over the run.
+        """
         if self.pending:
             self.account(step - 1, whole=False)
         return self.latest if self.latest.get("event") == step - 1 else {}
+
+
+def added_accounts(accounts: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """The accounts of several processes as those of one, by augmenter."""
+    names = dict.fromkeys(name for by_name in accounts for name in by_name)
+    return {name: added_account([by_name[name] for by_name in accounts if name in by_name]) for name in names}
+
+
+def added_account(accounts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Accounts of one event added up."""
+    checks = dict.fromkeys(check for account in accounts for check in account["warned"])
+    return {
+        "event": accounts[0]["event"],
+        "asked": added([account["asked"] for account in accounts]),
+        "dropped": added([account["dropped"] for account in accounts]),
+        "warned": {check: added([account["warned"].get(check, {}) for account in accounts]) for check in checks},
+    }
+
+
+def added(counts: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Sums by scale."""
+    scales = dict.fromkeys(scale for count in counts for scale in count)
+    return {scale: sum(count.get(scale, 0) for count in counts) for scale in scales}
 
 
 def by_scale(drawn: Sequence[Redrawn]) -> dict[str, int]:
@@ -157,8 +192,8 @@ class CheckedRegenerator:
     tally: Tally
 
     def refuse(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Before training: raise ConfigError or InputError if it can say already that it will not do (`Checked`)."""
-        if isinstance(self.inner, Checked):
+        """Before training: raise ConfigError or InputError if it can say already that it will not do (`Refusing`)."""
+        if isinstance(self.inner, Refusing):
             self.inner.check(views, scales, moved)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:

@@ -1,15 +1,17 @@
 """Several views in one step, on one process or on several: gradients, losses and observations become those of one.
 
 Every view's own loss is sent back, and the sums are divided in the end. An observation counts by its weight in the
-mean loss (`density`), so that published thresholds hold for any number of views.
+mean loss (`core.training.density`), so that published thresholds hold for any number of views.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
+from gsx.core.training.checked_regenerator import added_accounts
 from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
 from gsx.core.training.run import Run, Step
 
@@ -49,6 +51,8 @@ class Account:
     dropped: int
     learnt: set[str]
     """Parameters that have a gradient."""
+    pseudo: dict[str, dict[str, Any]]
+    """What became of the pictures that its augmenters asked for."""
 
 
 def account_of(run: Run, steps: Sequence[Step]) -> Account:
@@ -58,6 +62,7 @@ def account_of(run: Run, steps: Sequence[Step]) -> Account:
         terms=[step.terms for step in steps],
         dropped=sum(step.dropped for step in steps),
         learnt=set(gradients(run.backbone.table)),
+        pseudo=steps[0].pseudo,
     )
 
 
@@ -73,6 +78,7 @@ def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
         seen=run.ranks.gathered([seen for step in steps for seen in step.seen], run.device),
         dropped=sum(account.dropped for account in accounts),
         others=steps[1:],
+        pseudo=added_accounts([account.pseudo for account in accounts]),
     )
 
 

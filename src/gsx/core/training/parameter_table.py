@@ -21,9 +21,10 @@ ADAM_EPSILON = 1e-15
 
 @dataclass(eq=False)
 class Networks:
-    """Networks that all primitives share, and the Adam that moves them, with a group for each."""
+    """Networks that all primitives share, and the Adam that moves them, with a group for each, at rate 0 at first."""
 
     modules: nn.Module
+    """A network for each child; a learning rate is set by its name."""
     colour: nn.Module
     """Of them the one that makes colours, which pseudo views may leave alone."""
     optimiser: torch.optim.Adam = field(init=False)
@@ -32,6 +33,14 @@ class Networks:
         parts = self.modules.named_children()
         groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in parts]
         self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+    def names(self) -> list[str]:
+        """Names of the networks."""
+        return [group["name"] for group in self.optimiser.param_groups]
+
+    def set_rate(self, name: str, rate: float) -> None:
+        """Learning rate of one network."""
+        next(group for group in self.optimiser.param_groups if group["name"] == name)["lr"] = rate
 
     def named(self) -> Iterator[tuple[str, Parameter]]:
         """Parameters by the names that they are saved under."""
@@ -58,7 +67,7 @@ class ParameterTable:
         return len(next(iter(self.parameters.values())))
 
     def __getitem__(self, name: str) -> Tensor:
-        return next(kind[name] for kind in (self.parameters, self.columns, self.statistics) if name in kind)
+        return (self.parameters | self.columns | self.statistics)[name]
 
     def set_rate(self, name: str, rate: float) -> None:
         """Learning rate of one parameter."""
@@ -220,7 +229,8 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
 
 def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """The saved values of one kind, by name; older checkpoints hold some statistics as columns."""
-    names = {name: next((key for key in (f"{kind}.{name}", f"columns.{name}") if key in tensors), "") for name in like}
+    kinds = (kind, "columns") if kind == "statistics" else (kind,)
+    names = {name: next((f"{k}.{name}" for k in kinds if f"{k}.{name}" in tensors), "") for name in like}
     missing = [name for name, key in names.items() if not key]
     if missing:
         raise CheckpointError(

@@ -80,7 +80,7 @@ class Regenerator(Protocol):
 
 
 @runtime_checkable
-class Checked(Protocol):
+class Refusing(Protocol):
     """A regenerator that can say before training that it will not do."""
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.scene import Scene, View
-from gsx.core.options import IdleKeys, without_effect
+from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
@@ -127,8 +127,8 @@ class Run:
     augmenters: Sequence[Augmenter] = ()
     tallies: Sequence[Tally] = ()
     """What has become of the pictures that each augmenter asked for."""
-    idle: IdleKeys = IdleKeys()
-    """Keys of the configuration that change nothing of what is trained."""
+    idle: frozenset[str] = frozenset()
+    """Dotted keys of the configuration that change nothing of what is trained."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     step: int = 0

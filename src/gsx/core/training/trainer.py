@@ -82,8 +82,8 @@ def backward(run: Run) -> Step:
         for view, added, colour in zip(picked, terms, colours, strict=True):
             with gradients_added(run.backbone.table):
                 steps.append(view_loss(run, number, run.scene.train[view], added, colour))
-        step = steps[0] if len(batch) == 1 else merge_gradients(run, steps)
-        return replace(step, pseudo=asked_for(run, number))
+        steps[0] = replace(steps[0], pseudo=asked_for(run, number))
+        return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
 
 
 def asked_for(run: Run, number: int) -> dict[str, dict[str, Any]]:

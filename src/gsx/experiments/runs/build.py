@@ -95,7 +95,7 @@ def augmenter_of(
     def regenerator(role: str) -> CheckedRegenerator:
         inner = built[role] = built.get(role) or regenerator_of(role, settings)
         where = f"augmenter.{name}.checks" if own else f"checks.{role}"
-        tally.remedies = [f"choose another regenerator/{role}", f"loosen {where}"]
+        tally.remedies = list(dict.fromkeys([*tally.remedies, f"choose another regenerator/{role}", f"loosen {where}"]))
         return CheckedRegenerator(inner=inner, checks=own.checks if own else settings.checks[role], tally=tally)
 
     context = AugmenterContext(

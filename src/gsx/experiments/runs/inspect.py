@@ -1,5 +1,6 @@
 """What is in this folder? Answers `gsx scenes PATH`, also for folders that cannot be trained from."""
 
+import logging
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,6 +16,8 @@ from gsx.core.errors import GsxError, InputError
 from gsx.core.plugins import Component, Plugins
 from gsx.experiments.runs.compose import compose_raw, hydra_session
 from gsx.experiments.runs.settings import typed
+
+logger = logging.getLogger(__name__)
 
 Readable = list[tuple[Component, SceneFormat]]
 """Loaders that can read a folder, the most telling first."""
@@ -60,8 +63,15 @@ def describe(path: str | Path, plugins: Plugins) -> list[str]:
 
 
 def readable(path: Path, plugins: Plugins) -> Readable:
-    """The loaders that can read a folder, the most telling first."""
-    return [(loader, its) for loader, its in plugins.registry.formats() if its.recognise(path)]
+    """The loaders that can read a folder, the most telling first; one that fails to look is named in the log."""
+    found: Readable = []
+    for loader, its in plugins.registry.formats():
+        try:
+            if its.recognise(path):
+                found.append((loader, its))
+        except Exception as error:  # a plugin's; the other loaders are asked all the same
+            logger.warning("scene=%s cannot look at %s (%s: %s)", loader.name, path, type(error).__name__, error)
+    return found
 
 
 def format_lines(path: Path, loaders: Readable, plugins: Plugins) -> Iterator[str]:
@@ -108,7 +118,7 @@ def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plu
     """The options that this command means."""
     with hydra_session(plugins):
         asked = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
-    return typed(loader.options, OmegaConf.to_container(asked), "scene")
+    return typed(loader.options, OmegaConf.to_container(asked, resolve=True), "scene")
 
 
 def loaded_lines(scene: Scene) -> Iterator[str]:

@@ -116,6 +116,8 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
     checkpoint.restore(run)
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
+    for tally in run.tallies:
+        tally.recall(run.curves)
     return run
 
 

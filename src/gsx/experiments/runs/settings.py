@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.evaluation.evaluator import EvalOptions
-from gsx.core.options import IdleKeys, idle_keys
+from gsx.core.options import idle_keys
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.run_folder.general_options import GeneralOptions
@@ -84,8 +84,8 @@ class Settings:
     """By name, in the order of the command line."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
-    idle: IdleKeys
-    """What of them changes nothing of what is trained."""
+    idle: frozenset[str]
+    """Dotted keys of them that change nothing of what is trained, as their options say."""
 
 
 def dotted(node: Any, prefix: str = "") -> Iterator[str]:
@@ -120,25 +120,28 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     trackers = named_nodes(values.pop("tracker", None), "tracker")
     parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
     evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
-    loader = chosen("scene", parts["scene"], plugins)
+    single = {kind: chosen(kind, parts[kind], plugins) for kind in COMPONENT_KINDS}
     redrawing = {role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()}
     found = {name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()}
-    idle = () if any(not isinstance(one.options, WithChecks) for one in found.values()) else ("checks",)
+    unused = () if any(not isinstance(one.options, WithChecks) for one in found.values()) else ("checks",)
     return Settings(
         general=typed(GeneralOptions, values, ""),
         training=typed(TrainingOptions, parts["training"], "training"),
         evaluation=typed(EvalOptions, evaluation, "eval"),
         raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
-        scene=loader,
-        backbone=chosen("backbone", parts["backbone"], plugins),
+        scene=single["scene"],
+        backbone=single["backbone"],
         augmenters=found,
         regenerators=redrawing,
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
         trackers={name: chosen("tracker", node, plugins, name) for name, node in trackers.items()},
         checks={role: checks.get(role) or strict_checks() for role in regenerators},
-        resolved={key: value for key, value in raw.items() if key not in ("experiment", *idle)},  # type: ignore[misc]
+        resolved={key: value for key, value in raw.items() if key not in ("experiment", *unused)},  # type: ignore[misc]
         idle=idle_keys(
-            loader.component.options, [one.component.options for one in redrawing.values()], TrainingOptions
+            {"training": TrainingOptions}
+            | {kind: one.component.options for kind, one in single.items()}
+            | {f"augmenter.{name}": one.component.options for name, one in found.items()}
+            | {f"regenerator.{role}": one.component.options for role, one in redrawing.items()}
         ),
     )
 

@@ -53,7 +53,7 @@ def warm_start_folder(run: Run, plugins: Mapping[str, str]) -> Path:
 
 def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
     """The composition of the control."""
-    return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator")}
+    return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator", "checks")}
 
 
 def seen_by(run: Run) -> str:
@@ -64,7 +64,7 @@ def seen_by(run: Run) -> str:
         camera = view.camera
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
-        digest.update(repr(file_stamp(view.source.path) if isinstance(view.source, FromFile) else "").encode())
+        digest.update(repr(file_stamp(Path(view.source.path)) if isinstance(view.source, FromFile) else "").encode())
     return digest.hexdigest()
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from gsx.core.cache import source_revision
 from gsx.core.files import read_json
-from gsx.core.options import IdleKeys
 from gsx.core.run_folder.files import RunFiles, is_number, part, read_run, state_of
 from gsx.core.run_folder.run_key import NAMES, WHERE, asked_for, flattened, other_revision, without
 from gsx.core.training.remarks import remarks_of
@@ -329,7 +328,7 @@ def share_of(row: str, revision: str, cells: Sequence[Cell], found: dict[Path, s
     return f"{row} ({count} of {len(own)} runs)" if count else ""
 
 
-def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any], IdleKeys]]) -> list[str]:
+def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any], frozenset[str]]]) -> list[str]:
     """In which keys compositions (as run, as published) differ, each with its values, those of most rows first.
 
     `compared`: both, and what of them has no effect.
@@ -352,7 +351,7 @@ def listed(values: Sequence[str]) -> str:
     return ", ".join(dict.fromkeys(values))
 
 
-def differing(own: dict[str, Any], paper: dict[str, Any], idle: IdleKeys) -> Iterator[tuple[str, str, str]]:
+def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:
     """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
     mine, theirs = (flattened(judged(config, idle)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
@@ -362,12 +361,18 @@ def differing(own: dict[str, Any], paper: dict[str, Any], idle: IdleKeys) -> Ite
             yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
 
 
-def judged(config: dict[str, Any], idle: IdleKeys) -> dict[str, Any]:
+def judged(config: dict[str, Any], idle: frozenset[str]) -> dict[str, Any]:
     """What of a composition makes its protocol: all but where it runs, its seed, and which zooms are looked at."""
-    kept = {key: value for key, value in config.items() if key not in (*WHERE, *NAMES, "seed")}
-    kept["dataset"] = part(config, "dataset").get("title")
-    kept["eval"] = {key: value for key, value in part(config, "eval").items() if key not in ("zoom", "tile_pixels")}
-    kept["training"] = without(part(config, "training"), idle.training)
-    kept["scene"] = without(part(config, "scene"), idle.scene)
-    kept["metrics"] = {key: part(part(config, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
-    return kept | {"regenerator": without(asked_for(config), (*idle.regenerator, *PLACES))}
+    known = without(config, idle)
+    kept = {key: value for key, value in known.items() if key not in (*WHERE, *NAMES, "seed")}
+    kept["dataset"] = part(known, "dataset").get("title")
+    kept["eval"] = without(part(known, "eval"), ("zoom", "tile_pixels"))
+    kept["metrics"] = {key: part(part(known, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
+    return kept | {"regenerator": placeless(asked_for(known))}
+
+
+def placeless(node: Any) -> Any:
+    """Regenerators without where their models come from and how they are held in memory."""
+    if not isinstance(node, dict):
+        return node
+    return {key: placeless(value) for key, value in node.items() if key not in PLACES}
