@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -171,10 +171,12 @@ def added_account(accounts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def added(counts: Sequence[dict[str, int]]) -> dict[str, int]:
+def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Sums by scale."""
-    scales = dict.fromkeys(scale for count in counts for scale in count)
-    return {scale: sum(count.get(scale, 0) for count in counts) for scale in scales}
+    total: Counter[str] = Counter()
+    for count in counts:
+        total.update(count)
+    return dict(sorted(total.items(), key=lambda item: float(item[0])))
 
 
 def by_scale(drawn: Sequence[Redrawn]) -> dict[str, int]:

@@ -1,11 +1,11 @@
 """What a reader must know beside the figures of a run: growth held at a cap, pictures lost, splats left out."""
 
 import logging
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from gsx.core.plugins import hookimpl
+from gsx.core.training.checked_regenerator import added
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -68,14 +68,6 @@ def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "dropped": shares(added(event["dropped"] for event in events), asked),
         "warned": {check: shares(added(event["warned"].get(check, {}) for event in events), asked) for check in checks},
     }
-
-
-def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sums by scale."""
-    total: Counter[str] = Counter()
-    for count in counts:
-        total.update(count)
-    return dict(sorted(total.items(), key=lambda item: float(item[0])))
 
 
 def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, float]:
