@@ -580,7 +580,7 @@ def test_offsets_are_judged_after_more_than_forty_sightings() -> None:
 
 def pruning_case(visits: list[float], sums: list[float]) -> ParameterTable:
     table, _ = cloud([[float(i), 0, 0] for i in range(len(visits))], [[[0.0] * 3]] * len(visits), [[0.0]] * len(visits))
-    table.columns |= {"visits": torch.tensor(visits), "opacity_sum": torch.tensor(sums)}
+    table.statistics |= {"visits": torch.tensor(visits), "opacity_sum": torch.tensor(sums)}
     return table
 
 

@@ -264,7 +264,7 @@ def test_a_missing_package_is_refused_before_anything_is_done(
     monkeypatch.setitem(sys.modules, package, None)  # an import of it fails
     monkeypatch.setattr("gsx.experiments.runs.open.load_scene", lambda settings: pytest.fail("the scene was loaded"))
     settings = tiny_settings(tmp_path / "run", f"tracker=[{tracker}]")
-    with pytest.raises(ConfigError, match=rf"tracker {tracker} needs {package} .*pip install 'gsx\[{tracker}\]'"):
+    with pytest.raises(ConfigError, match=rf"tracker {tracker} needs {package}.*: pip install 'gsx\[{tracker}\]'"):
         start(settings, plugins())
     assert not (tmp_path / "run").exists()
 
