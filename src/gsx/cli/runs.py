@@ -69,7 +69,7 @@ def verb_export(words: list[str]) -> int:
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     given = parser.parse_args(words)
     from gsx.core.gaussians.splat_files import refuse_suffix
-    from gsx.experiments.runs.export import export, own_columns, reimport_psnr
+    from gsx.experiments.runs.export import export, reimport_psnr
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.render import view_named
 
@@ -78,8 +78,7 @@ def verb_export(words: list[str]) -> int:
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
-    export(run, path, view.camera if view else None)
-    if view is not None or own_columns(run) is None:
+    if export(run, path, view.camera if view else None):
         views = [view] if view else run.scene.test
         logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views))
     sys.stdout.write(f"{path}\n")

@@ -50,7 +50,7 @@ def load(options: PhotosOptions) -> Scene:
     model = read_model(reconstruct(folder, sizes, options))
     notes += report(model, list(sizes))
     scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
-    name = folder.resolve().parent.name if folder.name == "images" else folder.resolve().name
+    name = folder.resolve().parent.name if folder.name == IMAGES else folder.resolve().name
     return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
 
 
@@ -74,7 +74,7 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     """
     if not path.is_dir():
         raise InputError(f"scene.path '{path}' is no folder: name the folder that holds the photos.")
-    folder = path / "images" if not photos_in(path, "*") and (path / "images").is_dir() else path
+    folder = path / IMAGES if not photos_in(path, "*") and (path / IMAGES).is_dir() else path
     names = photos_in(folder, "*") or photos_in(folder, "**/*")
     if len(names) < MIN_PHOTOS:
         found = ", ".join(sorted({file.suffix for file in folder.rglob("*") if file.is_file()})) or "nothing"

@@ -5,6 +5,7 @@ removed with their moments; a group's step count is never reset (3D-GS). A param
 is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
 """
 
+from collections import ChainMap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -17,6 +18,11 @@ from gsx.core.shapes import Bool
 
 ADAM_EPSILON = 1e-15
 """Gradients of a mean loss are tiny (3D-GS, training_setup)."""
+
+
+def group_named(optimiser: torch.optim.Adam, name: str) -> dict:
+    """The group of one parameter or network."""
+    return next(group for group in optimiser.param_groups if group["name"] == name)
 
 
 @dataclass(eq=False)
@@ -40,7 +46,7 @@ class Networks:
 
     def set_rate(self, name: str, rate: float) -> None:
         """Learning rate of one network."""
-        next(group for group in self.optimiser.param_groups if group["name"] == name)["lr"] = rate
+        group_named(self.optimiser, name)["lr"] = rate
 
     def named(self) -> Iterator[tuple[str, Parameter]]:
         """Parameters by the names that they are saved under."""
@@ -67,7 +73,7 @@ class ParameterTable:
         return len(next(iter(self.parameters.values())))
 
     def __getitem__(self, name: str) -> Tensor:
-        return (self.parameters | self.columns | self.statistics)[name]
+        return ChainMap[str, Tensor](self.parameters, self.columns, self.statistics)[name]  # type: ignore[arg-type]
 
     def set_rate(self, name: str, rate: float) -> None:
         """Learning rate of one parameter."""
@@ -75,7 +81,7 @@ class ParameterTable:
 
     def group(self, name: str) -> dict:
         """The Adam group of one parameter."""
-        return next(group for group in self.optimiser.param_groups if group["name"] == name)
+        return group_named(self.optimiser, name)
 
 
 def edit(

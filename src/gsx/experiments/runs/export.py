@@ -3,15 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch import Tensor
-
 from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
-from gsx.core.shapes import Float
 from gsx.core.training.backbone import WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -19,16 +16,17 @@ from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 
 
-def export(run: Run, path: Path, camera: Camera | None = None) -> None:
-    """Write the backbone's splat file, or what it draws for one camera as a standard one.
+def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
+    """Write the backbone's splat file, or what it draws for one camera as a standard one; returns whether it is one.
 
     The comments hold the conventions that a viewer must know.
     """
-    columns = None if camera else own_columns(run)
+    own = run.backbone if isinstance(run.backbone, WithOwnFile) else None
+    columns = own.file_columns() if own and camera is None else None
     comments = [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
-        *(run.backbone.file_notes() if isinstance(run.backbone, WithOwnFile) else ()),
+        *(own.file_notes() if own else ()),
         *([f"SplatRenderMode: {render_mode(run.raster)}"] if columns is None else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
@@ -36,11 +34,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> None:
         write_gaussians(path, run.backbone.explicit(camera, run.model_step), comments)
     else:
         write_columns(path, columns, comments)
-
-
-def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:
-    """Columns of the backbone's own splat file; None: that is a standard one."""
-    return run.backbone.file_columns() if isinstance(run.backbone, WithOwnFile) else None
+    return columns is None
 
 
 def render_mode(raster: RasterSettings) -> str:
