@@ -35,7 +35,7 @@ print(len(names))
 
 LOCKS = """
 from pathlib import Path
-from gsx.core.run_folder.run_key import claimed
+from gsx.experiments.run_folder.run_key import claimed
 folder = Path(sys.argv[1]) / "run"
 with claimed(folder) as first, claimed(folder) as second:
     print(first, second)
@@ -44,7 +44,7 @@ with claimed(folder) as first, claimed(folder) as second:
 MEMORY = """
 from pathlib import Path
 import torch
-from gsx.core.evaluation.evaluator import peak_memory_mb
+from gsx.experiments.evaluation.evaluator import peak_memory_mb
 print(peak_memory_mb(torch.device("cpu")))
 from gsx.cli.dispatch import main
 sys.path.insert(0, {tests})

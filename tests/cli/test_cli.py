@@ -88,8 +88,8 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
         return False  # drawn eagerly after all: this test is not about compiling
 
     monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
-    monkeypatch.setattr("gsx.core.rasterizer.prepare.takes", lambda settings, **rest: settings.path == "compiled")
-    monkeypatch.setattr("gsx.core.rasterizer.prepare.compiles", lambda settings, device: False)
+    monkeypatch.setattr("gsx.core.rasterizer.compiled.takes", lambda settings, **rest: settings.path == "compiled")
+    monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.compiles", lambda settings, device: False)
 
     def evaluated(*overrides: str) -> tuple[str, set[str], str]:
         asked.clear()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from gsx.builtin import plugins
 from gsx.core.options import fields_with, idle_keys, label, without_effect
-from gsx.core.run_folder.run_key import NAMES, WHERE, without
+from gsx.experiments.run_folder.run_key import NAMES, WHERE, without
 from gsx.experiments.runs.compose import compose
 
 

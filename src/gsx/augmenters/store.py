@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.augmenters.timing import event_at
 from gsx.core.errors import InputError
-from gsx.core.run_folder.checkpoint import sidecars, step_of
+from gsx.core.training.checkpoint import sidecars, step_of
 from gsx.core.training.pseudo_views import PseudoView, load_views, save_views
 from gsx.core.training.run import Run
 

@@ -16,11 +16,11 @@ def verb_eval(words: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
     told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
     folder, overrides = run_words("eval", words, told)
-    from gsx.core.rasterizer.prepare import warm
     from gsx.experiments.reports.report import write_report
     from gsx.experiments.runs.evaluate import evaluate
     from gsx.experiments.runs.execute import finish
     from gsx.experiments.runs.open import as_trained, open_run
+    from gsx.experiments.runs.rasterizer_path import warm
 
     loaded = plugins()
     run, settings = open_run(folder, loaded, overrides)

@@ -106,11 +106,6 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
-def bytes_of(folder: Path) -> int:
-    """Bytes of the files in a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*"))
-
-
 def trim(kind: str, budget: float, kept: Path) -> list[Path]:
     """Remove those folders of a kind that were touched longest ago, until all hold `budget` bytes; `kept` stays.
 
@@ -119,16 +114,17 @@ def trim(kind: str, budget: float, kept: Path) -> list[Path]:
     Raises:
         OSError: the cache cannot be looked at.
     """
-    folders = {path: bytes_of(path) for path in cache_folder(kind, "").glob("*") if path.is_dir()}
-    excess = sum(folders.values()) - budget
+    folders = [path for path in cache_folder(kind, "").glob("*") if path.is_dir()]
+    sizes = {folder: sum(path.stat().st_size for path in folder.rglob("*")) for folder in folders}
+    excess = sum(sizes.values()) - budget
     removed: list[Path] = []
     for folder in sorted(folders, key=lambda path: path.stat().st_mtime_ns):
         if excess > 0 and folder != kept:
             shutil.rmtree(folder, ignore_errors=True)
-            excess -= folders[folder]
+            excess -= sizes[folder]
             removed.append(folder)
     if removed:
-        freed = sum(folders[folder] for folder in removed) / 1e9
+        freed = sum(sizes[folder] for folder in removed) / 1e9
         logger.info("%d of %s made room in the cache (%.1f GB)", len(removed), kind, freed)
     return removed
 

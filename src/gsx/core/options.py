@@ -1,4 +1,4 @@
-"""What options say of themselves beside their values: whether they have any effect on results.
+"""What options say of themselves beside their values: whether they have any effect on results. Dotted keys.
 
 A run is named by what it trains. Fields made by `without_effect` and `label` do not count for that name, in options of
 plugins just as in those of gsx itself.
@@ -34,3 +34,11 @@ def fields_with(effect: str, options: type, prefix: str = "") -> frozenset[str]:
 def idle_keys(options: Mapping[str, type]) -> frozenset[str]:
     """Dotted keys of a composition that change nothing of what is trained; `options`: schemas by key."""
     return frozenset[str]().union(*(fields_with("none", schema, f"{key}.") for key, schema in options.items()))
+
+
+def flattened(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values of a nested configuration by dotted key."""
+    out: dict[str, Any] = {}
+    for key, value in node.items():
+        out |= flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return out

@@ -204,7 +204,10 @@ def admit(plugins: Plugins, name: str, plugin: object) -> None:
         if hasattr(plugin, "gsx_register"):
             plugin.gsx_register(registry=plugins.registry)
         if hasattr(plugin, "gsx_config_paths"):
-            plugins.config_paths += checked_paths(plugin.gsx_config_paths())
+            added = plugin.gsx_config_paths()
+            if not isinstance(added, list) or not all(isinstance(path, str) for path in added):
+                raise TypeError(f"gsx_config_paths must return a list of texts, got {added!r}")
+            plugins.config_paths += added
     except Exception:
         plugins.manager.unregister(plugin)
         plugins.registry.components, plugins.config_paths = before, paths
@@ -220,10 +223,3 @@ def refuse_unmarked(plugin: object) -> None:
             and not hasattr(hook, f"{GROUP}_impl")
         ):
             raise TypeError(f"{name} is not marked with @hookimpl")
-
-
-def checked_paths(paths: Any) -> list[str]:
-    """What gsx_config_paths returned, or TypeError."""
-    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        raise TypeError(f"gsx_config_paths must return a list of texts, got {paths!r}")
-    return paths

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from gsx.core.run_folder.files import part
-
 
 def numbers(content: dict[str, Any], prefix: str = "") -> dict[str, float]:
     """The numbers directly in a mapping, those that are not finite included, under `prefix` and their key."""
@@ -13,13 +11,13 @@ def numbers(content: dict[str, Any], prefix: str = "") -> dict[str, float]:
 
 def line_figures(line: dict[str, Any]) -> dict[str, float]:
     """Numbers of a line of metrics.jsonl but for its step; parts of the loss are `terms/NAME`."""
-    figures = numbers(line) | numbers(part(line, "terms"), "terms/")
+    figures = numbers(line) | numbers(line.get("terms", {}), "terms/")
     return {name: value for name, value in figures.items() if name != "step"}
 
 
 def evaluation_figures(evaluation: dict[str, Any]) -> dict[str, float]:
     """Numbers of evaluation.json but for its step: `evaluation/psnr`, and by zoom `evaluation/x2/psnr`."""
     figures = numbers(evaluation, "evaluation/")
-    for factor, result in part(evaluation, "zoom").items():
+    for factor, result in evaluation.get("zoom", {}).items():
         figures |= numbers(result, f"evaluation/x{factor}/")
     return {name: value for name, value in figures.items() if name != "evaluation/step"}

@@ -14,9 +14,9 @@ from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import read_json, write_json
 from gsx.core.locks import lock
+from gsx.core.options import flattened
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
-from gsx.core.run_folder.run_key import flattened
 from gsx.core.training.run import Run
 from gsx.trackers.figures import evaluation_figures, line_figures
 
@@ -197,10 +197,14 @@ def experiment_id(client: Any, uri: str, name: str) -> str:
 
 
 def parameters(config: dict[str, Any]) -> list[Any]:
-    """The configuration as MLflow's parameters: dotted keys, in characters and lengths that it accepts."""
+    """The configuration as MLflow's parameters, without that of trackers: addresses may hold passwords.
+
+    Dotted keys, in characters and lengths that it accepts.
+    """
     from mlflow.entities import Param
 
-    values = {re.sub(r"[^\w./ -]", "_", key)[:LONGEST_KEY]: str(value) for key, value in flattened(config).items()}
+    told = flattened({key: value for key, value in config.items() if key != "tracker"})
+    values = {re.sub(r"[^\w./ -]", "_", key)[:LONGEST_KEY]: str(value) for key, value in told.items()}
     return [Param(key, value[:LONGEST_VALUE]) for key, value in values.items()]
 
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from gsx.core.run_folder.files import RunFiles
 from gsx.experiments.reports.baselines import compared, control_rows
+from gsx.experiments.run_folder.files import RunFiles
 
 
 def run(

@@ -15,10 +15,10 @@ import torch
 from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
-from gsx.core.run_folder.files import read_run, runs_below
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.reports.pictures import spread
 from gsx.experiments.reports.report import report_on
+from gsx.experiments.run_folder.files import read_run, runs_below
 
 FILES = ("config.yaml", "environment.json", "metrics.jsonl", "evaluation.json", "renders/index.json", "status.json")
 VOID = ("img", "meta", "br", "link")

@@ -14,7 +14,6 @@ import torch
 
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
-from gsx.core.run_folder.files import read_run, runs_below, state_of
 from gsx.experiments.reports.charts import (
     Axis,
     Series,
@@ -27,6 +26,7 @@ from gsx.experiments.reports.charts import (
 )
 from gsx.experiments.reports.page import duration, fixed, signed
 from gsx.experiments.reports.report import write_overview, write_report
+from gsx.experiments.run_folder.files import read_run, runs_below, state_of
 
 CONFIG = """\
 iterations: 1000

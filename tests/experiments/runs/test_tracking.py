@@ -19,10 +19,10 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
-from gsx.core.run_folder.files import read_run
 from gsx.core.training.run import Run
 from gsx.experiments.reports.baselines import key_of
 from gsx.experiments.reports.overview import flattened
+from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start

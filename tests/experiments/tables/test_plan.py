@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from gsx.builtin import plugins
-from gsx.core.run_folder.files import read_run
-from gsx.core.run_folder.run_key import claimed, composition_key, finished, judging, place_of, scene_stamp
+from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.run_key import claimed, composition_key, finished, judging, place_of, scene_stamp
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.settings import write_config
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, planned, told

@@ -8,9 +8,9 @@ from tiny import tiny_settings
 
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.builtin import plugins
-from gsx.core.run_folder.run_key import composition_key
 from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder.run_key import composition_key
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.settings import Settings

@@ -77,7 +77,7 @@ class Camera:
 
     def resize(self, width: int, height: int) -> "Camera":
         """The same field of view on another raster; intrinsics scale per axis."""
-        sx, sy = width / self.width, height / self.height
+        sx, sy, frame = width / self.width, height / self.height, self.cut_from
         return replace(
             self,
             fx=self.fx * sx,
@@ -86,7 +86,13 @@ class Camera:
             cy=self.cy * sy,
             width=width,
             height=height,
-            cut_from=self.cut_from and resized(self.cut_from, sx, sy),
+            cut_from=frame
+            and Frame(
+                left=round(frame.left * sx),
+                top=round(frame.top * sy),
+                width=round(frame.width * sx),
+                height=round(frame.height * sy),
+            ),
         )
 
     def zoom(self, factor: float) -> "Camera":
@@ -124,16 +130,6 @@ def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Fl
     Far from the origin the centre itself, rounded first, would move by a grain of the coordinates (docs/numerics.md).
     """
     return (points.double() - centre.to(points.device, torch.float64)).to(points)
-
-
-def resized(frame: Frame, sx: float, sy: float) -> Frame:
-    """The frame on a raster scaled by sx, sy, to whole pixels."""
-    return Frame(
-        left=round(frame.left * sx),
-        top=round(frame.top * sy),
-        width=round(frame.width * sx),
-        height=round(frame.height * sy),
-    )
 
 
 def look_at(

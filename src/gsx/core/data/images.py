@@ -44,9 +44,11 @@ def read_image(path: str | Path, *, upright: bool = False) -> UInt8[Tensor, "C H
         InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
     """
     pixels, spec = _decode(Path(path))
-    image = _display_bytes(_rgb_or_rgba(pixels, spec, path), _is_straight(spec), path)
+    straight = spec.alpha_channel < 0 or spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
+    image = _display_bytes(_rgb_or_rgba(pixels, spec, path), straight, path)
     image = image.permute(2, 0, 1).contiguous()
-    return _orient(image, _orientation(spec)) if upright else image
+    exchange, flips = ORIENTATIONS[_orientation(spec)] if upright else (False, ())
+    return (image.transpose(1, 2) if exchange else image).flip(flips).contiguous()
 
 
 def image_size(path: str | Path, *, upright: bool = False) -> Size:
@@ -223,10 +225,6 @@ def _rgb_or_rgba(pixels: np.ndarray, spec: Any, path: str | Path) -> np.ndarray:
     return pixels[..., (0, 0, 0, 1)[: channels + 2]] if channels < 3 else pixels
 
 
-def _is_straight(spec: Any) -> bool:
-    return spec.alpha_channel < 0 or spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
-
-
 def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt8[Tensor, "H W C"]:
     """Straight 8-bit display values of pixels of any number type."""
     if pixels.dtype == np.uint8 and straight:
@@ -246,11 +244,6 @@ def _orientation(spec: Any) -> int:
     """EXIF orientation, 1 (as stored) where it is missing or undefined."""
     value = spec.get_int_attribute("Orientation", 1)
     return value if value in ORIENTATIONS else 1
-
-
-def _orient(image: UInt8[Tensor, "C H W"], orientation: int) -> UInt8[Tensor, "C height width"]:
-    exchange, flips = ORIENTATIONS[orientation]
-    return (image.transpose(1, 2) if exchange else image).flip(flips).contiguous()
 
 
 def _refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:

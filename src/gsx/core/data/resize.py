@@ -112,7 +112,8 @@ def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size s
     centre = ((torch.arange(new_size, dtype=torch.float64) + 0.5) * ratio)[:, None]
     old = (centre - reach - 0.5).ceil().long() + torch.arange(math.floor(2 * reach) + 1)
     distance = old + 0.5 - centre
-    weights = _overlap(distance, ratio) if filter == "area" else KERNELS[filter](distance / stretch)
+    shared = ((1 + ratio) / 2 - distance.abs()).clamp(0, min(1, ratio))  # length of an old and of the new pixel
+    weights = shared if filter == "area" else KERNELS[filter](distance / stretch)
     weights = torch.where((distance.abs() <= reach) & (old >= 0) & (old < size), weights, 0)
     weights /= weights.sum(1, keepdim=True)
     new = torch.arange(new_size)[:, None].expand_as(old)
@@ -120,11 +121,6 @@ def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size s
     return torch.sparse_coo_tensor(
         places, weights.flatten().float(), (new_size, size), check_invariants=False
     ).coalesce()
-
-
-def _overlap(distance: Tensor, ratio: float) -> Tensor:
-    """Length shared by an old pixel (length 1) and a new one (length `ratio`), centres `distance` apart."""
-    return ((1 + ratio) / 2 - distance.abs()).clamp(0, min(1, ratio))
 
 
 def _keys(x: Tensor) -> Tensor:

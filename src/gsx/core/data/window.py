@@ -21,7 +21,12 @@ class Window:
         self, image: Float[Tensor, "C H W"] | UInt8[Tensor, "C H W"]
     ) -> Float[Tensor, "C h w"] | UInt8[Tensor, "C h w"]:
         """The part of an image inside the window."""
-        return image[:, self.top : self.top + self.height, self.left : self.left + self.width]
+        return image[:, *self.pixels]
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the raster."""
+        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def of(self, camera: Camera) -> Camera:
         """The camera through this window."""
@@ -32,3 +37,12 @@ class Window:
         left, top = max(0, self.left - margin), max(0, self.top - margin)
         right, bottom = min(width, self.left + self.width + margin), min(height, self.top + self.height + margin)
         return Window(left, top, right - left, bottom - top)
+
+    def halves(self, unit: int) -> tuple["Window", "Window"]:
+        """Two windows, cut across the longer side at the multiple of `unit` px nearest its middle, inside it."""
+        cut = max(1, round(max(self.width, self.height) / 2 / unit)) * unit
+        if self.width >= self.height:
+            beyond = Window(self.left + cut, self.top, self.width - cut, self.height)
+            return Window(self.left, self.top, cut, self.height), beyond
+        below = Window(self.left, self.top + cut, self.width, self.height - cut)
+        return Window(self.left, self.top, self.width, cut), below

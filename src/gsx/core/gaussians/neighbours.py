@@ -29,7 +29,10 @@ def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> F
         return torch.zeros_like(points[:, 0])
     nearest = points.new_empty(len(points), count)
     pending = torch.arange(len(points), device=points.device)
-    cell = first_cell(points, count) if len(points) > DIRECT else 0.0
+    cell = 0.0
+    if len(points) > DIRECT:  # a length that settles the densest: the lowest decile of a sample's distances
+        sample = torch.linspace(0, len(points) - 1, SAMPLE, device=points.device).long()
+        cell = float(direct_squares(points, sample, count)[:, -1].quantile(0.1).sqrt()) or 1.0
     while len(pending) > DIRECT:
         found = torch.cat([near_squares(points, rows, cell, count) for rows in pending.split(BATCH)])
         settled = found[:, -1] <= cell**2  # whatever lies within one cell's length was among the candidates
@@ -37,12 +40,6 @@ def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> F
         pending, cell = pending[~settled], 2 * cell
     nearest[pending] = direct_squares(points, pending, count)
     return nearest.mean(1)
-
-
-def first_cell(points: Float[Tensor, "P 3"], count: int) -> float:
-    """A cell length that settles the densest points: the lowest decile of a sample's distances; 1 if that is 0."""
-    rows = torch.linspace(0, len(points) - 1, SAMPLE, device=points.device).long()
-    return float(direct_squares(points, rows, count)[:, -1].quantile(0.1).sqrt()) or 1.0
 
 
 def direct_squares(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Float[Tensor, "R count"]:

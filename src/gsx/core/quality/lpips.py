@@ -117,16 +117,6 @@ def load_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
     return weights, hashlib.sha256(data).hexdigest()[:8]
 
 
-def fill(network: Lpips, trunk: dict[str, Tensor], head: dict[str, Tensor]) -> None:
-    """Copy torchvision trunk weights (`features.N.*`) and head weights (`linN.model.1.weight`) into the network."""
-    for stage in network.stages:
-        for number, layer in stage.named_children():
-            if isinstance(layer, nn.Conv2d):
-                layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
-    for index, parameter in enumerate(network.heads):
-        parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
-
-
 def load_lpips(options: LpipsOptions) -> Lpips | None:
     """The network, or None without weights (said once in the log).
 
@@ -143,7 +133,12 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
     trunk, trunk_hash = load_weights(options.trunk, "metrics.lpips.trunk")
     head, head_hash = load_weights(options.head, "metrics.lpips.head")
     try:
-        fill(network, trunk, head)
+        for stage in network.stages:
+            for number, layer in stage.named_children():
+                if isinstance(layer, nn.Conv2d):
+                    layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
+        for index, parameter in enumerate(network.heads):
+            parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
     except (KeyError, RuntimeError) as error:
         raise InputError(f"metrics.lpips weights do not fit net '{options.net}' ({error}): check both files") from error
     network.note = f", trunk {trunk_hash}, head {head_hash}"

@@ -49,12 +49,12 @@ def compile_rows(function: Callable[..., Any]) -> Callable[..., Any]:
     Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
     compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
     """
-    return first_sizes_free(torch.compile(function), lambda all: [a for a in all if as_long(a, all[0])])
 
+    def varying(arguments: tuple[Any, ...]) -> list[Tensor]:
+        rows = len(arguments[0])
+        return [a for a in arguments if isinstance(a, Tensor) and a.dim() > 0 and len(a) == rows]
 
-def as_long(value: Any, first: Tensor) -> bool:
-    """Whether `value` is a tensor with as many rows as `first`."""
-    return isinstance(value, Tensor) and value.dim() > 0 and len(value) == len(first)
+    return first_sizes_free(torch.compile(function), varying)
 
 
 def first_sizes_free(

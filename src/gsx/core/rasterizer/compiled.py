@@ -20,7 +20,7 @@ from gsx.core.rasterizer.pairs import Pairs
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
 from gsx.core.rasterizer.settings import RasterSettings
-from gsx.core.shapes import Bool, Float, Int
+from gsx.core.shapes import Float, Int
 
 MOST_CHANNELS = 8
 """Channels are unrolled: beyond this number compilation takes longer than it saves."""
@@ -40,12 +40,6 @@ class Basis:
     """x^2, x y, y^2."""
 
 
-def basis_of(grid: TileGrid, like: Tensor) -> Basis:
-    """The basis of a grid's tiles."""
-    x, y = grid.basis(like)[:2, :, None].unbind(0)
-    return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Job:
     """One picture to blend."""
@@ -60,11 +54,6 @@ class Job:
     batch: int
     """Groups, or blocks of segments, worked on at once."""
     segments: bool
-
-
-def batch_groups(settings: RasterSettings) -> int:
-    """Groups of a batch: about `compiled_values` alphas at once, at least two groups."""
-    return max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
 
 
 def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation: torch.dtype, device: str) -> Rules:
@@ -155,14 +144,9 @@ def stage_of(job: Job, number: int, begin: int, left: Int[Tensor, "B"] | None) -
     return Stage(base + groups, groups, last + groups) if len(groups) else None
 
 
-def still_going(after: Float[Tensor, "B P L"], stop: float) -> Bool[Tensor, "B"]:
-    """Groups with a pixel that has not ended."""
-    return after.amax((1, 2)) >= stop
-
-
 def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
     """Groups that go on, where enough have ended for the others to be picked out; at least two, for the compiler."""
-    going = still_going(kept.after[stage.blocks], job.rules.stop)
+    going = kept.after[stage.blocks].amax((1, 2)) >= job.rules.stop  # a pixel of theirs has not ended
     total = int(going.sum())
     if total > WORTH_LEAVING * len(going):
         return None
@@ -278,12 +262,6 @@ def sum_by_splat(values: Float[Tensor, "E V"], pairs: Pairs, lanes: Lanes, count
     return values.new_zeros(count, values.shape[1]).index_copy_(0, pairs.order, sums)
 
 
-def inside_of(job: Job, like: Tensor) -> Float[Tensor, "G P L"]:
-    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
-    ones = like.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
-    return to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()
-
-
 class CompiledComposite(torch.autograd.Function):
     """See `composite_compiled` for the arguments."""
 
@@ -291,7 +269,9 @@ class CompiledComposite(torch.autograd.Function):
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, pairs, job):
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
-        light, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside_of(job, means))
+        ones = means.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
+        inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
+        light, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside)
         if any(ctx.needs_input_grad):
             ctx.kept = (job, pairs, table, rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
@@ -323,13 +303,14 @@ def composite_compiled(
     """What `composite` returns, through compiled loops; `absgrad` as there. There must be a pair."""
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
-    batch = batch_groups(settings)
+    batch = max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
     lanes = lay_out(pairs, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)
+    x, y = grid.basis(exact)[:2, :, None].unbind(0)
     job = Job(
         lanes=lanes,
         grid=grid,
-        basis=basis_of(grid, exact),
+        basis=Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y])),
         centre=centres(lanes, grid, exact),
         loops=kernels(rules),
         rules=rules,
@@ -353,3 +334,8 @@ def takes(settings: RasterSettings, channels: int, pairs: int, max_weight: bool,
         warn_once(device)
         return False
     return True
+
+
+def path_of(settings: RasterSettings, device: torch.device) -> str:
+    """`compiled` or `eager`: which way pictures of three channels go by these settings, here."""
+    return "compiled" if takes(settings, channels=3, pairs=1, max_weight=False, device=device.type) else "eager"

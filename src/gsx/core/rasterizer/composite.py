@@ -116,14 +116,10 @@ class Front:
 # -- mathematics of a [B, K, P] batch ------------------------------------------------------------------------------
 
 
-def just_below(value: float, dtype: torch.dtype) -> float:
-    """The number of `dtype` under `value`, so that 'x > it' means 'x >= value' there."""
-    return float(torch.nextafter(torch.tensor(value, dtype=dtype), torch.tensor(-math.inf, dtype=dtype)))
-
-
 def alphas_(gaussian: Float[Tensor, "B K P"], settings: RasterSettings) -> Float[Tensor, "B K P"]:
     """In place: clamped at alpha_max, zero below alpha_min (3D-GS, renderCUDA)."""
-    below = just_below(settings.alpha_min, gaussian.dtype)
+    least = torch.tensor(settings.alpha_min, dtype=gaussian.dtype)
+    below = float(torch.nextafter(least, torch.tensor(-math.inf, dtype=gaussian.dtype)))  # "> below" means ">= least"
     return torch.threshold_(gaussian.clamp_(max=settings.alpha_max), below, 0.0)
 
 
@@ -291,11 +287,6 @@ def in_units(
     return (gradient / unit).to(precision.accumulation), unit
 
 
-def channel_units(channels: Float[Tensor, "M C"]) -> Float[Tensor, "C"]:
-    """Powers of two above each channel's largest magnitude."""
-    return power_of_two_above(torch.cat([channels, torch.zeros_like(channels[:1])]).detach().abs().amax(0))
-
-
 class Composite(torch.autograd.Function):
     """See `composite` for the arguments."""
 
@@ -346,7 +337,7 @@ def composite(
             means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights
         )
     # 16 bits hold neither a depth of 1e5 nor a colour of 1e-6: blend what lies within 1
-    units = channel_units(channels)
+    units = power_of_two_above(torch.cat([channels, torch.zeros_like(channels[:1])]).detach().abs().amax(0))
     blended = Composite.apply(
         means, conic_factors, log_opacities, channels / units, absgrad, blocks, grid, settings, max_weights
     )

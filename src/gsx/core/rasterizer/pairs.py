@@ -120,12 +120,6 @@ def row_spans(
     return first, torch.where(low <= high, last, first)
 
 
-def nearest_first(depths: Float[Tensor, "M"]) -> Int[Tensor, "M"]:
-    """Order by depth, ties by row. Positive floats sort like the integers of their bits, which torch sorts faster."""
-    bits = depths.contiguous().view({4: torch.int32, 8: torch.int64}[depths.element_size()])
-    return torch.argsort(bits, stable=True)
-
-
 def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pairs:
     """Pairs of every splat with every tile where its alpha may reach alpha_min.
 
@@ -156,7 +150,9 @@ def reached_tiles(
     radii: Int[Tensor, "M"],
 ) -> Pairs:
     """The pairs, given each splat's box of tiles (first, past the last)."""
-    order = nearest_first(screen.depths)
+    # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
+    bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
+    order = torch.argsort(bits, stable=True)
     order = order[((last > first).all(1))[order]]
     heights = (last - first)[order, 1]
     refuse_too_many(int(heights.sum()), grid, settings)
@@ -187,7 +183,8 @@ def sorted_pairs(
     line = torch.repeat_interleave(widths)
     before = widths.cumsum(0) - widths
     place = torch.arange(len(line), device=line.device)
-    tiles = (place + (row * columns + begin - before).index_select(0, line)).to(index_type(columns * rows))
+    narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
+    tiles = (place + (row * columns + begin - before).index_select(0, line)).to(narrow)
     tiles, slots = torch.sort(tiles, stable=True)
     counts = torch.zeros_like(order).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
@@ -200,11 +197,6 @@ def sorted_pairs(
         counts=counts,
         radii=radii,
     )
-
-
-def index_type(count: int) -> torch.dtype:
-    """The smallest integer type that holds `count`; torch sorts narrow integers fastest."""
-    return torch.int16 if count <= torch.iinfo(torch.int16).max else torch.int32
 
 
 def refuse_too_many(count: int, grid: TileGrid, settings: RasterSettings) -> None:

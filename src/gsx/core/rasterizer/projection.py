@@ -88,11 +88,6 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
         raise InputError(f"the pose of a camera is not finite: {pose}")
 
 
-def camera_points(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
-    """Positions in the camera's frame, in float64: float32 is too coarse far from the origin or through a long lens."""
-    return camera.to_camera(splats.means)
-
-
 @torch.no_grad()
 def usable(splats: Splats) -> Bool[Tensor, "N"]:
     """False for splats with a value that is not finite (an opacity of 0, ln -inf, is fine) or an opacity above 1."""
@@ -126,7 +121,7 @@ def sound(
 def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
     """False for the splats that a render from this camera leaves out and counts as dropped."""
     intrinsics = on_frame(intrinsics_of(camera, None), camera.frame).to(splats.means.device)
-    return sound(splats, camera_points(splats, camera), intrinsics, camera, settings.jacobian_margin)[1]
+    return sound(splats, camera.to_camera(splats.means), intrinsics, camera, settings.jacobian_margin)[1]
 
 
 def project(
@@ -142,7 +137,7 @@ def project(
     margin, intrinsics = settings.jacobian_margin, intrinsics_of(camera, intrinsics)
     refuse_unusable(camera, intrinsics, margin)
     intrinsics = on_frame(intrinsics, camera.frame).to(splats.means.device)
-    points = camera_points(splats, camera)
+    points = camera.to_camera(splats.means)
     in_front, good = sound(splats, points, intrinsics, camera, margin)  # selecting comes before any division
     ids = (good & in_front).nonzero()[:, 0]
     points, scales, quats, log_opacities, channels = (

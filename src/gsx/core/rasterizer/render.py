@@ -9,7 +9,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.compiled import composite_compiled, takes
-from gsx.core.rasterizer.composite import Blocks, composite, make_blocks
+from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.pairs import Pairs, pair
 from gsx.core.rasterizer.projection import ScreenSplats, project
@@ -62,12 +62,6 @@ class Rendering:
     """Splats left out because a value of theirs is not finite."""
 
 
-def heaviest_by_splat(by_entry: Float[Tensor, "S K"], blocks: Blocks, count: int) -> Float[Tensor, "M"]:
-    """Largest weight over a splat's list entries; 0 for splats in no list."""
-    zeros = by_entry.new_zeros(count + 1)
-    return zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
-
-
 def blend(
     screen: ScreenSplats,
     means2d_offset: Float[Tensor, "M 2"],
@@ -86,7 +80,10 @@ def blend(
     blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
     blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
-    return blended, None if by_entry is None else heaviest_by_splat(by_entry, blocks, len(screen.ids))
+    if by_entry is None:
+        return blended, None
+    zeros = by_entry.new_zeros(len(screen.ids) + 1)
+    return blended, zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
 
 
 def rasterize(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.window import Window
 from gsx.core.errors import InputError, TooManyPairs
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.render import Rendering, rasterize
@@ -18,40 +19,7 @@ TILE_PIXELS = 1 << 20
 """Pixels rendered at a time where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """Part of a raster, px."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    @property
-    def pixels(self) -> tuple[slice, slice]:
-        """Rows and columns of the raster."""
-        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
-
-    def halves(self, unit: int) -> tuple["Window", "Window"]:
-        """Two windows, cut across the longer side a multiple of `unit` px from its beginning."""
-        if self.width >= self.height:
-            cut = cut_of(self.width, unit)
-            parts = (0, 0, cut, self.height), (cut, 0, self.width - cut, self.height)
-        else:
-            cut = cut_of(self.height, unit)
-            parts = (0, 0, self.width, cut), (0, cut, self.width, self.height - cut)
-        first, second = (
-            Window(left=self.left + x, top=self.top + y, width=width, height=height) for x, y, width, height in parts
-        )
-        return first, second
-
-
-def cut_of(size: int, unit: int) -> int:
-    """The multiple of `unit` nearest half of `size`, inside it."""
-    return max(1, round(size / 2 / unit)) * unit
-
-
-def windows(width: int, height: int, pixels: int, unit: int) -> Iterator[Window]:
+def covering(width: int, height: int, pixels: int, unit: int) -> Iterator[Window]:
     """Squares of at most `pixels` px (but at least one unit) that cover a raster, edges at multiples of `unit` px."""
     edge = max(1, math.isqrt(pixels) // unit) * unit
     for top in range(0, height, edge):
@@ -73,8 +41,8 @@ class TiledRendering:
     """Splats with a radius on the whole raster."""
     dropped: int
     """Splats left out because a value of theirs is not finite."""
-    pieces: int
-    """Windows rendered."""
+    windows: int
+    """How many were rendered."""
 
     @staticmethod
     def empty(splats: Splats, camera: Camera, depth: bool) -> "TiledRendering":
@@ -86,7 +54,7 @@ class TiledRendering:
             depth=like.new_empty(raster) if depth else None,
             visible=torch.zeros(len(splats), dtype=torch.bool),
             dropped=0,
-            pieces=0,
+            windows=0,
         )
 
     def put(self, window: Window, part: Rendering) -> None:
@@ -109,9 +77,8 @@ def renderings(
 ) -> Iterator[tuple[Window, Rendering]]:
     """The window's rendering, or those of its halves where it needs too many pairs, and so on down to one tile."""
     unit = max(WINDOW_TILE, settings.tile_size)
-    crop = camera.crop(window.left, window.top, window.width, window.height)
     try:
-        part = rasterize(splats, crop, settings, background=background, depth=depth)
+        part = rasterize(splats, window.of(camera), settings, background=background, depth=depth)
     except TooManyPairs:
         if max(window.width, window.height) <= unit:
             raise
@@ -143,8 +110,8 @@ def rasterize_tiled(
     if pixels < 1:
         raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {TILE_PIXELS}")
     tiled, count, dropped = TiledRendering.empty(splats, camera, depth), 0, 0
-    for window in windows(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
+    for window in covering(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
         for place, part in renderings(splats, camera, settings, window, background, depth):
             tiled.put(place, part)
             count, dropped = count + 1, part.dropped
-    return replace(tiled, pieces=count, dropped=dropped)
+    return replace(tiled, windows=count, dropped=dropped)

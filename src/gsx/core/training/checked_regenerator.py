@@ -156,19 +156,17 @@ class Tally:
 
 def added_accounts(accounts: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     """The accounts of several processes as those of one, by augmenter."""
-    names = dict.fromkeys(name for by_name in accounts for name in by_name)
-    return {name: added_account([by_name[name] for by_name in accounts if name in by_name]) for name in names}
-
-
-def added_account(accounts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Accounts of one event added up."""
-    checks = dict.fromkeys(check for account in accounts for check in account["warned"])
-    return {
-        "event": accounts[0]["event"],
-        "asked": added([account["asked"] for account in accounts]),
-        "dropped": added([account["dropped"] for account in accounts]),
-        "warned": {check: added([account["warned"].get(check, {}) for account in accounts]) for check in checks},
-    }
+    out = {}
+    for name in dict.fromkeys(name for by_name in accounts for name in by_name):
+        own = [by_name[name] for by_name in accounts if name in by_name]
+        checks = dict.fromkeys(check for account in own for check in account["warned"])
+        out[name] = {
+            "event": own[0]["event"],
+            "asked": added([account["asked"] for account in own]),
+            "dropped": added([account["dropped"] for account in own]),
+            "warned": {check: added([account["warned"].get(check, {}) for account in own]) for check in checks},
+        }
+    return out
 
 
 def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
@@ -208,7 +206,7 @@ class CheckedRegenerator:
         `samples`: of each the mean of so many results counts. `project`: enlarged pictures are moved to the nearest
         one that reduces to the request's.
         """
-        results = [self.inner.regenerate([again(request, n) for request in requests]) for n in range(samples)]
+        results = [self.inner.regenerate([replace(one, seed=one.seed + n) for one in requests]) for n in range(samples)]
         drawn = []
         for request, *of_one in zip(requests, *results, strict=True):
             mean = torch.stack([result.detach().cpu().float() for result in of_one]).mean(0)
@@ -233,19 +231,9 @@ class CheckedRegenerator:
         )
 
 
-def again(request: Request, number: int) -> Request:
-    """The request for its n-th sample."""
-    return replace(request, seed=request.seed + number)
-
-
-def colour_drift(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3"]:
-    """By how much the mean colour of a result differs from that of its input."""
-    return result.cpu().float().mean((1, 2)) - request.image.cpu().mean((1, 2))
-
-
 def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """The result, its mean colour put right where it is more than LARGEST_DRIFT off."""
-    drift = colour_drift(request, result)
+    drift = result.cpu().float().mean((1, 2)) - request.image.cpu().mean((1, 2))
     return result if float(drift.abs().max()) <= LARGEST_DRIFT else result.cpu() - drift[:, None, None]
 
 

@@ -55,20 +55,16 @@ class Account:
     """What became of the pictures that its augmenters asked for."""
 
 
-def account_of(run: Run, steps: Sequence[Step]) -> Account:
-    """The account of this rank, of a step for each of its views."""
-    return Account(
+def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
+    """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
+    own = Account(
         losses=[float(step.loss) for step in steps],
         terms=[step.terms for step in steps],
         dropped=sum(step.dropped for step in steps),
         learnt=set(gradients(run.backbone.table)),
         pseudo=steps[0].pseudo,
     )
-
-
-def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
-    """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
-    accounts = run.ranks.all_gather(account_of(run, steps))
+    accounts = run.ranks.all_gather(own)
     average(run, set().union(*(account.learnt for account in accounts)))
     losses = [loss for account in accounts for loss in account.losses]
     return replace(

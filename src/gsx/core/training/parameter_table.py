@@ -202,15 +202,10 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     for name, parameter in table.parameters.items():
         out[f"parameters.{name}"] = parameter.detach()
         out |= adam_tensors(name, parameter, table.optimiser)
-    return out | (networks_tensors(table.networks) if table.networks else {})
-
-
-def networks_tensors(networks: Networks) -> dict[str, Tensor]:
-    """Values and Adam states of networks, by the names they are saved under."""
-    out: dict[str, Tensor] = {}
-    for name, parameter in networks.named():
-        out[name] = parameter.detach()
-        out |= adam_tensors(name, parameter, networks.optimiser)
+    if (networks := table.networks) is not None:
+        for name, parameter in networks.named():
+            out[name] = parameter.detach()
+            out |= adam_tensors(name, parameter, networks.optimiser)
     return out
 
 
@@ -228,8 +223,10 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     for name, parameter in table.parameters.items():
         table.set_rate(name, like.group(name)["lr"])
         restore_adam(name, parameter, table.optimiser, tensors, device)
-    if table.networks is not None:
-        restore_networks(table.networks, tensors, device)
+    if (networks := table.networks) is not None:
+        for name, parameter in networks.named():
+            parameter.data.copy_(tensors[name])
+            restore_adam(name, parameter, networks.optimiser, tensors, device)
     return table
 
 
@@ -244,11 +241,3 @@ def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -
             "go on with those, or train anew"
         )
     return {name: tensors[key] for name, key in names.items()}
-
-
-@torch.no_grad()
-def restore_networks(networks: Networks, tensors: dict[str, Tensor], device: torch.device) -> None:
-    """Take back values and Adam states of networks."""
-    for name, parameter in networks.named():
-        parameter.copy_(tensors[name])
-        restore_adam(name, parameter, networks.optimiser, tensors, device)

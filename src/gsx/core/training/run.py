@@ -72,18 +72,14 @@ class Sampler:
     def next(self) -> int:
         """Index of the next view."""
         if not self.order:
-            self.order, self.begun = self.shuffled(self.begun), self.begun + 1
+            generator = torch.Generator().manual_seed(derived_seed("views", self.seed, self.begun))
+            self.order, self.begun = torch.randperm(self.count, generator=generator).tolist(), self.begun + 1
         return self.order.pop()
 
     def coming(self, steps: int) -> set[int]:
         """Indices of the views of the next steps."""
         ahead = replace(self, order=list(self.order))
         return {ahead.next() for _ in range(steps * self.batch)}
-
-    def shuffled(self, number: int) -> list[int]:
-        """The order of that number."""
-        generator = torch.Generator().manual_seed(derived_seed("views", self.seed, number))
-        return torch.randperm(self.count, generator=generator).tolist()
 
 
 @runtime_checkable
@@ -121,9 +117,9 @@ class Run:
     device: torch.device
     generator: torch.Generator
     sampler: Sampler
-    anew: Callable[[Scene, int, torch.Generator], Backbone[Any]] | None = None
-    """A backbone of the same options at step 0, for a scene, so many steps and a generator; None: the run is only
-    looked at."""
+    held_out: Callable[[float, int], list[Float[Tensor, "3 h w"]]] | None = None
+    """(share of the steps, seed) -> training views as shown by models that do not know them
+    (`RegeneratorContext.held_out`); None: the run is only looked at."""
     augmenters: Sequence[Augmenter] = ()
     tallies: Sequence[Tally] = ()
     """What has become of the pictures that each augmenter asked for."""

@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,7 +47,8 @@ def train_step(run: Run, plugins: Plugins) -> Step:
         step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.update(step.number)
     run.step = step.number
-    synchronise(run.device)
+    if run.device.type == "cuda":
+        torch.cuda.synchronize(run.device)  # so that times mean something
     return step if not reason else replace(step, skipped=reason)
 
 
@@ -76,25 +76,16 @@ def backward(run: Run) -> Step:
     number = run.step + 1
     with next_views(run) as batch:
         picked = run.ranks.share(batch)
-        terms = [terms_of(run, number, view) for view in picked]
+        asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
         steps = []
-        for view, added, colour in zip(picked, terms, colours, strict=True):
+        for view, terms, colour in zip(picked, asked, colours, strict=True):
             with gradients_added(run.backbone.table):
-                steps.append(view_loss(run, number, run.scene.train[view], added, colour))
-        steps[0] = replace(steps[0], pseudo=asked_for(run, number))
+                given = [term for term in terms if term is not None]
+                steps.append(view_loss(run, number, run.scene.train[view], given, colour))
+        told = {tally.name: tally.told(number) for tally in run.tallies}
+        steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
         return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
-
-
-def asked_for(run: Run, number: int) -> dict[str, dict[str, Any]]:
-    """By augmenter, what became of the pictures that it asked for at this step."""
-    told = {tally.name: tally.told(number) for tally in run.tallies}
-    return {name: facts for name, facts in told.items() if facts}
-
-
-def terms_of(run: Run, number: int, picked: int) -> list[Term]:
-    """What augmenters add to the loss of a training view."""
-    return [term for augmenter in run.augmenters if (term := augmenter.term(run, number, picked)) is not None]
 
 
 def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
@@ -128,7 +119,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         number=number,
         view=view,
         target=target,
-        rendering=without_graph(rendering),
+        # the picture alone: steps of a batch do not hold on to what made theirs
+        rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
         loss=loss.detach() + sum(parts.values()),
         terms=named,
         seen=seen,
@@ -141,11 +133,6 @@ def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) 
     drawn = run.backbone.draw(camera, number)
     absolute = run.backbone.absolute_gradient
     return drawn, rasterize(drawn.splats, camera, run.raster, background=colour, absolute_gradient=absolute)
-
-
-def without_graph(rendering: Rendering) -> Rendering:
-    """The picture alone, so that the steps of a batch do not hold on to what made theirs."""
-    return replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach())
 
 
 def served_by_view(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
@@ -167,7 +154,9 @@ def pseudo_term(run: Run, term: Term, number: int, seen: list[Observation]) -> f
         loss = weight * pseudo_loss(rendering.image, view, term.squared)
         loss.backward()
         total += float(loss.detach())
-        if term.observed and math.isfinite(total) and finite_shift(rendering):
+        gradient = rendering.screen.means2d_offset.grad  # that of a step to be vetoed may not be finite
+        finite = math.isfinite(total) and (gradient is None or bool(torch.isfinite(gradient).all()))
+        if term.observed and finite:
             seen.append(observation(run, drawn, rendering, number, weight))
     if not term.shared:
         for parameter in shared_colour(run.backbone.table):
@@ -190,20 +179,8 @@ def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weigh
     return run.backbone.observe(drawn, rendering, number, weight / views)
 
 
-def finite_shift(rendering: Rendering) -> bool:
-    """Whether the screen gradients that density control gathers are finite: those of a step to be vetoed may not be."""
-    gradient = rendering.screen.means2d_offset.grad
-    return gradient is None or bool(torch.isfinite(gradient).all())
-
-
 def background(run: Run) -> Float[Tensor, "3"]:
     """The scene's background, or a new random colour."""
     if run.training.random_background:
         return torch.rand(3, generator=run.generator).to(run.device)
     return run.background
-
-
-def synchronise(device: torch.device) -> None:
-    """Wait for a GPU, so that times mean something."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gsx.core.run_folder.files import RunFiles, is_number, part
-from gsx.core.run_folder.run_key import JUDGING, NAMES, WHERE
+from gsx.experiments.run_folder.files import RunFiles, is_number, part
+from gsx.experiments.run_folder.run_key import JUDGING, NAMES, WHERE
 
 BESIDE = (*WHERE, *NAMES, *JUDGING, "augmenter", "regenerator", "seed")
 """Keys in which a run may differ from its control, and runs of one comparison from each other (the seed)."""

@@ -7,9 +7,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from gsx.core.run_folder.files import RunFiles, is_number, part
 from gsx.experiments.reports.charts import STYLES, Dot, Series, line_chart, pareto_front, scatter, style
 from gsx.experiments.reports.page import duration, fixed, time_unit
+from gsx.experiments.run_folder.files import RunFiles, is_number, part
 
 COSTS = (("primitives", "primitives", 0), ("megabytes", "MB", 1), ("seconds", "seconds of training", 1))
 """What quality is plotted against: column, its name on the axis, decimals."""

@@ -15,12 +15,12 @@ from urllib.parse import quote
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.core.run_folder.files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
-from gsx.core.run_folder.run_key import flattened
 from gsx.experiments.reports.baselines import control_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
 from gsx.experiments.reports.side_by_side import pictures_of
+from gsx.experiments.run_folder.files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+from gsx.experiments.run_folder.run_key import comparable
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
@@ -154,7 +154,7 @@ def differences(runs: Sequence[RunFiles]) -> list[str]:
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(runs):
         groups.setdefault((run.scene, run.variant), []).append(i)
-    flat = [flattened(run.config) for run in runs]
+    flat = [comparable(run.config) for run in runs]
     out = [""] * len(runs)
     for members in groups.values():
         varied = varied_keys([flat[i] for i in members])

@@ -5,8 +5,8 @@ from typing import Any
 
 import jinja2
 
-from gsx.core.run_folder.files import is_number
 from gsx.experiments.reports.charts import compact
+from gsx.experiments.run_folder.files import is_number
 
 NONE = "n/a"
 

@@ -16,10 +16,10 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.evaluation.evaluator import Zoomed
 from gsx.core.files import read_json, write_json
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
+from gsx.experiments.evaluation.evaluator import Zoomed
 
 SHOWN = 6
 """Test views that are drawn."""

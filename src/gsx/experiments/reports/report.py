@@ -14,12 +14,12 @@ from typing import Any
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.core.run_folder.files import RunFiles, gain_of, is_number, part, read_run, state_of
-from gsx.core.training.remarks import remarks_of
+from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
 from gsx.experiments.reports.page import NONE, duration, fixed, template, time_unit
 from gsx.experiments.reports.pictures import ERROR_COLOURS
+from gsx.experiments.run_folder.files import RunFiles, gain_of, is_number, part, read_run, state_of
 
 __all__ = ["report_on", "write_overview", "write_report"]
 

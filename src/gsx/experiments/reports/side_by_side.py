@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsx.core.run_folder.files import RunFiles, gain_of, is_number, part
 from gsx.experiments.reports.comparison import Entry, Group
+from gsx.experiments.run_folder.files import RunFiles, gain_of, is_number, part
 
 PNG, JPEG = (b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"), (b"\xff\xd8\xff", b"\xff\xd9")
 """How whole files begin and end."""

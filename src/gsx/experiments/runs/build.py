@@ -1,6 +1,7 @@
 """From settings to a run in memory: device, backbone, augmenters."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,14 @@ import torch
 from gsx.core.cache import cache_root
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
-from gsx.core.rasterizer.prepare import decide
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
+from gsx.experiments.runs.halves import held_out_renders
+from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
 
 
@@ -52,7 +54,7 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
 
     backbone = anew(scene, general.iterations, generator)
     augmenters = build_augmenters(settings, scene) if training else []
-    return Run(
+    run = Run(
         config=settings.resolved,
         folder=folder,
         scene=scene,
@@ -63,12 +65,13 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         device=device,
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
-        anew=anew,
         augmenters=[augmenter for augmenter, _ in augmenters],
         tallies=[tally for _, tally in augmenters],
         idle=settings.idle,
         ranks=ranks,
     )
+    run.held_out = partial(held_out_renders, run, anew) if training else None
+    return run
 
 
 def build_augmenters(settings: Settings, scene: Scene) -> list[tuple[Augmenter, Tally]]:

@@ -14,9 +14,9 @@ from gsx import __version__
 from gsx.core.cache import source_revision
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
-from gsx.core.rasterizer.prepare import path_of
-from gsx.core.run_folder.run_key import scene_stamp
+from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder.run_key import scene_stamp
 from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)

@@ -4,13 +4,13 @@ import logging
 import time
 from typing import Any
 
-from gsx.core.evaluation.evaluator import Evaluator
 from gsx.core.files import write_json
-from gsx.core.run_folder.files import read_run
-from gsx.core.run_folder.run_key import judging
-from gsx.core.training.remarks import remarks_of
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
+from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.run_key import judging
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
 from gsx.experiments.runs.settings import Settings

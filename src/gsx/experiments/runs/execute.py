@@ -5,12 +5,11 @@ from typing import Any
 from gsx.core.errors import Disagreement, TrainingError
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins, hookimpl
-from gsx.core.rasterizer.prepare import warm
-from gsx.core.run_folder import checkpoint
+from gsx.core.training import checkpoint
 from gsx.core.training.guard import Agreement, Guard
-from gsx.core.training.remarks import CapNotice
 from gsx.core.training.run import Run, Step
 from gsx.core.training.trainer import train
+from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.environment import announce
@@ -18,6 +17,7 @@ from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.open import say_what_changed
 from gsx.experiments.runs.progress import MetricsLog, Progress
+from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.tracking import build_trackers, telling_of_failure
 

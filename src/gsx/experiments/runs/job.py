@@ -96,7 +96,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.core.run_folder.run_key import claimed, place_of, scene_stamp
+    from gsx.experiments.run_folder.run_key import claimed, place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
 
     if processes() > 1:

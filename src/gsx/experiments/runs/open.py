@@ -14,11 +14,18 @@ from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
 from gsx.core.quality.lpips import load_lpips
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.run_folder import checkpoint
-from gsx.core.run_folder.files import RunFiles, read_run
-from gsx.core.run_folder.run_key import composition_key, finished, other_revision, place_of, scene_stamp, trained_on
+from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here, refuse_uneven
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder.files import RunFiles, read_run
+from gsx.experiments.run_folder.run_key import (
+    composition_key,
+    finished,
+    other_revision,
+    place_of,
+    scene_stamp,
+    trained_on,
+)
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device
 from gsx.experiments.runs.environment import environment

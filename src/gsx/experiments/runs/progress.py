@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-from gsx.core.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
 from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run, Step
+from gsx.experiments.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
 
 METRICS = "metrics.jsonl"
 LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0

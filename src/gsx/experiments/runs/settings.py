@@ -11,13 +11,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.evaluation.evaluator import EvalOptions
 from gsx.core.options import idle_keys
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.run_folder.general_options import GeneralOptions
 from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.run import TrainingOptions
+from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.run_folder.general_options import GeneralOptions
 
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""

@@ -18,9 +18,9 @@ from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, write_json
 from gsx.core.plugins import hookimpl
-from gsx.core.run_folder import checkpoint
-from gsx.core.run_folder.run_key import scene_stamp, trained
+from gsx.core.training import checkpoint
 from gsx.core.training.run import Run, Step
+from gsx.experiments.run_folder.run_key import scene_stamp, trained
 
 logger = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from gsx.core.cache import content_key
 from gsx.core.errors import ConfigError, nearest
-from gsx.core.run_folder.files import read_run
-from gsx.core.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
 from gsx.core.training.augmenter import Foretold
+from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.warm_start import without_augmenters
 

@@ -10,8 +10,8 @@ from gsx.core.cache import content_key
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import replace_file
 from gsx.core.plugins import Plugins
-from gsx.core.run_folder.run_key import sorted_items
 from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.run_folder.run_key import sorted_items
 from gsx.experiments.runs.compose import Compositions, parse_overrides
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing

@@ -8,10 +8,10 @@ from typing import Any
 
 from gsx.core.cache import source_revision
 from gsx.core.files import read_json
-from gsx.core.run_folder.files import RunFiles, is_number, part, read_run, state_of
-from gsx.core.run_folder.run_key import NAMES, WHERE, asked_for, flattened, other_revision, without
-from gsx.core.training.remarks import remarks_of
+from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
+from gsx.experiments.run_folder.files import RunFiles, is_number, part, read_run, state_of
+from gsx.experiments.run_folder.run_key import NAMES, WHERE, asked_for, comparable, other_revision, without
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published
@@ -353,7 +353,7 @@ def listed(values: Sequence[str]) -> str:
 
 def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:
     """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
-    mine, theirs = (flattened(judged(config, idle)) for config in (own, paper))
+    mine, theirs = (comparable(judged(config, idle)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
     for key in dict.fromkeys([*mine, *theirs]):
         inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)

@@ -11,9 +11,9 @@ import torch
 
 from gsx import __version__
 from gsx.core.files import replace_file, write_json
-from gsx.core.run_folder.files import is_number
 from gsx.experiments.reports.charts import Dot, scatter
 from gsx.experiments.reports.page import NONE, fixed, template
+from gsx.experiments.run_folder.files import is_number
 from gsx.experiments.trade.advice import advice, advice_lines, front_of, shown
 from gsx.experiments.trade.bench import EXACT, UNBOUNDED
 from gsx.experiments.trade.knobs import COSTS, KNOBS, OUTLIERS, Row, overrides

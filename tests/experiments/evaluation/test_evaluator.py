@@ -15,12 +15,12 @@ from torch import Tensor
 from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 
 SIZE = (24, 16)
 LEVELS = {"a": {1: 100.4, 2: 110.0}, "b": {1: 60.0, 2: 70.0}, "c": {1: 200.0, 2: 90.0}}

@@ -8,10 +8,8 @@ import torch
 
 from gsx.core.data.camera import look_at
 from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.available import available, compiles
-from gsx.core.rasterizer.compiled import takes
-from gsx.core.rasterizer.render import rasterize
-from gsx.core.rasterizer.settings import RasterSettings
 
 logger = logging.getLogger(__name__)
 
@@ -29,11 +27,6 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     path = "compiled" if compiled else "eager"
     logger.info("rasterizer: %s path (%s; rasterizer=eager or rasterizer=compiled decides otherwise)", path, reason)
     return replace(settings, path=path)
-
-
-def path_of(settings: RasterSettings, device: torch.device) -> str:
-    """`compiled` or `eager`: which way pictures of three channels go by these settings, here."""
-    return "compiled" if takes(settings, channels=3, pairs=1, max_weight=False, device=device.type) else "eager"
 
 
 def warm(settings: RasterSettings, device: torch.device) -> None:

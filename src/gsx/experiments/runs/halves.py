@@ -6,19 +6,22 @@ lack, and photographs to compare with (ours; every n-th view: Difix, Wu et al. 2
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.resize import to_uint8
+from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
 from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
+from gsx.core.training.backbone import Backbone
 from gsx.core.training.guard import Guard
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
@@ -27,9 +30,11 @@ from gsx.core.training.trainer import train_step
 logger = logging.getLogger(__name__)
 
 HALVES = 2
+Anew: TypeAlias = Callable[[Scene, int, torch.Generator], Backbone[Any]]
+"""(scene, steps, generator) -> a backbone of the run's options at step 0."""
 
 
-def held_out_renders(run: Run, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
+def held_out_renders(run: Run, anew: Anew, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
     """The training views in order, each rendered by the model of the half without it, in 8 bits.
 
     Each model begins anew and ends after `share` of the steps that the run has taken, by a schedule of that length. It
@@ -45,32 +50,31 @@ def held_out_renders(run: Run, share: float, seed: int) -> list[Float[Tensor, "3
     path = run.folder / "regenerators" / f"halves_{run.step:07d}_{steps}.safetensors"
     renders = read_renders(path, len(run.scene.train)) if path.is_file() else None
     if renders is None:
-        renders = made(run, steps, seed)
+        renders = made(run, anew, steps, seed)
         write_renders(path, renders)
     return [render.float() / 255 for render in renders]
 
 
-def made(run: Run, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
+def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
     """The renders of both models."""
     logger.info("two models of half of the training views each are trained for %d steps", steps)
     begun, views = time.perf_counter(), run.scene.train
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
-        model = trained(without(run, half, steps, seed))
+        model = trained(without(run, anew, half, steps, seed))
         numbers = range(half, len(views), HALVES)
         shown |= {n: to_uint8(render(model, views[n].camera).image) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 
 
-def without(run: Run, half: int, steps: int, seed: int) -> Run:
+def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
-    assert run.anew is not None
     views = [view for number, view in enumerate(run.scene.train) if number % HALVES != half]
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
-    backbone = run.anew(scene, steps, generator)
+    backbone = anew(scene, steps, generator)
     return Run(
         config=run.config,
         folder=run.folder,

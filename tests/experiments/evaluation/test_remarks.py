@@ -7,7 +7,7 @@ import pytest
 from tiny import tiny_run
 
 from gsx.core.files import read_json
-from gsx.core.training.remarks import gathered, remarks_of
+from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.progress import read_curves
 
 LINES = [

@@ -21,12 +21,12 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.lpips import LpipsOptions, load_lpips
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
-from gsx.core.rasterizer.prepare import path_of
+from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Float
 from gsx.core.training.parameter_table import size_of
-from gsx.core.training.remarks import gathered
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.remarks import gathered
 
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""

@@ -1,6 +1,7 @@
 """Models of half of the training views each: what they are shown, what they show; the run goes on untouched."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,11 +18,11 @@ from gsx.core.errors import InputError
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.core.training.halves import held_out_renders
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.open import open_run
 
 TRAINING = TrainingOptions(
@@ -73,8 +74,8 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
         device=torch.device("cpu"),
         generator=generator,
         sampler=Sampler(views, 0),
-        anew=anew,
     )
+    run.held_out = partial(held_out_renders, run, anew)
     for _ in range(steps):
         train_step(run, load_plugins([], points=[]))
     seen.clear()
@@ -84,7 +85,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
 def test_views_are_rendered_by_a_model_that_never_saw_them(tmp_path: Path) -> None:
     """Ten steps on odd views alone, then ten on even ones; dark views come out brighter than bright ones."""
     run, seen = begun(tmp_path)
-    renders = held_out_renders(run, 0.5, seed=3)
+    renders = run.held_out(0.5, 3)
     assert len(seen) == 20
     assert all(number % 2 == 1 for number in seen[:10])
     assert all(number % 2 == 0 for number in seen[10:])
@@ -102,7 +103,7 @@ def test_the_run_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
     run, _ = begun(tmp_path)
     run.training = replace(TRAINING, random_background=True)
     before, seconds = state_of(run), run.seconds
-    held_out_renders(run, 0.5, seed=3)
+    run.held_out(0.5, 3)
     assert all(torch.equal(a, b) for a, b in zip(before, state_of(run), strict=True))
     assert (run.step, run.seconds) == (20, seconds)
     undisturbed, _ = begun(tmp_path)
@@ -116,23 +117,23 @@ def test_renders_are_kept_for_a_resumed_run_and_made_alike_without_the_file(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run, seen = begun(tmp_path)
-    first = held_out_renders(run, 0.2, seed=3)
+    first = run.held_out(0.2, 3)
     (file,) = (tmp_path / "regenerators").glob("halves_*")
     seen.clear()
-    assert all(torch.equal(a, b) for a, b in zip(first, held_out_renders(run, 0.2, seed=3), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, run.held_out(0.2, 3), strict=True))
     assert not seen
     file.write_bytes(b"nothing")
-    assert all(torch.equal(a, b) for a, b in zip(first, held_out_renders(run, 0.2, seed=3), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, run.held_out(0.2, 3), strict=True))
     assert "made again" in caplog.text
     run.step = 30
-    held_out_renders(run, 0.2, seed=3)
+    run.held_out(0.2, 3)
     assert [path.name for path in file.parent.glob("halves_*")] == ["halves_0000030_6.safetensors"]
 
 
 def test_one_view_has_no_halves(tmp_path: Path) -> None:
     run, _ = begun(tmp_path, views=1, steps=1)
     with pytest.raises(InputError, match="one training view"):
-        held_out_renders(run, 0.5, seed=0)
+        run.held_out(0.5, 0)
 
 
 RUN = (

@@ -9,9 +9,9 @@ from typing import IO, Any
 from gsx.core.cache import content_key, tree_stamp
 from gsx.core.errors import InputError
 from gsx.core.locks import lock
-from gsx.core.options import fields_with
-from gsx.core.run_folder.files import RunFiles, part
-from gsx.core.run_folder.general_options import GeneralOptions
+from gsx.core.options import fields_with, flattened
+from gsx.experiments.run_folder.files import RunFiles, part
+from gsx.experiments.run_folder.general_options import GeneralOptions
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
 """Keys that say where and how a run is carried out."""
@@ -147,14 +147,6 @@ def locked(stream: IO[str], folder: Path) -> bool:
         ) from error
 
 
-def flattened(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys and values, without those that say where a run ran."""
-    out: dict[str, Any] = {}
-    for key, value in node.items():
-        if f"{prefix}{key}" in (*WHERE, "length"):
-            continue
-        if isinstance(value, dict):
-            out |= flattened(value, f"{prefix}{key}.")
-        else:
-            out[f"{prefix}{key}"] = value
-    return out
+def comparable(config: dict[str, Any]) -> dict[str, Any]:
+    """Values by dotted key that runs may be compared by: not those that say where a run ran."""
+    return flattened({key: value for key, value in config.items() if key not in (*WHERE, "length")})

@@ -1,1 +1,0 @@
-"""Files of a run: read, saved, found again."""

@@ -1,0 +1,1 @@
+"""Held-out views measured, and what to know beside the figures."""

@@ -1,0 +1,1 @@
+"""What a run folder holds, and the key that names a run by what it trains."""
