@@ -112,7 +112,7 @@ def train_group(scene: str, family: str, seed: int, once: bool, given: argparse.
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
     for name, words in asked(FAMILIES[family], once).items():
         folder = folder_of(scene, family, name, seed, given)
-        common = (f"iterations={given.iterations}", f"seed={seed}", "init=trunk", "eval.zoom=[1,2,4]")
+        common = (f"iterations={given.iterations}", f"seed={seed}", "init=warm_start", "eval.zoom=[1,2,4]")
         print(time.strftime("%H:%M"), folder.name, flush=True)
         overrides = [*SUBJECTS[scene], *where, *FAMILIES[family].control, *words, *common]
         train(folder, overrides, threads, folder.with_suffix(".log"))

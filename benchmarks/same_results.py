@@ -101,9 +101,9 @@ def resumed(folder: Path) -> None:
 
 def branched(folder: Path) -> None:
     """A run with an augmenter that begins with the state of one without."""
-    train(folder, "unbranched", "init=trunk")
+    train(folder, "unbranched", "init=warm_start")
     told = "augmenter.upscale.checks.agreement.action=warn"  # pictures are tiny
-    train(folder, "branched", "init=trunk", "augmenter=[upscale]", "regenerator/upscale=lanczos", told)
+    train(folder, "branched", "init=warm_start", "augmenter=[upscale]", "regenerator/upscale=lanczos", told)
 
 
 def evaluated(folder: Path) -> None:

@@ -64,7 +64,7 @@ def test_pairs_are_those_of_the_picture() -> None:
     from gsx.core.rasterizer import rasterize
 
     settings = settings_of("eager")
-    assert pairs_of(CASE, CPU, settings) == rasterize(splats_of(CASE, CPU), camera_of(CASE), settings).pairs
+    assert pairs_of(CASE, CPU, settings) == rasterize(splats_of(CASE, CPU), camera_of(CASE), settings).intersections
 
 
 def test_rivals_take_turns_after_one_call_each() -> None:

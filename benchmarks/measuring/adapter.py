@@ -9,7 +9,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.compiled import composite_compiled
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import Pairs, pair
+from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.experiments.runs.compose import compose
@@ -31,17 +31,19 @@ def missing(path: str, device: torch.device) -> str:
     return ""
 
 
-def pair_screen(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pairs:
+def pair_screen(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
     """Which splats reach which tiles, sorted."""
-    return pair(screen, camera, settings)
+    return intersect_tiles(screen, camera, settings)
 
 
-def count_pairs(pairs: Pairs) -> int:
+def count_pairs(pairs: TileIntersections) -> int:
     """Splat-tile pairs."""
     return len(pairs.splats)
 
 
-def blend_pairs(screen: ScreenSplats, pairs: Pairs, camera: Camera, settings: RasterSettings) -> Float[Tensor, "C H W"]:
+def blend_pairs(
+    screen: ScreenSplats, pairs: TileIntersections, camera: Camera, settings: RasterSettings
+) -> Float[Tensor, "C H W"]:
     """Blended channels, differentiable in means, factors, log-opacities and channels of the screen splats."""
     grid = TileGrid.of(camera, settings.tile_size)
     inputs = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
@@ -52,7 +54,7 @@ def blend_pairs(screen: ScreenSplats, pairs: Pairs, camera: Camera, settings: Ra
 
 def blend_screen(
     screen: ScreenSplats, camera: Camera, settings: RasterSettings
-) -> tuple[Float[Tensor, "C H W"], Pairs]:
+) -> tuple[Float[Tensor, "C H W"], TileIntersections]:
     """Everything behind projection: pair, then blend."""
     pairs = pair_screen(screen, camera, settings)
     return blend_pairs(screen, pairs, camera, settings), pairs

@@ -129,23 +129,23 @@ def test_an_augmenter_tells_what_became_of_its_pictures_once(tmp_path: Path, cap
     lenient = replace(checks, colour=replace(checks.colour, limit=0.0, action="warn"))
     augmenter = by_hand(run, enlarge, checks=lenient)
     augmenter.term(run, 61, 0)
-    told = augmenter.regenerator.tally.told(61)
+    told = augmenter.regenerator.tally.account_at(61)
     assert told["event"] == 60
     assert told["asked"] == {"1": 6, "2": 6}
     assert told["dropped"] == {"2": 2}
     assert "2 of 6 x2 pictures dropped: " in caplog.text
     assert sum(told["warned"].get("colour", {}).values()) > 0
-    assert augmenter.regenerator.tally.told(62) == {}
+    assert augmenter.regenerator.tally.account_at(62) == {}
     again = by_hand(run, enlarge, checks=lenient)
     run.step = 61
     again.term(run, 62, 0)  # from the file
     assert again.views.keys() == augmenter.views.keys()
-    assert again.regenerator.tally.told(62) == {}
+    assert again.regenerator.tally.account_at(62) == {}
 
 
 def test_nothing_else_is_dropped(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 60, "augmenter=upscale")
     augmenter = by_hand(run, good)
     augmenter.term(run, 61, 0)
-    assert augmenter.regenerator.tally.told(61)["dropped"] == {}
-    assert augmenter.regenerator.tally.told(61)["warned"] == {}
+    assert augmenter.regenerator.tally.account_at(61)["dropped"] == {}
+    assert augmenter.regenerator.tally.account_at(61)["warned"] == {}

@@ -36,7 +36,7 @@ NEURAL = ("scaffold", "octree_scaffold")
 PARAMETERS = {
     "scaffold": ("offsets", "features", "log_scales"),
     "octree_scaffold": ("offsets", "features", "log_scales"),
-    "octree_gs3d": ("offsets", "log_scales", "quats", "opacity_logits", "sh_constant", "sh_rest"),
+    "octree_gs3d": ("offsets", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"),
 }
 
 
@@ -145,7 +145,7 @@ def test_a_cell_begins_with_its_largest_colours() -> None:
     colours = torch.tensor([[255, 0, 51], [0, 102, 0], [0, 0, 255]], dtype=torch.uint8)
     scene = small_scene(points, colours)
     backbone = small_anchors("octree_gs3d", "levels.count=1", "levels.base_layer=3", scene=scene)
-    anchors, constants = backbone.table["anchors"], backbone.table["sh_constant"].detach()[:, 0]
+    anchors, constants = backbone.table["anchors"], backbone.table["sh_dc"].detach()[:, 0]
     assert len(anchors) == 2
     shown = (0.5 + 0.28209479 * constants)[anchors.norm(dim=1).argsort()]
     torch.testing.assert_close(shown, torch.tensor([[1.0, 0.4, 0.2], [0.0, 0.0, 1.0]]))
@@ -167,7 +167,7 @@ RATES = {
     "octree_scaffold": NEURAL_RATES,
     "octree_gs3d": {
         "offsets": (0.01, 1e-4), "log_scales": (0.005, 0.005), "quats": (0.001, 0.001), "opacity_logits": (0.05, 0.05),
-        "sh_constant": (0.0025, 0.0025), "sh_rest": (0.0025 / 20, 0.0025 / 20),
+        "sh_dc": (0.0025, 0.0025), "sh_rest": (0.0025 / 20, 0.0025 / 20),
     },
 }  # fmt: skip
 

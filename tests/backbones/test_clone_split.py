@@ -199,7 +199,7 @@ def test_a_child_is_smaller_a_level_finer_and_drawn_from_its_parent() -> None:
     assert 0.07 < float(offsets[:, 1].std()) < 0.13
     torch.testing.assert_close(new["log_scales"], raw["log_scales"] + math.log(0.6))
     assert torch.equal(new["level"], (raw["level"] + 1).clamp(max=2))
-    for name in ("sh_constant", "sh_rest", "opacity_logits", "quats"):
+    for name in ("sh_dc", "sh_rest", "opacity_logits", "quats"):
         assert torch.equal(new[name], raw[name]), name
 
 

@@ -56,7 +56,7 @@ def explicit_table(count: int = 6, dtype: torch.dtype = torch.float32, degree: i
     generator, bands = torch.Generator().manual_seed(6), (degree + 1) ** 2 - 1
     shapes = {
         "offsets": (count, 1, 3), "log_scales": (count, 6), "quats": (count, 4), "opacity_logits": (count,),
-        "sh_constant": (count, 1, 3), "sh_rest": (count, bands, 3),
+        "sh_dc": (count, 1, 3), "sh_rest": (count, bands, 3),
     }  # fmt: skip
     values = {name: torch.randn(*shape, generator=generator).to(dtype) / 2 for name, shape in shapes.items()}
     positions = torch.randn(count, 3, generator=generator).to(dtype)
@@ -237,7 +237,7 @@ def test_explicit_anchors_decode_as_in_a_loop() -> None:
         assert math.exp(decoded.splats.log_opacities[i].item()) == pytest.approx(opacity, rel=1e-5)
         assert float(decoded.opacities[i, 0]) == pytest.approx(opacity, rel=1e-5)
         view = (mean - CAMERA.centre.float())[None]
-        colour = colours_of(table["sh_constant"][row][None], table["sh_rest"][row, :8][None], view, 2)[0]
+        colour = colours_of(table["sh_dc"][row][None], table["sh_rest"][row, :8][None], view, 2)[0]
         torch.testing.assert_close(decoded.splats.colours[i], colour)
 
 
@@ -256,9 +256,9 @@ def test_new_explicit_anchors_show_the_colour_given() -> None:
     rows = Explicit(1, -2.0).rows(torch.tensor([0.5]), torch.tensor([[0.2, 0.5, 0.9]]))
     assert {name: tuple(value.shape) for name, value in rows.items()} == {
         "offsets": (1, 1, 3), "log_scales": (1, 6), "quats": (1, 4), "opacity_logits": (1,),
-        "sh_constant": (1, 1, 3), "sh_rest": (1, 3, 3),
+        "sh_dc": (1, 1, 3), "sh_rest": (1, 3, 3),
     }  # fmt: skip
-    shown = colours_of(rows["sh_constant"], rows["sh_rest"], torch.ones(1, 3), 1)
+    shown = colours_of(rows["sh_dc"], rows["sh_rest"], torch.ones(1, 3), 1)
     torch.testing.assert_close(shown, torch.tensor([[0.2, 0.5, 0.9]]))
     assert rows["quats"].tolist() == [[1, 0, 0, 0]]
     assert rows["opacity_logits"].tolist() == [-2.0]

@@ -47,7 +47,7 @@ def pair(name: str) -> tuple[GS3D | Anchors, GS3D | Anchors, Camera]:
     with torch.no_grad():
         near.table[place].copy_((near.table[place] * 16).round() / 16)  # anchors are nodes of a grid of their own
         for key, parameter in near.table.parameters.items():
-            if key in ("features", "sh_rest", "sh_constant"):
+            if key in ("features", "sh_rest", "sh_dc"):
                 parameter.normal_(generator=generator)
         for key, parameter in far.table.parameters.items():
             parameter.copy_(near.table[key])
@@ -82,7 +82,7 @@ def test_everything_but_the_place_stays(name: str) -> None:
 
 def double_colours(backbone: GS3D, means: Tensor, camera: Camera) -> Tensor:
     """Colours worked out in float64 throughout."""
-    constant, rest = (backbone.table[name].detach().double() for name in ("sh_constant", "sh_rest"))
+    constant, rest = (backbone.table[name].detach().double() for name in ("sh_dc", "sh_rest"))
     return colours_of(constant, rest, means - camera.centre, backbone.active_degree(STEP))
 
 

@@ -414,7 +414,7 @@ def test_overlap_stacks_anchors_in_one_cell_once_per_call() -> None:
     )
     assert level_up(table, gaussians, overlap=True) == 1
     assert grown_levels(table, 2) == [(0, (4.0, 0.0, 0.0))]
-    for name in ("sh_constant", "sh_rest"):
+    for name in ("sh_dc", "sh_rest"):
         assert torch.equal(table[name][2], table[name][:2].amax(0))
     assert table["opacity_logits"][2].item() == -2.0
     assert table["quats"][2].tolist() == [1, 0, 0, 0]

@@ -18,7 +18,7 @@ from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.density import mean_gradient
 from gsx.core.training.parameter_table import gradients, restored_table, size_of, table_tensors, zero_grad
 
-NAMES = ("means", "sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats")
+NAMES = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
 
 def logit(opacity: float) -> float:
@@ -34,13 +34,13 @@ def hand_made(
     extent: float = 1.0,
     cap: int = 10**6,
 ) -> GS3D:
-    """One primitive per entry, far apart, told apart by sh_constant = row number; statistics of two views each."""
+    """One primitive per entry, far apart, told apart by sh_dc = row number; statistics of two views each."""
     count = len(gradients)
     scene = small_scene(spread(count) * 100, extent=extent, background=background)
     backbone = small_gs3d(scene, options=replace(published_options(), max_primitives=cap))
     table = backbone.table
     with torch.no_grad():
-        table["sh_constant"].copy_(torch.arange(count)[:, None, None].expand(-1, 1, 3))
+        table["sh_dc"].copy_(torch.arange(count)[:, None, None].expand(-1, 1, 3))
         table["sh_rest"].normal_(generator=torch.Generator().manual_seed(1))
         table["quats"].normal_(generator=torch.Generator().manual_seed(2))
         table["log_scales"].copy_(torch.tensor(scales).log()[:, None] + torch.tensor([0.0, -0.5, -1.0]))
@@ -56,7 +56,7 @@ def snapshot(backbone: GS3D) -> dict[str, Tensor]:
 
 def labels(backbone: GS3D) -> list[int]:
     """Original row of every primitive, in order."""
-    return backbone.table["sh_constant"].detach()[:, 0, 0].int().tolist()
+    return backbone.table["sh_dc"].detach()[:, 0, 0].int().tolist()
 
 
 def learn(backbone: GS3D, gradient: float = 1e-6) -> None:
@@ -74,7 +74,7 @@ def test_initial_values_worked_by_hand() -> None:
     table = small_gs3d(small_scene(positions, colours)).table
     assert torch.equal(table["means"], positions)
     dc = torch.tensor([1.7724539, -1.7724539, (127 / 255 - 0.5) / 0.28209479])
-    torch.testing.assert_close(table["sh_constant"][0, 0], dc)
+    torch.testing.assert_close(table["sh_dc"][0, 0], dc)
     assert table["sh_rest"].shape == (4, 15, 3)
     assert not table["sh_rest"].any()
     torch.testing.assert_close(table["opacity_logits"].detach(), torch.full((4,), -2.1972246))  # opacity 0.1
@@ -116,7 +116,7 @@ def test_first_adam_step_moves_every_parameter_by_its_published_rate(step: int, 
     before = snapshot(backbone)
     learn(backbone, gradient=1e-12)
     backbone.update(step)
-    rates = {"means": 3 * means_rate, "sh_constant": 0.0025, "sh_rest": 1.25e-4}
+    rates = {"means": 3 * means_rate, "sh_dc": 0.0025, "sh_rest": 1.25e-4}
     rates |= {"opacity_logits": 0.05, "log_scales": 0.005, "quats": 0.001}
     for name, rate in rates.items():
         moved = before[name] - backbone.table[name].detach()
@@ -162,7 +162,7 @@ def test_explicit_holds_raw_values_and_unit_quaternions() -> None:
     explicit = backbone.explicit(None, 1)
     for name in ("means", "log_scales", "opacity_logits", "sh_rest"):
         assert torch.equal(getattr(explicit, name), backbone.table[name])
-    assert torch.equal(explicit.sh_constant, backbone.table["sh_constant"][:, 0])
+    assert torch.equal(explicit.sh_dc, backbone.table["sh_dc"][:, 0])
     torch.testing.assert_close(explicit.quats.norm(dim=1), torch.ones(3))
     assert not any(value.requires_grad for value in vars(explicit).values())
 
@@ -218,7 +218,7 @@ def test_rows_are_survivors_clones_first_children_second_children() -> None:
     after = snapshot(backbone)
     for name in NAMES:  # survivors and clones: every parameter exactly, position included
         assert torch.equal(after[name][:6], before[name][[0, 1, 3, 5, 1, 3]])
-    for name in ("sh_constant", "sh_rest", "opacity_logits", "quats"):
+    for name in ("sh_dc", "sh_rest", "opacity_logits", "quats"):
         assert torch.equal(after[name][6:], before[name][[2, 4, 2, 4]])
     torch.testing.assert_close(after["log_scales"][6:].exp(), before["log_scales"][[2, 4, 2, 4]].exp() / 1.6)
     assert not torch.isclose(after["means"][6:], before["means"][[2, 4, 2, 4]]).all(1).any()

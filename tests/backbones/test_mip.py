@@ -75,13 +75,13 @@ def row_values(
     absolute: Sequence[float] = (),
     **density: float,
 ) -> GS3D:
-    """Primitives 3 to 33 units before all cameras, statistics of two views each, told apart by sh_constant = row."""
+    """Primitives 3 to 33 units before all cameras, statistics of two views each, told apart by sh_dc = row."""
     count = len(scales)
     density = density | {"absolute": bool(absolute)}
     backbone = mip_gs3d(small_scene(spread(count) * torch.tensor([2.0, 30, 2]) + torch.tensor([0.0, 14, 0])), **density)
     table, opacity = backbone.table, torch.tensor(opacities)
     with torch.no_grad():
-        table["sh_constant"].copy_(torch.arange(count)[:, None, None].expand(-1, 1, 3))
+        table["sh_dc"].copy_(torch.arange(count)[:, None, None].expand(-1, 1, 3))
         table["log_scales"].copy_(torch.tensor(scales).log()[:, None] + torch.tensor([0.0, -0.5, -1.0]))
         table["opacity_logits"].copy_((opacity / (1 - opacity)).log())
     seen = torch.full((count,), 2.0)
@@ -93,7 +93,7 @@ def row_values(
 
 def labels(backbone: GS3D) -> list[int]:
     """Original row of every primitive, in order."""
-    return backbone.table["sh_constant"].detach()[:, 0, 0].int().tolist()
+    return backbone.table["sh_dc"].detach()[:, 0, 0].int().tolist()
 
 
 # -- sizes of the 3D filter (10.1) -------------------------------------------------------------------------------------

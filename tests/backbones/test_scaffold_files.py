@@ -71,7 +71,7 @@ def test_columns_hold_the_raw_values(name: str, tmp_path: Path) -> None:
         else:
             assert [columns[f"rot_{i}"][row] for i in range(4)] == table["quats"][row].tolist()
             assert columns["opacity"][row] == table["opacity_logits"][row].item()
-            assert [columns[f"f_dc_{i}"][row] for i in range(3)] == table["sh_constant"][row, 0].tolist()
+            assert [columns[f"f_dc_{i}"][row] for i in range(3)] == table["sh_dc"][row, 0].tolist()
             for channel in range(3):
                 for band in range(15):
                     found = columns[f"f_rest_{channel * 15 + band}"][row]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, tree_stamp, trim
+from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, trim
 from gsx.core.errors import InputError
 
 
@@ -67,62 +67,6 @@ def test_stamp_changes_with_name_size_and_time(tmp_path: Path) -> None:
     assert file_stamp(file) == ("photo.jpg", 5, 6)
 
 
-def scene_in(folder: Path) -> Path:
-    """Two photos and a model, written at known times."""
-    for name in ("images/a.png", "images/b.png", "sparse/0/cameras.bin"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(name)
-        os.utime(folder / name, ns=(0, 10**9))
-    return folder
-
-
-def test_a_folder_is_known_by_what_it_holds_wherever_it_lies(tmp_path: Path) -> None:
-    first, second = (scene_in(tmp_path / name) for name in ("a", "b"))
-    stamp = tree_stamp(first, Path("outputs"))
-    assert tree_stamp(second, Path("outputs")) == stamp
-    first.rename(tmp_path / "elsewhere")
-    assert tree_stamp(tmp_path / "elsewhere", Path("outputs")) == stamp
-    photo = second / "images" / "a.png"
-    os.utime(photo, ns=(0, 10**9 + 1))
-    touched = tree_stamp(second, Path("outputs"))
-    photo.write_text("another photo")
-    os.utime(photo, ns=(0, 10**9))
-    larger = tree_stamp(second, Path("outputs"))
-    photo.write_text("images/a.png")
-    os.utime(photo, ns=(0, 10**9))
-    assert tree_stamp(second, Path("outputs")) == stamp
-    photo.rename(second / "images" / "c.png")
-    renamed = tree_stamp(second, Path("outputs"))
-    (second / "images" / "c.png").rename(second / "a.png")
-    moved = tree_stamp(second, Path("outputs"))
-    assert len({stamp, touched, larger, renamed, moved}) == 5
-
-
-def test_what_gsx_writes_beside_photos_and_hidden_names_change_no_stamp(tmp_path: Path) -> None:
-    scene = scene_in(tmp_path / "scene")
-    stamp = tree_stamp(scene, scene / "outputs")
-    for name in (".DS_Store", ".thumbnails/a.png", "outputs/experiments/t/table.csv", "runs/mine/config.yaml",
-                 "runs/mine/renders/a.png"):  # fmt: skip
-        (scene / name).parent.mkdir(parents=True, exist_ok=True)
-        (scene / name).write_text("new")
-        assert tree_stamp(scene, scene / "outputs") == stamp, name
-    (scene / "more.png").write_text("new")
-    assert tree_stamp(scene, scene / "outputs") != stamp
-
-
-def test_links_are_followed_and_lead_nobody_round_in_circles(tmp_path: Path) -> None:
-    (tmp_path / "store").mkdir()
-    (tmp_path / "store" / "a.png").write_text("a")
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    (scene / "images").symlink_to(tmp_path / "store")
-    stamp = tree_stamp(scene, Path("outputs"))
-    (tmp_path / "store" / "back").symlink_to(scene)
-    assert tree_stamp(scene, Path("outputs")) == stamp
-    (tmp_path / "store" / "a.png").write_text("another")
-    assert tree_stamp(scene, Path("outputs")) != stamp
-
-
 def test_folder_that_cannot_be_made_is_named_with_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"file/sub.*GSX_CACHE"):
@@ -137,14 +81,14 @@ def test_folder_is_made_with_its_parents_and_may_exist(tmp_path: Path) -> None:
 def test_what_was_used_longest_ago_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of five folders of 100 bytes, but never the one at hand, though it is the oldest."""
     monkeypatch.setenv("GSX_CACHE", str(tmp_path))
-    folders = [cache_folder("trunks", name) for name in "abcde"]
+    folders = [cache_folder("warm_starts", name) for name in "abcde"]
     for age, folder in enumerate(folders):
         make_folder(folder)
         (folder / "state").write_bytes(bytes(100))
         os.utime(folder, (1000 - age, 1000 - age))
     make_folder(cache_folder("other", "z"))
-    assert trim("trunks", 500, folders[4]) == []
-    assert trim("trunks", 320, folders[4]) == [folders[3], folders[2]]
+    assert trim("warm_starts", 500, folders[4]) == []
+    assert trim("warm_starts", 320, folders[4]) == [folders[3], folders[2]]
     assert [folder.is_dir() for folder in folders] == [True, True, False, False, True]
-    assert trim("trunks", 0, folders[4]) == [folders[1], folders[0]]
+    assert trim("warm_starts", 0, folders[4]) == [folders[1], folders[0]]
     assert cache_folder("other", "z").is_dir()

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 from gsx.builtin import plugins
-from gsx.core.options import fields_with, idle_keys, label, without_effect
+from gsx.core.options import fields_with, label, without_effect
 from gsx.experiments.run_folder.run_key import NAMES, WHERE, without
 from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.settings import idle_keys
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,7 @@ def test_fields_inside_count_too() -> None:
 def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
     """As they stood in one list before every field said it of itself."""
     assert sorted(WHERE) == sorted(
-        ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "trunk_gb", "trunk_at")
+        ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "warm_start_gb", "warm_start_at")
     )
     assert sorted(NAMES) == sorted(("variant", "length", "budget", "dataset"))
     settings = compose(

@@ -102,8 +102,8 @@ def test_a_killed_run_goes_on_without_doubled_points(tmp_path: Path) -> None:
 
 def test_lines_of_a_trunk_are_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
-    tiny_run(tmp_path / "first", (*RUN, "init=trunk", "tracker=[]"), stop_after=13)
-    tiny_run(tmp_path / "second", (*RUN, "init=trunk"))
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start", "tracker=[]"), stop_after=13)
+    tiny_run(tmp_path / "second", (*RUN, "init=warm_start"))
     assert_curves_are_those_of_the_file(tmp_path / "second")
     assert lines(tmp_path / "second")[0]["step"] == 1
 

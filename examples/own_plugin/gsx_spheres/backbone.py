@@ -71,6 +71,6 @@ class Spheres:
             log_scales=splats.scales.detach().log(),
             quats=splats.quats,
             opacity_logits=self.table["opacity_logits"].detach(),
-            sh_constant=constant_from_colour(splats.colours.detach()),
+            sh_dc=constant_from_colour(splats.colours.detach()),
             sh_rest=splats.colours.new_zeros(len(splats.colours), 0, 3),
         )

@@ -58,7 +58,7 @@ class ExplicitRates:
     log_scales: Decay
     quats: Decay
     opacity_logits: Decay
-    sh_constant: Decay
+    sh_dc: Decay
     sh_rest: Decay
 
 

@@ -104,7 +104,7 @@ def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M
         log_scales=splats.scales.detach().clamp_min(LEAST).log(),
         quats=normalize(splats.quats.detach(), dim=1),
         opacity_logits=logit_of_log(splats.log_opacities.detach()),
-        sh_constant=constant.detach(),
+        sh_dc=constant.detach(),
         sh_rest=rest,
     )
 
@@ -180,7 +180,7 @@ class Explicit:
     """One Gaussian per anchor with spherical harmonics of its own, all of them drawn (Octree-AnyGS)."""
 
     offsets = 1
-    pooled: tuple[str, ...] = ("sh_constant", "sh_rest")
+    pooled: tuple[str, ...] = ("sh_dc", "sh_rest")
 
     def __init__(self, sh_degree: int, initial_logit: float) -> None:
         self.sh_degree, self.initial_logit = sh_degree, initial_logit
@@ -193,7 +193,7 @@ class Explicit:
             "log_scales": log_lengths[:, None].repeat(1, 6),
             "quats": identity_quats(log_lengths).clone(),
             "opacity_logits": torch.full_like(log_lengths, self.initial_logit),
-            "sh_constant": constant_from_colour(colours.to(log_lengths))[:, None],
+            "sh_dc": constant_from_colour(colours.to(log_lengths))[:, None],
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
@@ -213,7 +213,7 @@ class Explicit:
             scales=scales,
             quats=row["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(row["sh_constant"], row["sh_rest"], offsets, visible.sh_degree),
+            colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree),
         )
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 
@@ -224,13 +224,13 @@ class Explicit:
     def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
         """All bands."""
         rows = decoded.slots
-        return baked(decoded.splats, table["sh_constant"].detach()[rows, 0], table["sh_rest"].detach()[rows])
+        return baked(decoded.splats, table["sh_dc"].detach()[rows, 0], table["sh_rest"].detach()[rows])
 
     def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
         """67 floats a row with position and level at degree 3; f_rest is channel-major."""
         return (
             numbered("f_offset_", table["offsets"].flatten(1))
-            | numbered("f_dc_", table["sh_constant"][:, 0])
+            | numbered("f_dc_", table["sh_dc"][:, 0])
             | numbered("f_rest_", table["sh_rest"].transpose(1, 2).flatten(1))
             | {"opacity": table["opacity_logits"]}
             | numbered("scale_", table["log_scales"])

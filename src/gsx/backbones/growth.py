@@ -93,8 +93,8 @@ def selected(new: CandidateAnchors, keep: Bool[Tensor, "U"]) -> CandidateAnchors
 
 def strongest(new: CandidateAnchors, room: int) -> CandidateAnchors:
     """At most `room` of them, those with the largest gradients."""
-    everyone = torch.ones_like(new.strength, dtype=torch.bool)
-    return selected(new, within_room(everyone, new.strength, room))
+    all_cells = torch.ones_like(new.strength, dtype=torch.bool)
+    return selected(new, within_room(all_cells, new.strength, room))
 
 
 def offset_means(table: ParameterTable) -> Float[Tensor, "N k 3"]:

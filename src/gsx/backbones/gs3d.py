@@ -33,7 +33,7 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
     distance = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
     return {
         "means": positions.clone(),
-        "sh_constant": constant_from_colour(points.colours.float() / 255)[:, None],
+        "sh_dc": constant_from_colour(points.colours.float() / 255)[:, None],
         "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
         "opacity_logits": torch.full((count,), math.log(opacity / (1 - opacity))),
         "log_scales": distance.sqrt().log()[:, None].repeat(1, 3),
@@ -95,7 +95,7 @@ class GS3D:
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(values["sh_constant"], values["sh_rest"], offsets, self.active_degree(step)),
+            colours=colours_of(values["sh_dc"], values["sh_rest"], offsets, self.active_degree(step)),
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 
@@ -133,13 +133,13 @@ class GS3D:
         rates = self.options.rates
         of_means = log_linear(step, self.means_rate_steps(), rates.means_first, rates.means_last)
         self.table.set_rate("means", self.extent * of_means)
-        for name in ("sh_constant", "sh_rest", "opacity_logits", "log_scales", "quats"):
+        for name in ("sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"):
             self.table.set_rate(name, getattr(rates, name))
 
     def update(self, step: int) -> None:
         """One Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
         rest = self.table["sh_rest"]
-        if rest.grad is None and self.table["sh_constant"].grad is not None:
+        if rest.grad is None and self.table["sh_dc"].grad is not None:
             rest.grad = torch.zeros_like(rest)
         self.set_rates(step)
         take_adam_step(self.table)
@@ -158,7 +158,7 @@ class GS3D:
         if self.filter.note or shown.weights is not None:
             scales, log_opacities = extents(self.table, shown, self.filter)
             raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
-        raw["sh_constant"] = raw["sh_constant"][:, 0]
+        raw["sh_dc"] = raw["sh_dc"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)
         return Gaussians(**raw)
 

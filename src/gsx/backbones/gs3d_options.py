@@ -11,7 +11,7 @@ class Rates:
 
     means_first: float
     means_last: float
-    sh_constant: float
+    sh_dc: float
     sh_rest: float
     opacity_logits: float
     log_scales: float

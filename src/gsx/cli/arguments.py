@@ -8,12 +8,12 @@ from typing import Any, NoReturn
 from gsx.core.errors import ConfigError, InputError
 
 
-def run_words(verb: str, words: list[str], description: str) -> tuple[Path, list[str]]:
+def run_arguments(verb: str, arguments: list[str], description: str) -> tuple[Path, list[str]]:
     """The run folder and the overrides after it."""
     parser = Parser(prog=f"gsx {verb}", usage="%(prog)s RUN [KEY=VALUE ...]", description=description)
     parser.add_argument("run", metavar="RUN", help="run folder")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
-    given = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     if "=" in given.run and not Path(given.run).exists():
         raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
     return Path(given.run), given.overrides

@@ -43,47 +43,49 @@ Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     if processes() > 1:
         from gsx.core.training.distributed import as_one
 
-        return as_one(lambda: dispatch_together(words), explained)
+        return as_one(lambda: dispatch_together(arguments), explained)
     try:
-        return dispatch(words)
+        return dispatch(arguments)
     except BaseException as error:
         return explained(error)
 
 
-def dispatch_together(words: list[str]) -> int:
+def dispatch_together(arguments: list[str]) -> int:
     """Train or resume on several processes.
 
     Raises:
         ConfigError: anything else is asked for.
     """
-    if any(word.startswith("-") for word in words) or (words[:1] and words[0] in VERBS and words[0] != "resume"):
-        asked = " ".join(words[:2])
+    if any(word.startswith("-") for word in arguments) or (
+        arguments[:1] and arguments[0] in VERBS and arguments[0] != "resume"
+    ):
+        asked = " ".join(arguments[:2])
         raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
     from gsx.experiments.tables.sweep import is_table
 
-    if is_table(words):
+    if is_table(arguments):
         raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
-    return dispatch(words)
+    return dispatch(arguments)
 
 
-def dispatch(words: list[str]) -> int:
+def dispatch(arguments: list[str]) -> int:
     """Find the verb and run it."""
-    if words[:1] == ["help"] or ({"--help", "-h"} & set(words) and words[0] not in VERBS):
+    if arguments[:1] == ["help"] or ({"--help", "-h"} & set(arguments) and arguments[0] not in VERBS):
         sys.stdout.write(HELP)
         return 0
-    if words == ["--version"]:
+    if arguments == ["--version"]:
         sys.stdout.write(f"gsx {__version__}\n")
         return 0
-    if not words or words[0].startswith(("-", "+", "~")) or "=" in words[0]:
-        return verb_train(words)
-    if words[0] not in VERBS:
-        raise ConfigError(f"'{words[0]}' is no verb of gsx.{nearest(words[0], VERBS)} See gsx --help")
+    if not arguments or arguments[0].startswith(("-", "+", "~")) or "=" in arguments[0]:
+        return verb_train(arguments)
+    if arguments[0] not in VERBS:
+        raise ConfigError(f"'{arguments[0]}' is no verb of gsx.{nearest(arguments[0], VERBS)} See gsx --help")
     set_up_logging()
-    return VERBS[words[0]](words[1:])
+    return VERBS[arguments[0]](arguments[1:])
 
 
 VERBS: dict[str, Callable[[list[str]], int]] = {

@@ -8,23 +8,23 @@ from gsx.cli.arguments import Parser, new_folder
 from gsx.core.errors import InputError, nearest
 
 
-def verb_report(words: list[str]) -> int:
+def verb_report(arguments: list[str]) -> int:
     """gsx report DIR [DIR ...] [--to FOLDER]"""
     parser = Parser(prog="gsx report", description="Report of a run, or one page over all runs of some folders.")
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
-    given = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     from gsx.experiments.reports.report import report_on
 
     sys.stdout.write(f"{report_on(given.folders, new_folder(given.to) if given.to else None)}\n")
     return 0
 
 
-def verb_scenes(words: list[str]) -> int:
+def verb_scenes(arguments: list[str]) -> int:
     """gsx scenes PATH"""
     parser = Parser(prog="gsx scenes", description="What a folder is: format, cameras, images, points, problems.")
     parser.add_argument("path", type=Path, metavar="PATH", help="folder of a scene")
-    given = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     from gsx.experiments.runs.inspect import describe
 
     lines = describe(given.path, plugins())
@@ -32,7 +32,7 @@ def verb_scenes(words: list[str]) -> int:
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
-def verb_datasets(words: list[str]) -> int:
+def verb_datasets(arguments: list[str]) -> int:
     """gsx datasets [NAME ...] [data_root=FOLDER]"""
     parser = Parser(
         prog="gsx datasets",
@@ -40,14 +40,14 @@ def verb_datasets(words: list[str]) -> int:
         description="The paper's datasets: what is expected below data_root=FOLDER, what is found, what is missing.",
     )
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
-    words = parser.parse_args(words).words
+    arguments = parser.parse_args(arguments).words
     from gsx.experiments.runs.compose import Compositions
     from gsx.experiments.tables.datasets import described
 
-    overrides = [word for word in words if "=" in word]
+    overrides = [word for word in arguments if "=" in word]
     with Compositions(plugins()) as compositions:
         known = [name for name in compositions.choices("dataset") if name != "own"]
-        names = [word for word in words if word not in overrides] or known
+        names = [word for word in arguments if word not in overrides] or known
         for name in names:
             if name not in known:
                 raise InputError(f"'{name}' is no dataset; there are {', '.join(known)}.{nearest(name, known)}")
@@ -57,9 +57,11 @@ def verb_datasets(words: list[str]) -> int:
     return 0
 
 
-def verb_plugins(words: list[str]) -> int:
+def verb_plugins(arguments: list[str]) -> int:
     """gsx plugins"""
-    Parser(prog="gsx plugins", description="What is installed, from where, and what failed to load.").parse_args(words)
+    Parser(prog="gsx plugins", description="What is installed, from where, and what failed to load.").parse_args(
+        arguments
+    )
     from gsx.core.plugins import KINDS
 
     loaded = plugins()

@@ -6,16 +6,16 @@ import sys
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import run_words
+from gsx.cli.arguments import run_arguments
 from gsx.core.errors import InputError
 
 logger = logging.getLogger("gsx.cli")
 
 
-def verb_eval(words: list[str]) -> int:
+def verb_eval(arguments: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
     told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
-    folder, overrides = run_words("eval", words, told)
+    folder, overrides = run_arguments("eval", arguments, told)
     from gsx.experiments.reports.report import write_report
     from gsx.experiments.runs.evaluate import evaluate
     from gsx.experiments.runs.execute import finish
@@ -35,7 +35,7 @@ def verb_eval(words: list[str]) -> int:
     return 0
 
 
-def verb_render(words: list[str]) -> int:
+def verb_render(arguments: list[str]) -> int:
     """gsx render RUN [--orbit FILE] ..."""
     parser = argparse.ArgumentParser(prog="gsx render", description="Render test views, or an orbit as an animation.")
     parser.add_argument("run", type=Path, help="run folder")
@@ -44,7 +44,7 @@ def verb_render(words: list[str]) -> int:
     parser.add_argument("--fps", type=float, default=20, help="frames per second (20)")
     parser.add_argument("--zoom", type=float, default=1, help="times the training resolution (1)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for test views (RUN/renders/test)")
-    given = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     if given.zoom <= 0 or given.frames < 1:
         raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
     from gsx.experiments.runs.open import open_run
@@ -61,13 +61,13 @@ def verb_render(words: list[str]) -> int:
     return 0
 
 
-def verb_export(words: list[str]) -> int:
+def verb_export(arguments: list[str]) -> int:
     """gsx export RUN [FILE.ply] [--view NAME]"""
     parser = argparse.ArgumentParser(prog="gsx export", description="Write a splat file (PLY), read back and compared.")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
-    given = parser.parse_args(words)
+    given = parser.parse_args(arguments)
     from gsx.core.gaussians.splat_files import refuse_suffix
     from gsx.experiments.runs.export import export, reimport_psnr
     from gsx.experiments.runs.open import open_run

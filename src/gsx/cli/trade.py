@@ -12,7 +12,7 @@ from gsx.core.errors import ConfigError, InputError, nearest
 logger = logging.getLogger("gsx.cli")
 
 
-def trade_arguments(words: list[str]) -> argparse.Namespace:
+def trade_arguments(arguments: list[str]) -> argparse.Namespace:
     """The options of gsx trade; `target` is a path or None, `overrides` what has an equals sign.
 
     Raises:
@@ -32,7 +32,7 @@ def trade_arguments(words: list[str]) -> argparse.Namespace:
     add("--views", type=positive(int), metavar="N", help="pictures to measure on (2, built-in scene: 1)")
     add("--combinations", type=whole, metavar="N", help="most combinations of knobs to try (4, built-in scene: 1)")
     add("--knobs", metavar="A,B,...", help="turn only these settings, for example tile_size,cull (all)")
-    given, unknown = parser.parse_known_intermixed_args(words)
+    given, unknown = parser.parse_known_intermixed_args(arguments)
     if unknown:
         options = ("--max-error", "--to", "--repeats", "--views", "--combinations", "--knobs")
         hint = nearest(unknown[0], options)
@@ -45,16 +45,18 @@ def trade_arguments(words: list[str]) -> argparse.Namespace:
     return given
 
 
-def verb_trade(words: list[str]) -> int:
+def verb_trade(arguments: list[str]) -> int:
     """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
-    if words[:1] in (["--help"], ["-h"]):
-        words = ["rasterizer", "--help"]
-    if not words:
+    if arguments[:1] in (["--help"], ["-h"]):
+        arguments = ["rasterizer", "--help"]
+    if not arguments:
         raise InputError("gsx trade needs to know what to trade: gsx trade rasterizer [RUN or FILE.ply]")
-    if words[0] != "rasterizer":
+    if arguments[0] != "rasterizer":
         remedy = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...]"
-        raise ConfigError(f"'{words[0]}' is nothing gsx can trade.{nearest(words[0], ['rasterizer'])} Type {remedy}")
-    given = trade_arguments(words[1:])
+        raise ConfigError(
+            f"'{arguments[0]}' is nothing gsx can trade.{nearest(arguments[0], ['rasterizer'])} Type {remedy}"
+        )
+    given = trade_arguments(arguments[1:])
     from gsx.experiments.trade.advice import advice_lines, table
     from gsx.experiments.trade.knobs import check_knobs
     from gsx.experiments.trade.measure import sweep, usable_paths

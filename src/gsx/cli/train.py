@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import run_words
+from gsx.cli.arguments import run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
@@ -30,48 +30,48 @@ HYDRA_FLAGS = (
 """Flags that are handed to Hydra as they are."""
 
 
-def verb_train(words: list[str]) -> int:
+def verb_train(arguments: list[str]) -> int:
     """gsx OVERRIDES..."""
     set_up_logging()
-    flags = [word for word in words if word.startswith("-")]
+    flags = [word for word in arguments if word.startswith("-")]
     for flag in flags:
         if flag.split("=")[0] not in HYDRA_FLAGS:
             raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
     if flags:
-        return hand_to_hydra(words)
+        return hand_to_hydra(arguments)
     from gsx.experiments.tables.sweep import is_table
 
-    if is_table(words):
-        return fill_table(words)
+    if is_table(arguments):
+        return fill_table(arguments)
     from gsx.experiments.runs.compose import compose
 
-    return train(compose(words, loaded := plugins()), loaded)
+    return train(compose(arguments, loaded := plugins()), loaded)
 
 
-def fill_table(words: list[str]) -> int:
+def fill_table(arguments: list[str]) -> int:
     """gsx +experiment=TABLE ..."""
     from gsx.experiments.tables.sweep import run_table
 
-    text, code = run_table(words, plugins(), sweep_job)
+    text, code = run_table(arguments, plugins(), sweep_job)
     sys.stdout.write(text)
     return code
 
 
-def hand_to_hydra(words: list[str]) -> int:
+def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
     from gsx.experiments.tables.sweep import is_table
 
-    if is_table(words) and {"-m", "--multirun"} & set(words):
+    if is_table(arguments) and {"-m", "--multirun"} & set(arguments):
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
     loaded = plugins()
-    if not {"-m", "--multirun"} & set(words):
-        hydra_main(words, loaded, sweep_job)
+    if not {"-m", "--multirun"} & set(arguments):
+        hydra_main(arguments, loaded, sweep_job)
         return 0
-    given = [word for word in words if not word.startswith("-")]
+    given = [word for word in arguments if not word.startswith("-")]
     sweep = new_sweep(check_overrides(given, loaded))
     try:
-        hydra_main([*words, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+        hydra_main([*arguments, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     finally:
         code = close_sweep(sweep)
     return code
@@ -130,10 +130,10 @@ def sweep_job(config: Any) -> int:
     return code
 
 
-def verb_resume(words: list[str]) -> int:
+def verb_resume(arguments: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...]"""
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
-    folder, overrides = run_words("resume", words, told)
+    folder, overrides = run_arguments("resume", arguments, told)
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.settings import write_config
 

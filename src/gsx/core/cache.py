@@ -4,7 +4,6 @@ import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import gsx
@@ -55,39 +54,6 @@ def file_stamp(path: Path) -> tuple[str, int, int]:
     """
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
-
-
-def tree_stamp(place: Path, but: Path) -> str:
-    """A digest of a file, or of all in a folder: names relative to it, sizes, times as in `file_stamp`.
-
-    Links are followed. Passed over are hidden names, what cannot be read, folders of runs (they have a config.yaml) and
-    the folder `but`.
-    """
-    if not place.is_dir():
-        return content_key(file_stamp(place))
-    return content_key(list(stamps_below(str(place), "", {os.path.realpath(but)})))
-
-
-def stamps_below(folder: str, prefix: str, known: set[str]) -> Iterator[tuple[str, int, int]]:
-    """`file_stamp` of each file in a folder, names with `prefix`, in their order; `known`: folders already seen."""
-    known.add(os.path.realpath(folder))
-    entries = sorted(entries_of(folder), key=lambda entry: entry.name)
-    for entry in [] if prefix and any(entry.name == "config.yaml" for entry in entries) else entries:
-        name = prefix + entry.name
-        if entry.is_dir() and os.path.realpath(entry.path) not in known:
-            yield from stamps_below(entry.path, f"{name}/", known)
-        elif entry.is_file():
-            status = entry.stat()
-            yield name, status.st_size, status.st_mtime_ns
-
-
-def entries_of(folder: str) -> list[os.DirEntry[str]]:
-    """What lies in a folder, but for hidden names; nothing if it cannot be read."""
-    try:
-        with os.scandir(folder) as entries:
-            return [entry for entry in entries if not entry.name.startswith(".")]
-    except OSError:
-        return []
 
 
 def make_folder(folder: Path) -> Path:

@@ -31,11 +31,6 @@ def fields_with(effect: str, options: type, prefix: str = "") -> frozenset[str]:
     return frozenset(found)
 
 
-def idle_keys(options: Mapping[str, type]) -> frozenset[str]:
-    """Dotted keys of a composition that change nothing of what is trained; `options`: schemas by key."""
-    return frozenset[str]().union(*(fields_with("none", schema, f"{key}.") for key, schema in options.items()))
-
-
 def flattened(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Values of a nested configuration by dotted key."""
     out: dict[str, Any] = {}

@@ -42,7 +42,7 @@ def enlarged(request: Request) -> Float[Tensor, "3 H W"]:
 
 
 class Unchanged:
-    """Gives back what it is given: the control of a restorer."""
+    """Gives back what it is given: the baseline of a restorer."""
 
     def __init__(self, options: PlainOptions) -> None:
         self.options = options

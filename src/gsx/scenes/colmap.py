@@ -107,8 +107,8 @@ def shot_of(model: Model, image: ModelImage, photos: Path) -> Shot:
     Raises:
         InputError: the photo's size is no uniform reduction of its camera's, or that has no pinhole equivalent.
     """
-    lens = model.cameras[image.camera_id]
-    return shot_through(lens, image.name, photos / image.name, image.rotation, image.translation)
+    intrinsics = model.cameras[image.camera_id]
+    return shot_through(intrinsics, image.name, photos / image.name, image.rotation, image.translation)
 
 
 def check_cameras(
@@ -134,13 +134,13 @@ def check_cameras(
     return f"Reprojection error {median:.2f} px (median of {len(errors)} observations, at the model's resolution)."
 
 
-def reprojection_errors(image: ModelImage, lens: Any, camera: Camera) -> Float[Tensor, "K"]:
+def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> Float[Tensor, "K"]:
     """Distance of projected points from their keypoints in pixels of the model; infinite behind the camera.
 
-    `camera` is the image's pinhole camera on any raster, `lens` the model's pycolmap camera.
+    `camera` is the image's pinhole camera on any raster, `intrinsics` the model's pycolmap camera.
     """
-    pinhole = pinhole_of(lens)
-    observed = undistort_points(lens, pinhole, image.keypoints)
+    pinhole = pinhole_of(intrinsics)
+    observed = undistort_points(intrinsics, pinhole, image.keypoints)
     projected, depth = camera.project(image.observed)
     to_model = projected.new_tensor([pinhole.width / camera.width, pinhole.height / camera.height])
     errors = (projected * to_model - observed).norm(dim=1)

@@ -41,27 +41,27 @@ class Shot:
 
 
 def shot_through(
-    lens: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+    intrinsics: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
 ) -> Shot:
-    """A photo taken through `lens`, a pycolmap camera, as the pinhole photo that gsx uses.
+    """A photo taken through `intrinsics`, a pycolmap camera, as the pinhole photo that gsx uses.
 
     Raises:
-        InputError: the photo's size is no uniform reduction of the lens's, or that has no pinhole equivalent.
+        InputError: the photo's size is no uniform reduction of the intrinsics's, or that has no pinhole equivalent.
     """
-    pinhole, expected = pinhole_of(lens), (lens.width, lens.height)
-    size = undistorted_size(lens, pinhole, checked_size(photo, expected))
+    pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
+    size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))
     return Shot(
         name=name,
         photo=photo,
         whole=camera_of(pinhole, rotation, translation).resize(*size),
         expected_size=expected,
-        remap=None if pinhole is lens else StoredUndistortion(photo, lens, pinhole, size),
+        remap=None if pinhole is intrinsics else StoredUndistortion(photo, intrinsics, pinhole, size),
     )
 
 
 def lens_notes(shots: Sequence[Shot]) -> list[str]:
     """One note for each kind of camera that is undistorted."""
-    kinds = {(shot.remap.lens.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
+    kinds = {(shot.remap.intrinsics.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
     return [
         f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
         for name, (width, height), (new_width, new_height) in sorted(kinds)

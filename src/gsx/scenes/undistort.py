@@ -63,35 +63,39 @@ def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[T
     )
 
 
-def undistorted_size(lens: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height) of the result for a photo of `size`, which may be reduced against the camera `lens`."""
+def undistorted_size(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the result for a photo of `size`, which may be reduced against the camera `intrinsics`."""
     width, height = size
-    return round(pinhole.width * width / lens.width), round(pinhole.height * height / lens.height)
+    return round(pinhole.width * width / intrinsics.width), round(pinhole.height * height / intrinsics.height)
 
 
-def undistort_points(lens: Any, pinhole: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
-    """Where pixels of `lens` lie in `pinhole`; both pycolmap cameras, positions in pixels, float64."""
-    if lens is pinhole or not len(positions):
+def undistort_points(intrinsics: Any, pinhole: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
+    """Where pixels of `intrinsics` lie in `pinhole`; both pycolmap cameras, positions in pixels, float64."""
+    if intrinsics is pinhole or not len(positions):
         return positions
-    rays = torch.from_numpy(lens.cam_from_img(positions.numpy()))
+    rays = torch.from_numpy(intrinsics.cam_from_img(positions.numpy()))
     focal = torch.tensor([pinhole.focal_length_x, pinhole.focal_length_y], dtype=torch.float64)
     centre = torch.tensor([pinhole.principal_point_x, pinhole.principal_point_y], dtype=torch.float64)
     return rays * focal + centre
 
 
-def undistort(image: UInt8[Tensor, "C H W"], lens: Any, pinhole: Any, size: tuple[int, int]) -> UInt8[Tensor, "C h w"]:
-    """The photo `image` of the camera `lens` as `pinhole` would have taken it, on a raster of `size` (width, height).
+def undistort(
+    image: UInt8[Tensor, "C H W"], intrinsics: Any, pinhole: Any, size: tuple[int, int]
+) -> UInt8[Tensor, "C h w"]:
+    """The photo `image` of the camera `intrinsics` as `pinhole` would have taken it, on a raster of `size`.
 
     Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
     """
     photo = image.float() / 255
-    to_photo = torch.tensor([image.shape[2] / lens.width, image.shape[1] / lens.height], dtype=torch.float64)
-    bands = [to_uint8(sample(photo, pixels * to_photo)) for pixels in _lens_pixels(lens, pinhole, size)]
+    to_photo = torch.tensor(
+        [image.shape[2] / intrinsics.width, image.shape[1] / intrinsics.height], dtype=torch.float64
+    )
+    bands = [to_uint8(sample(photo, pixels * to_photo)) for pixels in _distorted_pixels(intrinsics, pinhole, size)]
     return torch.cat(bands, dim=1)
 
 
-def _lens_pixels(lens: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
-    """For each pixel of the result, band by band, where `lens` sees the same, in its pixels."""
+def _distorted_pixels(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
+    """For each pixel of the result, band by band, where `intrinsics` sees the same, in its pixels."""
     width, height = size
     columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (pinhole.width / width)
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
@@ -99,7 +103,7 @@ def _lens_pixels(lens: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Flo
     for y in ((rows - pinhole.principal_point_y) / pinhole.focal_length_y).split(ROWS_PER_BAND):
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
-        yield torch.from_numpy(lens.img_from_cam(rays.numpy())).reshape(len(y), width, 2)
+        yield torch.from_numpy(intrinsics.img_from_cam(rays.numpy())).reshape(len(y), width, 2)
 
 
 def sample(photo: Float[Tensor, "C H W"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "C h w"]:
@@ -137,7 +141,7 @@ class StoredUndistortion:
     """`undistort` for one photo, its result kept as PNG between runs."""
 
     photo: Path
-    lens: Any
+    intrinsics: Any
     pinhole: Any
     size: tuple[int, int]
     """(width, height) of the result."""
@@ -149,14 +153,14 @@ class StoredUndistortion:
                 return read_image(stored)
             except InputError as problem:
                 logger.warning("%s It is made anew.", problem)
-        result = undistort(image, self.lens, self.pinhole, self.size)
+        result = undistort(image, self.intrinsics, self.pinhole, self.size)
         make_folder(stored.parent)
         write_image(stored, result)
         return result
 
     def stored(self) -> Path:
         """Where the result is kept; another photo, camera or method has another place."""
-        key = content_key(METHOD, _numbers(self.lens), _numbers(self.pinhole), self.size)
+        key = content_key(METHOD, _numbers(self.intrinsics), _numbers(self.pinhole), self.size)
         name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo))
         return cache_folder("undistorted", key) / f"{self.photo.stem}_{name}.png"
 

@@ -28,7 +28,7 @@ def gaussians(count: int, bands: int = 15, seed: int = 0) -> Gaussians:
 
     return Gaussians(
         means=random(3), log_scales=random(3) - 3, quats=random(4), opacity_logits=random(),
-        sh_constant=random(3), sh_rest=random(bands, 3),
+        sh_dc=random(3), sh_rest=random(bands, 3),
     )  # fmt: skip
 
 
@@ -40,7 +40,7 @@ def one_row() -> Gaussians:
         log_scales=torch.tensor([[-1.0, -2, -3]]),
         quats=torch.tensor([[0.5, 0.25, 0.125, 0.75]]),  # w, x, y, z
         opacity_logits=torch.tensor([-4.5]),
-        sh_constant=torch.tensor([[10.0, 20, 30]]),
+        sh_dc=torch.tensor([[10.0, 20, 30]]),
         sh_rest=rest[None],
     )
 
@@ -67,7 +67,7 @@ def test_round_trip_is_exact(count: int, bands: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("field", "name"),
-    [("means", "y"), ("quats", "rot_1"), ("sh_constant", "f_dc_1"), ("log_scales", "scale_1")],
+    [("means", "y"), ("quats", "rot_1"), ("sh_dc", "f_dc_1"), ("log_scales", "scale_1")],
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_values_that_are_not_finite_are_refused(field: str, name: str, value: float, tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_viewer_draws_the_activated_values_with_all_bands() -> None:
         means=torch.tensor([[1.0, 2.0, 8.0]]),
         log_scales=torch.log(torch.tensor([[0.1, 0.2, 0.3]])),
         opacity_logits=torch.tensor([math.log(0.25 / 0.75)]),
-        sh_constant=torch.zeros(1, 3),
+        sh_dc=torch.zeros(1, 3),
         sh_rest=torch.zeros(1, 15, 3),
     )
     raw.sh_rest[0, 11] = torch.tensor([0.1, 0.2, -9.0])  # k = 12: 0.746353 straight up

@@ -21,7 +21,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.geometry import LEAST_SHARE, log_compensation
-from gsx.core.rasterizer.pairs import pair
+from gsx.core.rasterizer.intersections import pair
 from gsx.core.rasterizer.projection import project
 
 MIP = RasterSettings(cull="tight", dilation=0.1, compensate=True, unrolled=2)
@@ -135,7 +135,7 @@ def test_bounds_see_the_compensated_opacity_and_the_published_radius_does_not() 
     assert torch.equal(fewer.radii, more.radii)
     point = axis_splat(1e-4)  # its opacity falls to 9e-4
     rendering = rasterize(point, axis_camera(), MIP)
-    assert rendering.pairs == 0
+    assert rendering.intersections == 0
     assert rendering.screen.visible.all()
 
 

@@ -23,7 +23,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.composite import composite, make_blocks, make_tables
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import pair
+from gsx.core.rasterizer.intersections import pair
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import project
 

@@ -10,7 +10,7 @@ from gsx.core.data.camera import look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.cap import capped
-from gsx.core.rasterizer.pairs import pair
+from gsx.core.rasterizer.intersections import pair
 from gsx.core.rasterizer.projection import project
 
 
@@ -113,7 +113,7 @@ def test_a_capped_tile_shows_its_nearest_splats_alone(cap: int) -> None:
     truth = truth_of(alone, small_camera(), rules)
     rules = RasterSettings(cull="tight", transmittance_stop=0.0, tile_cap=cap)
     rendering, found = render_with_gradients(splats, small_camera(), rules)
-    assert rendering.pairs == min(cap, 12)
+    assert rendering.intersections == min(cap, 12)
     assert (rendering.image - truth.image).abs().max() <= 1e-6
     for name, value in found.items():
         chosen = value[nearest]

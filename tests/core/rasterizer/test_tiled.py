@@ -4,11 +4,12 @@ import pytest
 import torch
 from raster_scenes import changed, front_camera, leaves, random_splats, run_script
 
+from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.compiled import available
 from gsx.core.rasterizer.reference import render_reference
-from gsx.core.rasterizer.tiled import Window, windows
+from gsx.core.rasterizer.tiled import covering
 
 
 @pytest.mark.parametrize("cull", ["published", "tight"])
@@ -16,12 +17,12 @@ from gsx.core.rasterizer.tiled import Window, windows
 def test_pieces_are_the_whole_bit_for_bit(pixels: int, cull: str) -> None:
     splats, rules, colour = random_splats(), RasterSettings(cull=cull), torch.tensor([0.2, 0.5, 0.9])
     whole = rasterize(splats, front_camera(), rules, background=colour, depth=True)
-    mosaic = rasterize_tiled(splats, front_camera(), rules, background=colour, depth=True, pixels=pixels)
-    assert torch.equal(mosaic.image, whole.image)
-    assert torch.equal(mosaic.alpha, whole.alpha)
-    assert torch.equal(mosaic.depth, whole.depth)
-    assert torch.equal(mosaic.visible.nonzero()[:, 0], whole.screen.ids[whole.screen.visible].sort().values)
-    assert (mosaic.pieces > 1) is (pixels < 70 * 52)
+    tiled = rasterize_tiled(splats, front_camera(), rules, background=colour, depth=True, pixels=pixels)
+    assert torch.equal(tiled.image, whole.image)
+    assert torch.equal(tiled.alpha, whole.alpha)
+    assert torch.equal(tiled.depth, whole.depth)
+    assert torch.equal(tiled.visible.nonzero()[:, 0], whole.screen.ids[whole.screen.visible].sort().values)
+    assert (tiled.windows > 1) is (pixels < 70 * 52)
 
 
 @pytest.mark.skipif(not available(), reason="no working compiler on this machine")
@@ -29,9 +30,9 @@ def test_pieces_of_the_compiled_path_are_the_whole_without_gradients() -> None:
     rules = RasterSettings(path="compiled", unrolled=2)
     with torch.no_grad():
         whole = rasterize(random_splats(), front_camera(), rules).image
-    mosaic = rasterize_tiled(random_splats(), front_camera(), rules, pixels=500)
-    assert mosaic.pieces > 1
-    assert torch.equal(mosaic.image, whole)
+    tiled = rasterize_tiled(random_splats(), front_camera(), rules, pixels=500)
+    assert tiled.windows > 1
+    assert torch.equal(tiled.image, whole)
 
 
 def test_pieces_of_a_crop_and_of_large_tiles_are_the_whole_too() -> None:
@@ -43,12 +44,12 @@ def test_pieces_of_a_crop_and_of_large_tiles_are_the_whole_too() -> None:
 def test_pieces_with_too_many_pairs_are_halved_until_they_fit() -> None:
     splats = random_splats()
     whole = rasterize(splats, front_camera(), RasterSettings())
-    rules = RasterSettings(max_pairs=whole.pairs // 4)
+    rules = RasterSettings(max_pairs=whole.intersections // 4)
     with pytest.raises(InputError, match="max_pairs"):
         rasterize(splats, front_camera(), rules)
-    mosaic = rasterize_tiled(splats, front_camera(), rules)
-    assert mosaic.pieces >= 4
-    assert torch.equal(mosaic.image, whole.image)
+    tiled = rasterize_tiled(splats, front_camera(), rules)
+    assert tiled.windows >= 4
+    assert torch.equal(tiled.image, whole.image)
 
 
 def test_a_tile_with_too_many_pairs_is_refused() -> None:
@@ -62,15 +63,15 @@ def test_non_finite_splats_are_counted_once_and_nothing_learns() -> None:
     splats = leaves(random_splats())
     with torch.no_grad():
         splats.means[3] = torch.nan
-    mosaic = rasterize_tiled(splats, front_camera(), RasterSettings(), pixels=500)
-    assert mosaic.dropped == 1
-    assert not mosaic.image.requires_grad
+    tiled = rasterize_tiled(splats, front_camera(), RasterSettings(), pixels=500)
+    assert tiled.dropped == 1
+    assert not tiled.image.requires_grad
 
 
 @pytest.mark.parametrize(("width", "height", "pixels", "unit"), [(70, 52, 500, 16), (16, 16, 1, 16), (100, 7, 900, 8)])
 def test_windows_cover_the_raster_once(width: int, height: int, pixels: int, unit: int) -> None:
     count = torch.zeros(height, width)
-    for window in windows(width, height, pixels, unit):
+    for window in covering(width, height, pixels, unit):
         assert window.width * window.height <= max(pixels, unit * unit)
         assert window.left % unit == window.top % unit == 0
         count[window.pixels] += 1
@@ -107,10 +108,10 @@ from raster_scenes import front_camera, random_splats
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
 splats, before = random_splats(300, size=0.02), peak()
-mosaic = rasterize_tiled(splats, front_camera(7680, 4320), RasterSettings(), pixels=1 << 19)
-finite = all(bool(torch.isfinite(row).all()) for row in mosaic.image.flatten(0, 1).split(1000))
-print(json.dumps({"before": before, "peak": peak(), "size": list(mosaic.image.shape), "finite": finite,
-    "covered": float(mosaic.alpha.mean()), "pieces": mosaic.pieces}))
+tiled = rasterize_tiled(splats, front_camera(7680, 4320), RasterSettings(), pixels=1 << 19)
+finite = all(bool(torch.isfinite(row).all()) for row in tiled.image.flatten(0, 1).split(1000))
+print(json.dumps({"before": before, "peak": peak(), "size": list(tiled.image.shape), "finite": finite,
+    "covered": float(tiled.alpha.mean()), "pieces": tiled.windows}))
 """
 
 

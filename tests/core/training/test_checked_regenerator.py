@@ -158,9 +158,9 @@ def test_whoever_asks_gets_checked_pictures_and_their_tally(caplog: pytest.LogCa
     assert [one.image is None for one in drawn] == [False, True, False]
     assert drawn[1].problem == "a: it holds values that are not finite"
     told = {"event": 6, "asked": {"2": 3}, "dropped": {"2": 1}, "warned": {}}
-    assert regenerator.tally.told(7) == told
+    assert regenerator.tally.account_at(7) == told
     assert "mine: 1 of 3 x2 pictures dropped: a: it holds values that are not finite" in caplog.text
-    assert regenerator.tally.told(8) == {}
+    assert regenerator.tally.account_at(8) == {}
 
 
 def test_losing_most_pictures_is_an_error_that_names_remedies() -> None:
@@ -175,10 +175,10 @@ def test_one_bad_picture_among_those_asked_for_now_and_then_ends_nothing() -> No
     regenerator = checked(spoilt_where({0, 1, 2, 3, 8}))
     for number in range(8):
         regenerator.redraw([replace(request(texture()), number=number)])
-        assert regenerator.tally.told(number + 1)["dropped"] == ({"2": 1} if number < 4 else {})
+        assert regenerator.tally.account_at(number + 1)["dropped"] == ({"2": 1} if number < 4 else {})
     regenerator.redraw([replace(request(texture()), number=8)])
     with pytest.raises(TrainingError, match="lost 5 of 9 pictures at x2, step 8"):
-        regenerator.tally.told(9)
+        regenerator.tally.account_at(9)
 
 
 def test_accounts_of_processes_add_up_and_outlive_an_interruption() -> None:

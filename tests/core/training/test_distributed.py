@@ -19,10 +19,11 @@ from torch import Tensor
 from gsx.core.errors import ConfigError, Disagreement
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.distributed import Ranks, placed, ranks_here, refuse_uneven
+from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.guard import Agreement
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
+from gsx.experiments.runs.build import placed, refuse_uneven
 
 COMMON = ("rasterizer=eager", "iterations=30", "training.batch=2", "training.checkpoint_every=12")
 GS3D = (*COMMON, "backbone.density.every=400", "backbone.density.reset_passes=1", "backbone.density.gradient=1e-6",
@@ -183,7 +184,7 @@ def test_a_process_that_dies_or_drifts_is_noticed(kind: str, sentence: str, tmp_
 
 @pytest.mark.slow
 def test_a_branch_from_a_trunk_equals_one_from_scratch(tmp_path: Path) -> None:
-    words = (*OVERRIDES, *GS3D, "init=trunk", "augmenter=bootstrap", "regenerator/restore=identity")
+    words = (*OVERRIDES, *GS3D, "init=warm_start", "augmenter=bootstrap", "regenerator/restore=identity")
     environment = {"GSX_CACHE": str(tmp_path / "cache")}
     for name in ("first", "second"):
         done = together(*words, f"folder={tmp_path / name}", **environment)

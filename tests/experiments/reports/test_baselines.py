@@ -1,11 +1,11 @@
-"""Comparisons with the control, by hand."""
+"""Comparisons with the baseline, by hand."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gsx.experiments.reports.baselines import compared, control_rows
+from gsx.experiments.reports.baselines import baseline_rows, compared
 from gsx.experiments.run_folder.files import RunFiles
 
 
@@ -41,7 +41,7 @@ def test_gains_are_means_over_seeds_with_half_of_their_range() -> None:
         run({"1": 29.9, "2": 28.5, "4": 27.0}, 150, UP),
         run({"1": 31.1, "2": 27.1, "4": 27.0}, 130, UP, seed=1),
     ]
-    (row,) = control_rows(runs)
+    (row,) = baseline_rows(runs)
     assert (row["scene"], row["backbone"], row["augmenters"], row["seeds"]) == ("demo", "gs3d", "upscale", 2)
     assert row["gains"]["1"] == pytest.approx((0.0, 0.1))
     assert row["gains"]["2"] == pytest.approx((0.3, 0.2))
@@ -61,11 +61,13 @@ def test_other_runs_are_no_control(change: dict[str, Any]) -> None:
 
 def test_augmentations_that_differ_are_told_apart() -> None:
     runs = [run({"1": 30.0}), run({"1": 31.0}, augmenter=UP), run({"1": 32.0}, augmenter=WIDE)]
-    assert [row["told"] for row in control_rows(runs)] == ["upscale.narrow=0.5", "upscale.narrow=1.0"]
-    assert [row["told"] for row in control_rows(runs[:2])] == [""]
+    assert [row["told"] for row in baseline_rows(runs)] == ["upscale.narrow=0.5", "upscale.narrow=1.0"]
+    assert [row["told"] for row in baseline_rows(runs[:2])] == [""]
 
 
 def test_folders_and_zooms_looked_at_make_no_difference() -> None:
-    control = run({"1": 30.0}, folder="a", eval={"zoom": [1]}, init="trunk")
-    (row,) = control_rows([control, run({"1": 31.0}, augmenter=UP, folder="b", eval={"zoom": [1, 2]}, init="scratch")])
+    baseline = run({"1": 30.0}, folder="a", eval={"zoom": [1]}, init="warm_start")
+    (row,) = baseline_rows(
+        [baseline, run({"1": 31.0}, augmenter=UP, folder="b", eval={"zoom": [1, 2]}, init="scratch")]
+    )
     assert row["gains"]["1"][0] == pytest.approx(1.0)

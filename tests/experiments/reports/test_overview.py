@@ -382,7 +382,7 @@ def test_a_variant_has_its_control_whatever_they_are_called(tmp_path: Path) -> N
     make_run(tmp_path / "plain", {"variant": "gs3d_b"})
     upscale = {"augmenter": {"upscale": {"name": "upscale"}}}
     make_run(tmp_path / "up", {"variant": "gs3d_u"} | upscale, zoom={"2": {"psnr": 27.5}})
-    assert "+0.50" in Page(write_overview(tmp_path)).section("Against the control").text
+    assert "+0.50" in Page(write_overview(tmp_path)).section("Against the baseline").text
 
 
 # -- any state -----------------------------------------------------------------------------------------------------

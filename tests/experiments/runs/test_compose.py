@@ -81,7 +81,7 @@ def compose_length(words: list[str]) -> int:
 def test_published_values_of_gs3d() -> None:
     options = compose([], plugins()).backbone.options
     assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)
-    assert options.rates.sh_rest == pytest.approx(options.rates.sh_constant / 20)
+    assert options.rates.sh_rest == pytest.approx(options.rates.sh_dc / 20)
     density = options.density
     assert (density.start, density.stop, density.every, density.reset_every) == (500, 15000, 100, 3000)
 

@@ -50,11 +50,11 @@ def lines(folder: Path) -> list[dict]:
 def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The control trains all of it and leaves states at 10, 15, 20, 22, 30; bootstrap branches at 20, upscale at 22."""
     caplog.set_level("INFO")
-    tiny_run(tmp_path / "control", (*RUN, "init=trunk"))
+    tiny_run(tmp_path / "control", (*RUN, "init=warm_start"))
     assert "no earlier run" in caplog.text
     for name, step in (("bootstrap", 20), ("upscale", 22)):
         caplog.clear()
-        tiny_run(tmp_path / name, (*RUN, *augmented(name), "init=trunk"))
+        tiny_run(tmp_path / name, (*RUN, *augmented(name), "init=warm_start"))
         assert f"branching at step {step} from an earlier run" in caplog.text
         tiny_run(tmp_path / f"{name}_scratch", (*RUN, *augmented(name)))
         assert_same(tmp_path / name, tmp_path / f"{name}_scratch")
@@ -65,11 +65,11 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
 
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
     """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
-    run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=trunk"))
+    run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=warm_start"))
     assert sorted(path.stem for path in warm_start_folder(run, plugins().versions).glob("step_*.json")) == [
         f"step_{step:07d}" for step in (10, 15, 20, 22)
     ]
-    tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=trunk"))
+    tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=warm_start"))
     tiny_run(tmp_path / "scratch", (*RUN, *augmented("upscale", "bootstrap")))
     assert_same(tmp_path / "both", tmp_path / "scratch")
 
@@ -79,35 +79,35 @@ def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> 
 )
 def test_other_compositions_have_other_trunks(other: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
     caplog.clear()
-    tiny_run(tmp_path / "second", (*RUN, other, "init=trunk"), stop_after=1)
+    tiny_run(tmp_path / "second", (*RUN, other, "init=warm_start"), stop_after=1)
     assert "no earlier run" in caplog.text
 
 
-def test_how_a_run_is_watched_makes_no_other_trunk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_how_a_run_is_watched_makes_no_other_warm_start(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
-    tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=trunk"), stop_after=14)
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
+    tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=warm_start"), stop_after=14)
     assert "branching at step 10" in caplog.text
 
 
 def test_resumed_runs_leave_nothing_behind(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Their first steps may have followed another schedule."""
     caplog.set_level("INFO")
-    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=5)
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=5)
     run, settings = open_run(tmp_path / "first", plugins(), ["iterations=44"])
     execute(run, settings, plugins())
     caplog.clear()
-    tiny_run(tmp_path / "second", (*RUN, "iterations=44", "init=trunk"), stop_after=1)
+    tiny_run(tmp_path / "second", (*RUN, "iterations=44", "init=warm_start"), stop_after=1)
     assert "no earlier run" in caplog.text
 
 
 def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    run = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=16)
+    run = tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=16)
     (warm_start_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
-    tiny_run(tmp_path / "second", (*RUN, "init=trunk"), stop_after=17)
+    tiny_run(tmp_path / "second", (*RUN, "init=warm_start"), stop_after=17)
     assert "truncated or altered" in caplog.text
     assert "branching at step 10" in caplog.text
 
@@ -118,15 +118,15 @@ def test_a_cache_that_cannot_be_written_ends_no_run(
     (tmp_path / "blocked").write_text("a file where a folder should be")
     tiny_run(tmp_path / "demo", (*RUN,), stop_after=1)  # pictures of the scene are kept
     monkeypatch.setattr("gsx.experiments.runs.warm_start.cache_folder", lambda kind, key: tmp_path / "blocked" / key)
-    tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
     assert "the state of step 10 is not kept" in caplog.text
 
 
 def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Room for one composition: the second makes the first go; a run's own states stay whatever their size."""
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
-    first = tiny_run(tmp_path / "first", (*RUN, "init=trunk"), stop_after=12)
-    second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=trunk", "trunk_gb=0"), stop_after=12)
+    first = tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
+    second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=warm_start", "warm_start_gb=0"), stop_after=12)
     folders = [warm_start_folder(run, plugins().versions) for run in (first, second)]
     assert [folder.is_dir() for folder in folders] == [False, True]
 

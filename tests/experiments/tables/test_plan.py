@@ -9,7 +9,14 @@ import pytest
 
 from gsx.builtin import plugins
 from gsx.experiments.run_folder.files import read_run
-from gsx.experiments.run_folder.run_key import claimed, composition_key, finished, judging, place_of, scene_stamp
+from gsx.experiments.run_folder.run_key import (
+    claimed,
+    composition_key,
+    evaluation_settings,
+    finished,
+    place_of,
+    scene_stamp,
+)
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.settings import write_config
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, planned, told
@@ -36,7 +43,7 @@ def words_of(plan: Any) -> list[list[tuple[str, str]]]:
 
     def short(job: list[str]) -> tuple[str, str]:
         given = dict(word.split("=", 1) for word in job)
-        return given["variant"], given.get("trunk_at", given["init"])
+        return given["variant"], given.get("warm_start_at", given["init"])
 
     return [sorted(map(short, phase)) for phase in plan.phases]
 
@@ -47,7 +54,7 @@ def finish(cell: Cell) -> None:
     write_config(cell.folder / "config.yaml", cell.config)
     steps = cell.config["iterations"]
     (cell.folder / "evaluation.json").write_text(
-        json.dumps({"step": steps, "psnr": 20.0, "views": [], "judged": judging(cell.config)})
+        json.dumps({"step": steps, "psnr": 20.0, "views": [], "judged": evaluation_settings(cell.config)})
     )
     (cell.folder / "status.json").write_text(json.dumps({"state": "ok", "step": steps}))
 
@@ -111,9 +118,9 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
             return composition_key(settings.resolved, "", settings.idle)
 
         plain = key()
-        for word in ("output=elsewhere", "device=cpu", "init=trunk", "trunk_at=[3]", "eval.zoom=[1,2]", "reuse=true",
-                     "training.log_every=3", "regenerator/upscale=lanczos", "length=900",
-                     "scene.cache_gb=1"):  # fmt: skip
+        for word in ("output=elsewhere", "device=cpu", "init=warm_start", "warm_start_at=[3]",
+                     "eval.zoom=[1,2]", "reuse=true", "training.log_every=3", "regenerator/upscale=lanczos",
+                     "length=900", "scene.cache_gb=1"):  # fmt: skip
             assert key(word) == plain, word
         for word in ("seed=1", "iterations=901", "backbone=scaffold", "augmenter=upscale", "scene.samples=7",
                      "rasterizer.tile_size=16", "training.ssim_weight=0.1"):  # fmt: skip

@@ -441,7 +441,7 @@ def test_a_splat_file_becomes_a_subject(tmp_path: Path) -> None:
         log_scales=torch.randn(50, 3, generator=g) - 2,
         quats=torch.randn(50, 4, generator=g),
         opacity_logits=torch.randn(50, generator=g),
-        sh_constant=torch.randn(50, 3, generator=g),
+        sh_dc=torch.randn(50, 3, generator=g),
         sh_rest=torch.randn(50, 8, 3, generator=g),
     )
     path = tmp_path / "x.ply"

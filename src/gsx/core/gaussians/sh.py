@@ -19,23 +19,12 @@ def harmonics(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N
         a, b, c = BAND_2
         values += [a * x * y, -a * y * z, b * (2 * z * z - x * x - y * y), -a * x * z, c * (x * x - y * y)]
     if degree >= 3:
-        values += band_3(x, y, z)
+        a, b, c, d, e = BAND_3
+        xx, yy, zz = x * x, y * y, z * z
+        values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
+        values += [d * z * (2 * zz - 3 * xx - 3 * yy)]
+        values += [-c * x * (4 * zz - xx - yy), e * z * (xx - yy), -a * x * (xx - 3 * yy)]
     return torch.stack(values, 1)
-
-
-def band_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
-    """The seven functions of degree 3."""
-    a, b, c, d, e = BAND_3
-    xx, yy, zz = x * x, y * y, z * z
-    return [
-        -a * y * (3 * xx - yy),
-        b * x * y * z,
-        -c * y * (4 * zz - xx - yy),
-        d * z * (2 * zz - 3 * xx - 3 * yy),
-        -c * x * (4 * zz - xx - yy),
-        e * z * (xx - yy),
-        -a * x * (xx - 3 * yy),
-    ]
 
 
 class Contraction(torch.autograd.Function):

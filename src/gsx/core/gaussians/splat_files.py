@@ -31,7 +31,7 @@ def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
     zeros = torch.zeros_like(gaussians.opacity_logits)
     columns = dict(zip("xyz", gaussians.means.unbind(1), strict=True))
     columns |= dict.fromkeys(("nx", "ny", "nz"), zeros)
-    columns |= {f"f_dc_{i}": value for i, value in enumerate(gaussians.sh_constant.unbind(1))}
+    columns |= {f"f_dc_{i}": value for i, value in enumerate(gaussians.sh_dc.unbind(1))}
     columns |= {f"f_rest_{i}": value for i, value in enumerate(rest.unbind(1))}
     columns["opacity"] = gaussians.opacity_logits
     columns |= {f"scale_{i}": value for i, value in enumerate(gaussians.log_scales.unbind(1))}
@@ -81,7 +81,7 @@ def read_gaussians(path: Path) -> Gaussians:
         log_scales=stack("scale_", 3),
         quats=stack("rot_", 4),
         opacity_logits=column("opacity"),
-        sh_constant=stack("f_dc_", 3),
+        sh_dc=stack("f_dc_", 3),
         sh_rest=rest.view(len(rest), 3, bands).transpose(1, 2),
     )
 
@@ -95,7 +95,7 @@ def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats
         quats=gaussians.quats,
         log_opacities=torch.nn.functional.logsigmoid(gaussians.opacity_logits),
         colours=colours_of(
-            gaussians.sh_constant[:, None],
+            gaussians.sh_dc[:, None],
             gaussians.sh_rest,
             offsets_from(gaussians.means, camera_centre),
             degree,

@@ -34,5 +34,5 @@ class Gaussians:
     log_scales: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
     opacity_logits: Float[Tensor, "N"]
-    sh_constant: Float[Tensor, "N 3"]
+    sh_dc: Float[Tensor, "N 3"]
     sh_rest: Float[Tensor, "N B 3"]

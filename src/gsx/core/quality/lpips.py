@@ -9,6 +9,7 @@ import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -20,9 +21,14 @@ logger = logging.getLogger(__name__)
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """LPIPS input normalisation for values in [-1, 1]."""
-VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-ALEX_LAYERS = ((64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1))
-"""AlexNet: channels, kernel, stride, padding; max pooling before the second and third."""
+Layer: TypeAlias = tuple[int, int, int, int]
+"""Of a convolution: channels, kernel, stride, padding; a ReLU follows."""
+VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+STAGES: dict[str, list[tuple[int, list[Layer]]]] = {
+    "vgg": [(2 if n else 0, [(width, 3, 1, 1) for width in widths]) for n, widths in enumerate(VGG_WIDTHS)],
+    "alex": [(0, [(64, 11, 4, 2)]), (3, [(192, 5, 1, 2)]), (3, [(384, 3, 1, 1)]), *[(0, [(256, 3, 1, 1)])] * 2],
+}
+"""VGG16 and AlexNet up to their last ReLUs: the edge of the max pooling before each stage (0: none), and its layers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,33 +41,18 @@ class LpipsOptions:
     input_range: str
 
 
-def vgg_stages() -> nn.ModuleList:
-    """VGG16 up to the last ReLU of each stage; children numbered as in torchvision's `features`."""
+def stages_of(net: str) -> nn.ModuleList:
+    """Stages whose features are compared; children numbered as in torchvision's `features`."""
     stages, number, channels = nn.ModuleList(), 0, 3
-    for index, widths in enumerate(VGG_STAGES):
+    for pooling, layers in STAGES[net]:
         stage = nn.Sequential()
-        if index:
-            stage.add_module(str(number), nn.MaxPool2d(2))
+        if pooling:
+            stage.add_module(str(number), nn.MaxPool2d(pooling, 2))
             number += 1
-        for width in widths:
-            stage.add_module(str(number), nn.Conv2d(channels, width, 3, padding=1))
+        for width, kernel, stride, padding in layers:
+            stage.add_module(str(number), nn.Conv2d(channels, width, kernel, stride, padding))
             stage.add_module(str(number + 1), nn.ReLU())
             number, channels = number + 2, width
-        stages.append(stage)
-    return stages
-
-
-def alex_stages() -> nn.ModuleList:
-    """AlexNet's five convolutions with their ReLUs; children numbered as in torchvision's `features`."""
-    stages, number, channels = nn.ModuleList(), 0, 3
-    for index, (width, kernel, stride, padding) in enumerate(ALEX_LAYERS):
-        stage = nn.Sequential()
-        if index in (1, 2):
-            stage.add_module(str(number), nn.MaxPool2d(3, 2))
-            number += 1
-        stage.add_module(str(number), nn.Conv2d(channels, width, kernel, stride, padding))
-        stage.add_module(str(number + 1), nn.ReLU())
-        number, channels = number + 2, width
         stages.append(stage)
     return stages
 
@@ -71,15 +62,14 @@ class Lpips(nn.Module):
 
     def __init__(self, net: str, input_range: str) -> None:
         super().__init__()
-        if net not in ("vgg", "alex") or input_range not in ("unit", "signed"):
+        if net not in STAGES or input_range not in ("unit", "signed"):
             raise InputError(
                 f"metrics.lpips has net '{net}' and input_range '{input_range}': "
                 "choose net vgg or alex, input_range unit ([0,1], as published) or signed ([-1,1])"
             )
         self.net, self.signed = net, input_range == "signed"
-        self.stages = vgg_stages() if net == "vgg" else alex_stages()
-        widths = [stage[-1] for stage in VGG_STAGES] if net == "vgg" else [layer[0] for layer in ALEX_LAYERS]
-        self.heads = nn.ParameterList([torch.zeros(width) for width in widths])
+        self.stages = stages_of(net)
+        self.heads = nn.ParameterList([torch.zeros(layers[-1][0]) for _, layers in STAGES[net]])
         self.note = ""
 
     @property

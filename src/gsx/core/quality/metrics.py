@@ -29,22 +29,17 @@ def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant:
     """Structural similarity in [-1, 1].
 
     They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
-    `torchmetrics`: the same with reflected borders, as torchmetrics since 1.5. `valid`: mean over the pixels whose
-    window lies inside, as the original SSIM and pytorch-msssim.
+    `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
+    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim.
     """
     if variant == "inria":
         return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4))
     if variant == "torchmetrics":
-        return whole_windows(reflected(image), reflected(target))
+        half, mode = WINDOW // 2, "reflect" if min(image.shape[1:]) > WINDOW // 2 else "replicate"
+        return whole_windows(*(pad(picture, (half,) * 4, mode=mode) for picture in (image, target)))
     if variant == "valid":
         return whole_windows(image, target)
     raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
-
-
-def reflected(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
-    """Extended by half a window on each side; borders narrower than that are repeated, not reflected."""
-    half = WINDOW // 2
-    return pad(image, (half,) * 4, mode="reflect" if min(image.shape[1:]) > half else "replicate")
 
 
 def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:

@@ -14,9 +14,9 @@ from torch import Tensor
 from gsx.core.rasterizer.available import available, warn_once
 from gsx.core.rasterizer.composite import NOTHING
 from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
-from gsx.core.rasterizer.pairs import Pairs
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
 from gsx.core.rasterizer.settings import RasterSettings
@@ -158,16 +158,16 @@ def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
 
 
 def blend_stage(
-    job: Job, stage: Stage, rows: Float[Tensor, "S K F L"], light: list[Float[Tensor, "G P L"]], kept: Chunks
+    job: Job, stage: Stage, rows: Float[Tensor, "S K F L"], accumulated: list[Float[Tensor, "G P L"]], kept: Chunks
 ) -> None:
-    """Blend one stage into `light` and `kept.after`."""
-    part = [take(channel, stage.groups) for channel in light]
+    """Blend one stage into `accumulated` and `kept.after`."""
+    part = [take(channel, stage.groups) for channel in accumulated]
     picked = not isinstance(stage.blocks, slice)
     after = take(kept.after, stage.blocks)
     job.loops.blend(take(rows, stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
     if picked:
         kept.after[stage.blocks] = after
-        for channel, value in zip(light, part, strict=True):
+        for channel, value in zip(accumulated, part, strict=True):
             channel[stage.groups] = value
 
 
@@ -175,18 +175,18 @@ def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
     """Channels and coverage, front to back."""
-    light = [torch.zeros_like(inside) for _ in range(job.rules.channels + 1)]
+    accumulated = [torch.zeros_like(inside) for _ in range(job.rules.channels + 1)]
     kept = Chunks([], inside, inside.new_empty(len(rows), *inside.shape[1:]))
     for begin in range(0, len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, begin, left)) is not None:
-            blend_stage(job, stage, rows, light, kept)
+            blend_stage(job, stage, rows, accumulated, kept)
             kept.stages.append(stage)
             number += 1
             if number % CHECK_EVERY == 0:
                 fewer = leave(job, stage, kept)
                 left = left if fewer is None else fewer
-    return light, kept
+    return accumulated, kept
 
 
 def chunk_moments(
@@ -215,7 +215,7 @@ class Segments:
     """Share of light that passes each block."""
     before: Float[Tensor, "S P L"]
     """Transmittance in front of each block."""
-    light: Float[Tensor, "C_1 S P L"]
+    accumulated: Float[Tensor, "C_1 S P L"]
     """What each block adds to the channels and the coverage."""
 
 
@@ -226,14 +226,14 @@ def blend_segments(
     x, y, lanes = job.basis.x, job.basis.y, job.lanes
     passed = torch.cat([job.loops.fade(rows[part], x, y).to(inside.dtype) for part in parts(len(rows), job.batch)])
     before = before_blocks(passed, inside, lanes)
-    light = inside.new_zeros(job.rules.channels + 1, len(rows), *inside.shape[1:])
+    accumulated = inside.new_zeros(job.rules.channels + 1, len(rows), *inside.shape[1:])
     scratch = torch.empty_like(before)
     for part in parts(len(rows), job.batch):
-        job.loops.blend(rows[part], x, y, before[part], scratch[part], [channel[part] for channel in light])
-    total = inside.new_zeros(len(light), *inside.shape)
+        job.loops.blend(rows[part], x, y, before[part], scratch[part], [channel[part] for channel in accumulated])
+    total = inside.new_zeros(len(accumulated), *inside.shape)
     for active, base in zip(lanes.active, lanes.bases, strict=True):
-        total[:, :active] += light[:, base : base + active]
-    return list(total.unbind(0)), Segments(passed, before, light)
+        total[:, :active] += accumulated[:, base : base + active]
+    return list(total.unbind(0)), Segments(passed, before, accumulated)
 
 
 def segment_moments(
@@ -241,7 +241,7 @@ def segment_moments(
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, all blocks at once."""
     seen = [g[job.lanes.groups] for g in gradient]
-    shine = sum(channel * g for channel, g in zip(kept.light, seen, strict=True))
+    shine = sum(channel * g for channel, g in zip(kept.accumulated, seen, strict=True))
     own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
     behind = behind_blocks(kept.passed, own, job.lanes)
     return torch.cat(
@@ -255,35 +255,37 @@ def segment_moments(
 # -- the autograd function -----------------------------------------------------------------------------------------
 
 
-def sum_by_splat(values: Float[Tensor, "E V"], pairs: Pairs, lanes: Lanes, count: int) -> Float[Tensor, "M V"]:
+def sum_by_splat(
+    values: Float[Tensor, "E V"], intersections: TileIntersections, lanes: Lanes, count: int
+) -> Float[Tensor, "M V"]:
     """Sums over the entries of each splat, always in the same order."""
-    offsets = (pairs.counts.cumsum(0) - pairs.counts).int()
+    offsets = (intersections.counts.cumsum(0) - intersections.counts).int()
     sums = torch.nn.functional.embedding_bag(lanes.places, values, offsets, mode="sum")
-    return values.new_zeros(count, values.shape[1]).index_copy_(0, pairs.order, sums)
+    return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 
 class CompiledComposite(torch.autograd.Function):
     """See `composite_compiled` for the arguments."""
 
     @staticmethod
-    def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, pairs, job):
+    def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, intersections, job):
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         ones = means.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
         inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
-        light, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside)
+        accumulated, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside)
         if any(ctx.needs_input_grad):
-            ctx.kept = (job, pairs, table, rows, kept, absgrad is not None, means.dtype)
+            ctx.kept = (job, intersections, table, rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
-        return job.grid.to_raster(from_lanes(light, job.lanes, columns * lines)).to(means.dtype)
+        return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, pairs, table, rows, kept, absolute, dtype = ctx.kept
+        job, intersections, table, rows, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
         moments = (segment_moments if job.segments else chunk_moments)(job, rows, kept, seen)
         values = job.loops.entry_gradients(table, job.lanes.entries, job.centre, moments)
-        total = sum_by_splat(values.view(-1, values.shape[-1]), pairs, job.lanes, len(table) - 1).to(dtype)
+        total = sum_by_splat(values.view(-1, values.shape[-1]), intersections, job.lanes, len(table) - 1).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)
@@ -294,7 +296,7 @@ def composite_compiled(
     conic_factors: Float[Tensor, "M 3"],
     log_opacities: Float[Tensor, "M"],
     channels: Float[Tensor, "M C"],
-    pairs: Pairs,
+    intersections: TileIntersections,
     grid: TileGrid,
     settings: RasterSettings,
     *,
@@ -304,7 +306,7 @@ def composite_compiled(
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
     batch = max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
-    lanes = lay_out(pairs, len(means), settings.unrolled, batch)
+    lanes = lay_out(intersections, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)
     x, y = grid.basis(exact)[:2, :, None].unbind(0)
     job = Job(
@@ -318,17 +320,17 @@ def composite_compiled(
         batch=batch,
         segments=settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"),
     )
-    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, pairs, job)
+    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job)
 
 
 # -- when? --------------------------------------------------------------------------------------------------------
 
 
-def takes(settings: RasterSettings, channels: int, pairs: int, max_weight: bool, device: str) -> bool:
+def takes(settings: RasterSettings, channels: int, intersections: int, max_weight: bool, device: str) -> bool:
     """Whether this picture goes the compiled way: asked for, possible here, and nothing only the eager path does."""
     if settings.path != "compiled" or settings.accumulation in ("bfloat16", "float16"):
         return False
-    if channels > MOST_CHANNELS or max_weight or pairs == 0:
+    if channels > MOST_CHANNELS or max_weight or intersections == 0:
         return False
     if not available(device):
         warn_once(device)
@@ -338,4 +340,4 @@ def takes(settings: RasterSettings, channels: int, pairs: int, max_weight: bool,
 
 def path_of(settings: RasterSettings, device: torch.device) -> str:
     """`compiled` or `eager`: which way pictures of three channels go by these settings, here."""
-    return "compiled" if takes(settings, channels=3, pairs=1, max_weight=False, device=device.type) else "eager"
+    return "compiled" if takes(settings, channels=3, intersections=1, max_weight=False, device=device.type) else "eager"

@@ -5,7 +5,7 @@ How ln alpha is written is chosen in exponent.py, in which number formats the wo
 The list of a tile is cut into blocks of K splats, the last one padded. Tiles are taken in batches of similar list
 length; a batch blends one block of each of its tiles at a time, front to back; tiles whose list has ended or whose
 pixels have all stopped leave the batch. The backward pass recomputes alphas from the transmittance saved before each
-block and walks back to front, so that the light behind a splat is a sum of small terms, never a difference of large
+block and walks back to front, so that the colour behind a splat is a sum of small terms, never a difference of large
 ones. The work on a batch's blocks is a function of dense [B, K, P] arrays: B tiles, K splats, P pixels of a tile.
 """
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsx.core.rasterizer.exponent import EXPONENTS, Exponent
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import Pairs
+from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.precision import Precision, power_of_two_above
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
@@ -41,17 +41,17 @@ class Blocks:
     """Blocks of each tile."""
 
 
-def make_blocks(pairs: Pairs, chunk: int, splats: int) -> Blocks:
+def make_blocks(intersections: TileIntersections, chunk: int, splats: int) -> Blocks:
     """Cut each tile's list into blocks of `chunk`; `splats` is the number M of screen splats."""
-    lengths = pairs.starts.diff()
+    lengths = intersections.starts.diff()
     counts = (lengths + (chunk - 1)) // chunk
     tiles = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     starts = counts.cumsum(0) - counts
     number = torch.arange(len(tiles), device=counts.device) - starts[tiles]
     lane = torch.arange(chunk, device=counts.device)
-    entry = pairs.starts[:-1].long()[tiles, None] + number[:, None] * chunk + lane
-    padded = torch.cat([pairs.splats, pairs.splats.new_tensor([splats])])
-    last = torch.where(entry < pairs.starts[1:][tiles, None], entry, len(pairs.splats))
+    entry = intersections.starts[:-1].long()[tiles, None] + number[:, None] * chunk + lane
+    padded = torch.cat([intersections.splats, intersections.splats.new_tensor([splats])])
+    last = torch.where(entry < intersections.starts[1:][tiles, None], entry, len(intersections.splats))
     return Blocks(splats=padded[last], tiles=tiles, starts=starts, counts=counts)
 
 
@@ -147,8 +147,8 @@ def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[T
     transmittance = transmittances(alpha, front.transmittance)
     stop_(alpha, transmittance, tables.settings.transmittance_stop)
     weight = alpha.mul_(transmittance[:, :-1])
-    light = torch.bmm(weight.mT, tables.channels.index_select(0, front.blocks))
-    return light, transmittance[:, -1], weight
+    accumulated = torch.bmm(weight.mT, tables.channels.index_select(0, front.blocks))
+    return accumulated, transmittance[:, -1], weight
 
 
 def unclamp_(slope: Tensor, gaussian: Tensor, settings: RasterSettings) -> None:
@@ -157,12 +157,14 @@ def unclamp_(slope: Tensor, gaussian: Tensor, settings: RasterSettings) -> None:
         slope.mul_((gaussian / settings.alpha_max).clamp_(min=1.0))
 
 
-def light_behind(light: Float[Tensor, "B K P"], rest: Float[Tensor, "B P"]) -> Float[Tensor, "B K_plus_1 P"]:
-    """First the sum of the whole block and `rest`, the light behind it; then the sum behind each splat."""
-    values = light.new_empty(light.shape[0], light.shape[1] + 1, light.shape[2])
+def contribution_behind(
+    contribution: Float[Tensor, "B K P"], rest: Float[Tensor, "B P"]
+) -> Float[Tensor, "B K_plus_1 P"]:
+    """First the sum of the whole block and `rest`, the colour behind it; then the sum behind each splat."""
+    values = contribution.new_empty(contribution.shape[0], contribution.shape[1] + 1, contribution.shape[2])
     *others, current = values.unbind(1)
     current.copy_(rest)
-    for own, before in zip(reversed(light.unbind(1)), reversed(others), strict=True):
+    for own, before in zip(reversed(contribution.unbind(1)), reversed(others), strict=True):
         torch.add(current, own, out=before)
         current = before
     return values
@@ -170,7 +172,7 @@ def light_behind(light: Float[Tensor, "B K P"], rest: Float[Tensor, "B P"]) -> F
 
 @dataclass(frozen=True, eq=False)
 class FrontGradient:
-    """Gradients of B blocks, and the light of the blocks and all behind them."""
+    """Gradients of B blocks, and the colour of the blocks and all behind them."""
 
     rows: Float[Tensor, "B K 6"]
     """As `Exponent.gradient` has it."""
@@ -183,7 +185,7 @@ class FrontGradient:
 def front_gradient(
     tables: Tables, front: Front, gradient: Float[Tensor, "B C P"], rest: Float[Tensor, "B P"], absolute: bool
 ) -> FrontGradient:
-    """Gradient of a front; `rest` is the light behind it, weighted by the gradient of the picture."""
+    """Gradient of a front; `rest` is the colour behind it, weighted by the gradient of the picture."""
     rows = tables.rows.index_select(0, front.blocks)
     log_alpha, kept = tables.exponent.log_alphas(rows, tables.basis)
     gaussian, exact = log_alpha.exp_(), tables.precision.exact
@@ -191,10 +193,10 @@ def front_gradient(
     transmittance = transmittances(alpha, front.transmittance)
     stop_(alpha, transmittance, tables.settings.transmittance_stop)
     weight = alpha * transmittance[:, :-1]
-    light = torch.bmm(tables.channels.index_select(0, front.blocks), gradient).mul_(weight)
-    behind = light_behind(light, rest)
-    # d loss / d log alpha = w c.g - (light behind) alpha / (1 - alpha)
-    slope = light.addcdiv_(behind[:, 1:].mul_(alpha), 1 - alpha, value=-1)
+    contribution = torch.bmm(tables.channels.index_select(0, front.blocks), gradient).mul_(weight)
+    behind = contribution_behind(contribution, rest)
+    # d loss / d log alpha = w c.g - (colour behind) alpha / (1 - alpha)
+    slope = contribution.addcdiv_(behind[:, 1:].mul_(alpha), 1 - alpha, value=-1)
     unclamp_(slope, gaussian, tables.settings)
     slope = slope.to(exact)  # sums over pixels are exact
     return FrontGradient(
@@ -217,13 +219,13 @@ def batches(blocks: Blocks, settings: RasterSettings) -> list[Int[Tensor, "B"]]:
 def walk(
     tables: Tables, blocks: Blocks, tiles: Int[Tensor, "B"]
 ) -> Iterator[tuple[Front, Float[Tensor, "B P C"], Float[Tensor, "B K P"]]]:
-    """(front, light, weights) of a batch of tiles, front to back."""
+    """(front, accumulated colour, weights) of a batch of tiles, front to back."""
     transmittance = tables.inside[tiles]
     number = 0
     while len(tiles):
         front = Front(tiles, blocks.starts[tiles] + number, transmittance)
-        light, transmittance, weight = blend(tables, front)
-        yield front, light, weight
+        accumulated, transmittance, weight = blend(tables, front)
+        yield front, accumulated, weight
         number += 1
         going = (blocks.counts[tiles] > number) & (transmittance.amax(1) >= tables.settings.transmittance_stop)
         if not bool(going.all()):
@@ -240,8 +242,8 @@ def blend_all(
     pictures = tables.channels.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
     fronts: list[Front] = []
     for batch in batches(blocks, tables.settings):
-        for front, light, weight in walk(tables, blocks, batch):
-            pictures.index_add_(0, front.tiles, light)
+        for front, accumulated, weight in walk(tables, blocks, batch):
+            pictures.index_add_(0, front.tiles, accumulated)
             if max_weights is not None:
                 max_weights[front.blocks] = weight.amax(2).to(max_weights)
             if keep:

@@ -51,11 +51,6 @@ def squares_rows(
     return torch.stack([u0, u1, -(u0 * x + u1 * y), torch.zeros_like(u0), u2, -u2 * y, log_opacities], -1)
 
 
-def linear(basis: Float[Tensor, "3 P"]) -> Float[Tensor, "3 P"]:
-    """x, y, 1 as they are."""
-    return basis
-
-
 def squares_log_alphas(
     rows: Float[Tensor, "B K 7"], basis: Float[Tensor, "3 P"]
 ) -> tuple[Float[Tensor, "B K P"], tuple[Tensor, ...]]:
@@ -154,13 +149,6 @@ def direct_absolute(
     return torch.stack([by_x, by_y], 2)
 
 
-def direct_by_splat(
-    gradient: Float[Tensor, "S K 6"], rows: Float[Tensor, "S K 6"], offsets: Float[Tensor, "S K 2"]
-) -> Float[Tensor, "S K 6"]:
-    """As it is."""
-    return gradient
-
-
 # -- the polynomial ------------------------------------------------------------------------------------------------
 
 
@@ -226,7 +214,7 @@ def expanded_by_splat(
 EXPONENTS = {
     "squares": Exponent(
         rows=squares_rows,
-        basis=linear,
+        basis=lambda basis: basis,
         log_alphas=squares_log_alphas,
         gradient=squares_gradient,
         absolute=squares_absolute,
@@ -234,11 +222,11 @@ EXPONENTS = {
     ),
     "direct": Exponent(
         rows=direct_rows,
-        basis=linear,
+        basis=lambda basis: basis,
         log_alphas=direct_log_alphas,
         gradient=direct_gradient,
         absolute=direct_absolute,
-        by_splat=direct_by_splat,
+        by_splat=lambda gradient, rows, offsets: gradient,
     ),
     "expanded": Exponent(
         rows=expanded_rows,

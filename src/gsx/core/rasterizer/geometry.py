@@ -117,6 +117,6 @@ def geometry(
     stretches, magnification = ((fx / longest).to(scales), (fy / longest).to(scales)), (longest / z).to(scales)
     sizes = scaled(scales.unbind(1), (magnification,) * 3)
     p, q = screen_axes(clamped, stretches, sizes, unit(quats), rotation)
-    covariances, factors, determinants = covariance_and_factor(p, q, dilation)
-    gains = log_compensation(*determinants) if compensate else None
-    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(factors, 1), gains
+    covariances, conic_factors, determinants = covariance_and_factor(p, q, dilation)
+    compensation = log_compensation(*determinants) if compensate else None
+    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(conic_factors, 1), compensation

@@ -8,7 +8,7 @@ need outlive a cache. Rules are constants of the compiled code.
 import functools
 import math
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,15 +126,15 @@ def blend(
     y: Float[Tensor, "P 1"],
     before: Float[Tensor, "B P L"],
     after: Float[Tensor, "B P L"],
-    light: list[Float[Tensor, "B P L"]],
+    accumulated: list[Float[Tensor, "B P L"]],
     rules: Rules,
 ) -> None:
-    """Blend one block of every group into `light`, the channels and, last, the coverage.
+    """Blend one block of every group into `accumulated`, the channels and, last, the coverage.
 
     `before` is the transmittance in front of the block, `after` receives that behind it. It goes on falling below the
     stop value, so that a pixel that has ended stays ended.
     """
-    t, sums = before, list(light)
+    t, sums = before, list(accumulated)
     for row in entries(rows):
         alpha = clamped(gaussian(row, x, y, rules), row).to(t.dtype)
         weight = alpha * t
@@ -142,7 +142,7 @@ def blend(
         weight = torch.where(t >= rules.stop, weight, 0.0)
         sums = [sums[c] + weight * row[ROW + c] for c in range(rules.channels)] + [sums[-1] + weight]
     after.copy_(t)
-    for target, value in zip(light, sums, strict=True):
+    for target, value in zip(accumulated, sums, strict=True):
         target.copy_(value)
 
 
@@ -318,17 +318,10 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
         "realize_cpu_opcount_threshold": sharing,
     }
     if loop.__name__ in SHARING:
-        options["guard_filter_fn"] = without_symbols
+        # no guards on symbols, which are the number of blocks, the same in all arguments, and where in storage a view
+        # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one
+        options["guard_filter_fn"] = lambda guards: [guard.guard_type != "SHAPE_ENV" for guard in guards]
     return first_sizes_free(torch.compile(own, fullgraph=True, options=options), varying)
-
-
-def without_symbols(guards: Sequence[Any]) -> list[bool]:
-    """Which guards to keep: not those on symbols, which are the number of blocks and where in storage a view begins.
-
-    The former is the same in all arguments of a call, the latter enters no code: arguments are contiguous. Every other
-    size, dtypes, strides and devices are guarded one by one. 32-bit indices suffice: RasterSettings.compiled_values.
-    """
-    return [guard.guard_type != "SHAPE_ENV" for guard in guards]
 
 
 def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[Tensor]:

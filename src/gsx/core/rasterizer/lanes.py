@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import Pairs
+from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.shapes import Float, Int
 
 LANES = 16
@@ -39,20 +39,22 @@ class Lanes:
     """Entry of each pair, pairs sorted by splat."""
 
 
-def lay_out(pairs: Pairs, splats: int, chunk: int, batch: int) -> Lanes:
+def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int) -> Lanes:
     """Lay the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
 
     The first two groups of every `batch` groups get equally many chunks (torch specialises on sizes of one).
     """
-    lengths = pairs.starts.diff()
+    lengths = intersections.starts.diff()
     ranks, tiles = rank_tiles(lengths)
-    counts = chunk_counts(lengths, tiles, chunk, batch)
+    longest = torch.cat([lengths, lengths.new_zeros(1)])[tiles[:, 0]].long()
+    counts = (longest + (chunk - 1)) // chunk  # of each group: those of its first, longest list
+    counts[1::batch] = counts[::batch][: len(counts[1::batch])]
     active = (len(counts) - counts.bincount().cumsum(0))[:-1]
     bases = active.cumsum(0) - active
-    places = entry_places(pairs, ranks, bases, chunk)
+    places = entry_places(intersections, ranks, bases, chunk)
     blocks = int(active.sum())
     entries = places.new_full((blocks * chunk * LANES,), splats)
-    entries.scatter_(0, places.long(), pairs.splats.int())
+    entries.scatter_(0, places.long(), intersections.splats.int())
     chunks = torch.repeat_interleave(active)
     return Lanes(
         tiles=tiles,
@@ -61,7 +63,7 @@ def lay_out(pairs: Pairs, splats: int, chunk: int, batch: int) -> Lanes:
         chunks=chunks,
         active=active.tolist(),
         bases=bases.tolist(),
-        places=torch.empty_like(places).scatter_(0, pairs.slots, places),
+        places=torch.empty_like(places).scatter_(0, intersections.slots, places),
     )
 
 
@@ -76,19 +78,13 @@ def rank_tiles(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor,
     return ranks, tiles.view(groups, LANES)
 
 
-def chunk_counts(lengths: Int[Tensor, "T"], tiles: Int[Tensor, "G L"], chunk: int, batch: int) -> Int[Tensor, "G"]:
-    """Chunks of each group: those of its first, longest list."""
-    longest = torch.cat([lengths, lengths.new_zeros(1)])[tiles[:, 0]].long()
-    counts = (longest + (chunk - 1)) // chunk
-    counts[1::batch] = counts[::batch][: len(counts[1::batch])]
-    return counts
-
-
-def entry_places(pairs: Pairs, ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int) -> Int[Tensor, "P"]:
+def entry_places(
+    intersections: TileIntersections, ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int
+) -> Int[Tensor, "P"]:
     """Place of every pair (sorted by tile) in the flat [S K L] entries; fewer than 2^31, as max_pairs sees to."""
     # per tile: place of a list's first entry but for its chunk, and where the list begins
     lane = (ranks // LANES * chunk * LANES + ranks % LANES).int()
-    lane, begin = torch.stack([lane, pairs.starts[:-1].int()], 1).index_select(0, pairs.tiles).unbind(1)
+    lane, begin = torch.stack([lane, intersections.starts[:-1].int()], 1).index_select(0, intersections.tiles).unbind(1)
     number = torch.arange(len(lane), device=lane.device, dtype=torch.int32) - begin
     step = torch.div(number, chunk, rounding_mode="floor")
     return lane + (number - step * chunk) * LANES + (bases * (chunk * LANES)).int().index_select(0, step)

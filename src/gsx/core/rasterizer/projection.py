@@ -21,8 +21,8 @@ OPACITY_SLACK = 1e-3
 """ln of an opacity may exceed 0 by this, for rounding."""
 SQUARABLE = 0.4
 """Lengths in px stay below this power of their dtype's largest number: 3e15 in float32."""
-LENS_LIMIT = 1e12
-"""No lens has a focal length of so many px, or sees so many focal lengths off its axis."""
+FOCAL_LIMIT = 1e12
+"""No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
 Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
 """`geometry`, compiled or not."""
 
@@ -55,7 +55,7 @@ def intrinsics_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Floa
 
 
 def on_frame(intrinsics: Float[Tensor, "4"], frame: Frame) -> Float[Tensor, "4"]:
-    """The lens with its principal point counted on the frame."""
+    """Intrinsics with the principal point counted on the frame."""
     return intrinsics + intrinsics.new_tensor([0, 0, frame.left, frame.top])
 
 
@@ -79,10 +79,12 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
     """Raise InputError for a camera through which nothing can be projected."""
     fx, fy, cx, cy = intrinsics.tolist()
     words = f"fx={fx}, fy={fy}, cx={cx}, cy={cy}, near={camera.near}"
-    if not (0 < fx < LENS_LIMIT and 0 < fy < LENS_LIMIT and 0 <= camera.near < math.inf):
-        raise InputError(f"a camera has {words}: focal lengths must be in (0, {LENS_LIMIT:g}) px, near at least 0")
-    if not float(steepest_slope(on_frame(intrinsics, camera.frame), camera.frame, margin)) < LENS_LIMIT:
-        raise InputError(f"a camera has {words} and sees {LENS_LIMIT:g} focal lengths off its axis: check its lens")
+    if not (0 < fx < FOCAL_LIMIT and 0 < fy < FOCAL_LIMIT and 0 <= camera.near < math.inf):
+        raise InputError(f"a camera has {words}: focal lengths must be in (0, {FOCAL_LIMIT:g}) px, near at least 0")
+    if not float(steepest_slope(on_frame(intrinsics, camera.frame), camera.frame, margin)) < FOCAL_LIMIT:
+        raise InputError(
+            f"a camera has {words} and sees {FOCAL_LIMIT:g} focal lengths off its axis: check its intrinsics"
+        )
     if not bool(torch.isfinite(camera.rotation).all() & torch.isfinite(camera.translation).all()):
         pose = f"rotation {camera.rotation.tolist()}, translation {camera.translation.tolist()}"
         raise InputError(f"the pose of a camera is not finite: {pose}")
@@ -146,7 +148,9 @@ def project(
     low, high = slope_bounds(intrinsics, camera.frame, margin)
     rotation = camera.rotation.to(scales)
     rules = settings.dilation, settings.compensate
-    means, covariances, conic_factors, gains = geometry_of(settings, ids)(
+    worthwhile = len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type)
+    compute = compiled_geometry(settings.compensate) if worthwhile else geometry
+    means, covariances, conic_factors, compensation = compute(
         points, scales, quats, rotation, intrinsics, low.to(scales), high.to(scales), *rules
     )
     return ScreenSplats(
@@ -155,7 +159,7 @@ def project(
         depths=points[:, 2].to(scales),
         covariances=covariances,
         conic_factors=conic_factors,
-        log_opacities=log_opacities if gains is None else log_opacities + gains,
+        log_opacities=log_opacities if compensation is None else log_opacities + compensation,
         channels=channels,
         dropped=len(good) - int(good.sum()),
     )
@@ -179,13 +183,6 @@ class TakeRows(torch.autograd.Function):
 def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
     """`values[ids]` for ids that are all different."""
     return TakeRows.apply(values, ids)
-
-
-def geometry_of(settings: RasterSettings, ids: Int[Tensor, "M"]) -> Geometry:
-    """`geometry`, compiled where that is asked for, possible, and worth it: in grad mode, of more than one splat."""
-    if len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type):
-        return compiled_geometry(settings.compensate)
-    return geometry
 
 
 @functools.lru_cache

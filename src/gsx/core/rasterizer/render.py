@@ -11,7 +11,7 @@ from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.pairs import Pairs, pair
+from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -56,7 +56,7 @@ class Rendering:
     depth: Float[Tensor, "H W"] | None
     """Blending-weighted sum of camera z, scene units (divide by alpha for a mean); None unless asked for."""
     screen: ScreenStatistics
-    pairs: int
+    intersections: int
     """Splat-tile pairs blended."""
     dropped: int
     """Splats left out because a value of theirs is not finite."""
@@ -66,7 +66,7 @@ def blend(
     screen: ScreenSplats,
     means2d_offset: Float[Tensor, "M 2"],
     channels: Float[Tensor, "M C"],
-    pairs: Pairs,
+    intersections: TileIntersections,
     camera: Camera,
     settings: RasterSettings,
     absgrad: Float[Tensor, "M 2"] | None,
@@ -75,9 +75,9 @@ def blend(
     """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for."""
     inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, channels)
     grid = TileGrid.of(camera, settings.tile_size)
-    if takes(settings, channels.shape[1], len(pairs.splats), max_weight, means2d_offset.device.type):
-        return composite_compiled(*inputs, pairs, grid, settings, absgrad=absgrad), None
-    blocks = make_blocks(pairs, settings.chunk, len(screen.ids))
+    if takes(settings, channels.shape[1], len(intersections.splats), max_weight, means2d_offset.device.type):
+        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
+    blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
     blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
     if by_entry is None:
@@ -107,12 +107,12 @@ def rasterize(
         TooManyPairs: the picture needs more splat-tile pairs than `settings.max_pairs`.
     """
     screen = project(splats, camera, settings, intrinsics)
-    pairs = capped(pair(screen, camera, settings), settings.tile_cap)
+    intersections = capped(intersect_tiles(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
     means2d_offset = torch.zeros_like(screen.means, requires_grad=learning)
     absgrad = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
-    blended, max_weights = blend(screen, means2d_offset, channels, pairs, camera, settings, absgrad, max_weight)
+    blended, max_weights = blend(screen, means2d_offset, channels, intersections, camera, settings, absgrad, max_weight)
     count = splats.colours.shape[1]
     image, alpha = blended[:count], blended[-1]
     if background is not None:
@@ -121,11 +121,11 @@ def rasterize(
         image=image,
         alpha=alpha,
         depth=blended[count] if depth else None,
-        pairs=len(pairs.splats),
+        intersections=len(intersections.splats),
         dropped=screen.dropped,
         screen=ScreenStatistics(
             ids=screen.ids,
-            radii=pairs.radii,
+            radii=intersections.radii,
             means2d_offset=means2d_offset,
             absgrad=absgrad,
             max_weights=max_weights,

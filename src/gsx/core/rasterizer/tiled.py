@@ -75,7 +75,7 @@ def renderings(
     background: Float[Tensor, "C"] | None,
     depth: bool,
 ) -> Iterator[tuple[Window, Rendering]]:
-    """The window's rendering, or those of its halves where it needs too many pairs, and so on down to one tile."""
+    """The window's rendering, or those of its halves where it has too many intersections, and so on to one tile."""
     unit = max(WINDOW_TILE, settings.tile_size)
     try:
         part = rasterize(splats, window.of(camera), settings, background=background, depth=depth)

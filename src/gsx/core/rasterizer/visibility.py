@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.pairs import on_raster, published_radii, published_windows
+from gsx.core.rasterizer.intersections import on_raster, published_radii, published_windows
 from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float

@@ -13,7 +13,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.parameter_table import ParameterTable, finite_rows, keep_rows
+from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.schedule import Schedule
 
 Observation: TypeAlias = dict[str, Tensor]
@@ -159,7 +159,8 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
     Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
     gradients included; nor where nothing would be left.
     """
-    kept = finite_rows(backbone.table)
+    rows = [parameter.detach().reshape(len(parameter), -1) for parameter in backbone.table.parameters.values()]
+    kept = torch.stack([torch.isfinite(values).all(1) for values in rows]).all(0)
     for camera in cameras:
         kept &= drawable_rows(backbone, camera, step)
     if bool(kept.all()) or not bool(kept.any()):
@@ -178,6 +179,6 @@ def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Te
     good = drawable(splats, camera, backbone.raster) & torch.isfinite(splats.scales.prod(1))
     if drawn.rows is None:
         return good
-    everyone = torch.ones(len(table), dtype=torch.bool, device=good.device)
-    found = everyone.index_fill(0, drawn.rows[~good], False)
-    return everyone if table.networks is not None and not bool(found[drawn.rows].any()) else found
+    all_rows = torch.ones(len(table), dtype=torch.bool, device=good.device)
+    found = all_rows.index_fill(0, drawn.rows[~good], False)
+    return all_rows if table.networks is not None and not bool(found[drawn.rows].any()) else found

@@ -143,7 +143,7 @@ class Tally:
             logger.warning("%s: %d of %d pictures kept although %s", self.name, len(strays), len(drawn), first)
         return counts
 
-    def told(self, step: int) -> dict[str, Any]:
+    def account_at(self, step: int) -> dict[str, Any]:
         """The account of the pictures asked for at this step; empty where there were none.
 
         Raises:

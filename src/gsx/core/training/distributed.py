@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from gsx.core.errors import ConfigError, TrainingError, first_line
+from gsx.core.errors import TrainingError, first_line
 
 T = TypeVar("T")
 
@@ -93,17 +93,12 @@ class Joined(Ranks):
             empty = [{name: torch.empty(*of[:1], dtype=of[1], device=device) for name, of in p.items()} for p in listed]
             held = list(parts) if rank == self.rank else empty
             for part in held:
-                spread(part, rank)
+                for name, tensor in part.items():
+                    part[name] = tensor.contiguous()
+                    if tensor.numel():
+                        dist.broadcast(part[name], rank)
             out += held
         return out
-
-
-def spread(part: dict[str, Tensor], source: int) -> None:
-    """Fill tensors on every rank with those of one."""
-    for name, tensor in part.items():
-        part[name] = tensor.contiguous()
-        if tensor.numel():
-            dist.broadcast(part[name], source)
 
 
 # -- coming and going --------------------------------------------------------------------------------------------------
@@ -122,30 +117,6 @@ def ranks_here() -> Ranks:
     if not (dist.is_available() and dist.is_initialized()):
         return Ranks()
     return Joined(rank=dist.get_rank(), size=dist.get_world_size())
-
-
-def placed(device: torch.device) -> torch.device:
-    """The device of this rank: of several GPUs each rank has its own.
-
-    Raises:
-        ConfigError: there are fewer GPUs than ranks on this machine.
-    """
-    if device.type != "cuda" or ranks_here().size == 1:
-        return device
-    own, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
-    if own >= count:
-        raise ConfigError(f"process {own} of this machine has no GPU, there are {count}: --nproc-per-node {count}")
-    torch.cuda.set_device(own)
-    return torch.device("cuda", own)
-
-
-def refuse_uneven(batch: int, ranks: Ranks) -> None:
-    """Raise ConfigError for a batch that the ranks cannot share."""
-    if batch % ranks.size:
-        raise ConfigError(
-            f"training.batch is {batch}, and {ranks.size} processes share its views: give a multiple of {ranks.size}, "
-            f"for example training.batch={-(-batch // ranks.size) * ranks.size}"
-        )
 
 
 def as_one(action: Callable[[], int], explained: Callable[[BaseException], int]) -> NoReturn:

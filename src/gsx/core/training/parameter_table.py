@@ -137,12 +137,6 @@ def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
     edit(table, name, lambda old: values, torch.zeros_like)
 
 
-def finite_rows(table: ParameterTable) -> Bool[Tensor, "N"]:
-    """Rows whose parameters are finite in every value."""
-    flat = [parameter.detach().reshape(len(parameter), -1) for parameter in table.parameters.values()]
-    return torch.stack([torch.isfinite(values).all(1) for values in flat]).all(0)
-
-
 def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
     """Adam's step count and moments of one parameter, by the names they are saved under; none before its first step."""
     return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
@@ -215,6 +209,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     Raises:
         CheckpointError: something of it was not saved: the run had other options.
     """
+    tensors = {name.replace("sh_constant", "sh_dc"): value for name, value in tensors.items()}  # as it was called once
     found = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
     device = next(iter(like.parameters.values())).device
     rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}

@@ -90,18 +90,12 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
             f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
         }
         entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
-        listed.append(entry | {"camera": intrinsics(view.camera), "reduction": asdict(view.reduction)})
+        numbers = {name: getattr(view.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")}
+        frame = view.camera.cut_from
+        numbers["cut_from"] = None if frame is None else [frame.left, frame.top, frame.width, frame.height]
+        listed.append(entry | {"camera": numbers, "reduction": asdict(view.reduction)})
     text = json.dumps({"facts": facts, "views": listed})
     replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
-
-
-def intrinsics(camera: Camera) -> dict[str, Any]:
-    """Everything of a camera but its pose, as plain values."""
-    frame = camera.cut_from
-    return {
-        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")},
-        "cut_from": None if frame is None else [frame.left, frame.top, frame.width, frame.height],
-    }
 
 
 def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
@@ -119,24 +113,21 @@ def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
         raise ValueError(str(error)) from error
-    return [view_of(number, entry, tensors) for number, entry in enumerate(content["views"])], content["facts"]
-
-
-def view_of(number: int, entry: dict[str, Any], tensors: dict[str, Tensor]) -> PseudoView:
-    """One view of a file."""
-    values = dict(entry["camera"])
-    frame = values.pop("cut_from")
-    corner = None if frame is None else Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])
-    camera = Camera(
-        rotation=tensors[f"{number}.rotation"], translation=tensors[f"{number}.translation"], cut_from=corner, **values
-    )
-    return PseudoView(
-        camera=camera,
-        target=tensors[f"{number}.target"],
-        parent=entry["parent"],
-        pixel_weight=tensors.get(f"{number}.trust"),
-        coarse=tensors.get(f"{number}.coarse"),
-        coarse_weight=entry["coarse_weight"],
-        reduction=Reduction(**entry.get("reduction", {})),
-        provenance=entry["provenance"],
-    )
+    views = []
+    for number, entry in enumerate(content["views"]):
+        values = dict(entry["camera"])
+        if (frame := values.pop("cut_from")) is not None:
+            values["cut_from"] = Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])
+        pose = {name: tensors[f"{number}.{name}"] for name in ("rotation", "translation")}
+        view = PseudoView(
+            camera=Camera(**pose, **values),
+            target=tensors[f"{number}.target"],
+            parent=entry["parent"],
+            pixel_weight=tensors.get(f"{number}.trust"),
+            coarse=tensors.get(f"{number}.coarse"),
+            coarse_weight=entry["coarse_weight"],
+            reduction=Reduction(**entry.get("reduction", {})),
+            provenance=entry["provenance"],
+        )
+        views.append(view)
+    return views, content["facts"]

@@ -83,7 +83,7 @@ def backward(run: Run) -> Step:
             with gradients_added(run.backbone.table):
                 given = [term for term in terms if term is not None]
                 steps.append(view_loss(run, number, run.scene.train[view], given, colour))
-        told = {tally.name: tally.told(number) for tally in run.tallies}
+        told = {tally.name: tally.account_at(number) for tally in run.tallies}
         steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
         return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
 

@@ -1,4 +1,4 @@
-"""Runs with augmenters against their control: the same composition and seed without any, on held-out real pixels."""
+"""Runs with augmenters against their baseline: the same composition and seed without any, on held-out real pixels."""
 
 import json
 import statistics
@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsx.experiments.run_folder.files import RunFiles, is_number, part
-from gsx.experiments.run_folder.run_key import JUDGING, NAMES, WHERE
+from gsx.experiments.run_folder.run_key import EVALUATION, NAMES, WHERE
 
-BESIDE = (*WHERE, *NAMES, *JUDGING, "augmenter", "regenerator", "seed")
-"""Keys in which a run may differ from its control, and runs of one comparison from each other (the seed)."""
+BESIDE = (*WHERE, *NAMES, *EVALUATION, "augmenter", "regenerator", "seed")
+"""Keys in which a run may differ from its baseline, and runs of one comparison from each other (the seed)."""
 
 
 @dataclass(kw_only=True)
 class Comparison:
-    """What an augmentation gains over the control: differences of each seed, dB."""
+    """What an augmentation gains over the baseline: differences of each seed, dB."""
 
     scene: str
     backbone: str
@@ -25,19 +25,19 @@ class Comparison:
     gains: dict[str, list[float]] = field(default_factory=dict)
     """By zoom."""
     cost: list[float] = field(default_factory=list)
-    """Training time over that of the control."""
+    """Training time over that of the baseline."""
     seeds: list[int] = field(default_factory=list)
 
 
 def compared(runs: Sequence[RunFiles]) -> list[Comparison]:
-    """Every augmentation that has a control among the runs, in the order of the runs."""
-    controls = {
+    """Every augmentation that has a baseline among the runs, in the order of the runs."""
+    baselines = {
         (key_of(run), seed_of(run)): run for run in runs if run.evaluation and not part(run.config, "augmenter")
     }
     found: dict[tuple[str, str], Comparison] = {}
     for run in runs:
-        control = controls.get((key_of(run), seed_of(run)))
-        if control is None or not run.evaluation or not part(run.config, "augmenter"):
+        baseline = baselines.get((key_of(run), seed_of(run)))
+        if baseline is None or not run.evaluation or not part(run.config, "augmenter"):
             continue
         choice = json.dumps([run.config.get("augmenter"), run.config.get("regenerator")], sort_keys=True)
         names = " + ".join(map(str, part(run.config, "augmenter")))
@@ -45,7 +45,7 @@ def compared(runs: Sequence[RunFiles]) -> list[Comparison]:
             (key_of(run), choice),
             Comparison(scene=run.scene, backbone=run.backbone.split(" + ")[0], augmenters=names, told=""),
         )
-        add(entry, run, control)
+        add(entry, run, baseline)
     told(found)
     return list(found.values())
 
@@ -62,13 +62,13 @@ def seed_of(run: RunFiles) -> int:
     return int(seed) if is_number(seed) else 0
 
 
-def add(entry: Comparison, run: RunFiles, control: RunFiles) -> None:
+def add(entry: Comparison, run: RunFiles, baseline: RunFiles) -> None:
     """Count one pair of runs in."""
     for factor, figures in zooms(run).items():
-        other = zooms(control).get(factor)
+        other = zooms(baseline).get(factor)
         if other is not None:
             entry.gains.setdefault(factor, []).append(figures - other)
-    own, other_own = (files.evaluation.get("train_seconds") for files in (run, control))
+    own, other_own = (files.evaluation.get("train_seconds") for files in (run, baseline))
     if is_number(own) and is_number(other_own) and other_own > 0:
         entry.cost.append(own / other_own)
     entry.seeds.append(seed_of(run))
@@ -104,7 +104,7 @@ def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
     return [(prefix, node)]
 
 
-def control_rows(runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
+def baseline_rows(runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
     """The comparisons as the template shows them: mean gain and spread over the seeds, by zoom."""
     return [
         {

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
-from gsx.experiments.reports.baselines import control_rows
+from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
 from gsx.experiments.reports.side_by_side import pictures_of
@@ -39,7 +39,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         InputError: there is no run below it.
     """
     runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
-    rows, controls = overview_rows(folder, runs), control_rows(runs)
+    rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
     replace_file(folder / "report.csv", csv_of(rows).encode())
     context = {
@@ -50,8 +50,8 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
         "mixed": mixed_protocols(rows),
         "groups": [compared_runs(group) | {"pictures": pictures_of(group, folder)} for group in groups],
-        "controls": controls,
-        "control_zooms": sorted({factor for entry in controls for factor in entry["gains"]}, key=float),
+        "baselines": baselines,
+        "baseline_zooms": sorted({factor for entry in baselines for factor in entry["gains"]}, key=float),
         "any_lpips": any(is_number(row["lpips"]) for row in rows),
     }
     path = folder / "report.html"

@@ -23,16 +23,16 @@ class GeneralOptions:
     reuse: bool = without_effect(default=False)
     """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
     init: str = without_effect(default="scratch")
-    """scratch, or trunk: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
-    trunk_at: list[int] = without_effect(default_factory=list)
+    """scratch, or warm_start: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
+    warm_start_at: list[int] = without_effect(default_factory=list)
     """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
-    trunk_gb: float = without_effect(default=10.0)
+    warm_start_gb: float = without_effect(default=10.0)
     """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
 
     def __post_init__(self) -> None:
-        if self.init not in ("scratch", "trunk"):
-            raise ValueError(f"init is '{self.init}'; choose scratch or trunk")
+        if self.init not in ("scratch", "warm_start"):
+            raise ValueError(f"init is '{self.init}'; choose scratch or warm_start")
         if self.reuse and self.folder:
             raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")
-        if not self.trunk_gb >= 0:
-            raise ValueError(f"trunk_gb is {self.trunk_gb}; give 10^9 bytes from 0")
+        if not self.warm_start_gb >= 0:
+            raise ValueError(f"warm_start_gb is {self.warm_start_gb}; give 10^9 bytes from 0")

@@ -6,18 +6,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from gsx.core.cache import content_key, tree_stamp
+from gsx.core.cache import content_key
 from gsx.core.errors import InputError
 from gsx.core.locks import lock
 from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions
+from gsx.experiments.run_folder.stamps import tree_stamp
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
 """Keys that say where and how a run is carried out."""
 NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 """Keys that name what other keys hold."""
-JUDGING = ("eval", "metrics")
+EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
 
 
@@ -27,7 +28,7 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     `idle`: dotted keys that their options say to have no effect. The folder of a scene is among them: what lies there
     counts.
     """
-    kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *JUDGING)}
+    kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *EVALUATION)}
     return kept | {"regenerator": asked_for(kept)}
 
 
@@ -108,18 +109,18 @@ def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
     return output / re.sub(r"[^\w.-]", "_", name) / backbone / composition_key(config, stamp, idle)
 
 
-def judging(config: dict[str, Any]) -> dict[str, Any]:
-    """How a composition wants to be judged; saved with every evaluation."""
-    return {key: config.get(key) for key in JUDGING}
+def evaluation_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """How a composition is to be evaluated; saved with every evaluation (once as `judged`)."""
+    return {key: config.get(key) for key in EVALUATION}
 
 
 def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collection[str]) -> bool:
     """Whether a run folder holds all that a composition asks for: trained to the end, just so and on a scene of that
-    stamp, and judged the same."""
+    stamp, and evaluated the same."""
     return (
         files.status.get("state") == "ok"
         and files.evaluation.get("step") == config["iterations"]
-        and files.evaluation.get("judged") == judging(config)
+        and files.evaluation.get("settings", files.evaluation.get("judged")) == evaluation_settings(config)
         and composition_key(files.config, trained_on(files), idle) == composition_key(config, stamp, idle)
     )
 

@@ -13,7 +13,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
-from gsx.core.training.distributed import placed, ranks_here, refuse_uneven
+from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
 from gsx.experiments.runs.halves import held_out_renders
@@ -32,6 +32,30 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device is cuda, but this torch finds no CUDA device: use device=cpu or device=auto")
     return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+
+
+def placed(device: torch.device) -> torch.device:
+    """The device of this rank: of several GPUs each rank has its own.
+
+    Raises:
+        ConfigError: there are fewer GPUs than ranks on this machine.
+    """
+    if device.type != "cuda" or ranks_here().size == 1:
+        return device
+    own, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    if own >= count:
+        raise ConfigError(f"process {own} of this machine has no GPU, there are {count}: --nproc-per-node {count}")
+    torch.cuda.set_device(own)
+    return torch.device("cuda", own)
+
+
+def refuse_uneven(batch: int, ranks: Ranks) -> None:
+    """Raise ConfigError for a batch that the ranks cannot share."""
+    if batch % ranks.size:
+        raise ConfigError(
+            f"training.batch is {batch}, and {ranks.size} processes share its views: give a multiple of {ranks.size}, "
+            f"for example training.batch={-(-batch // ranks.size) * ranks.size}"
+        )
 
 
 def build(settings: Settings, scene: Scene, folder: Path, training: bool = False) -> Run:

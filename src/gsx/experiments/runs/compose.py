@@ -11,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.plugins import Plugins
-from gsx.experiments.runs.settings import Settings, dotted, settings_from
+from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
 OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
 OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
@@ -210,7 +210,7 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
     known = known_keys(overrides)
     if key in known:  # a mapping that is open, such as arguments of a function
         return f"'{key}' takes its entries one by one: '+{key}.NAME=VALUE'"
-    return f"'{key}' is no configuration key.{nearest(key, known) or ' `gsx --cfg job` lists all keys.'}"
+    return f"'{key}' is no configuration key.{right_key(key, known) or ' `gsx --cfg job` lists all keys.'}"
 
 
 def known_keys(overrides: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import read_run
-from gsx.experiments.run_folder.run_key import judging
+from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
 from gsx.experiments.runs.settings import Settings
@@ -26,7 +26,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
     pictures.write_index()
     write_pseudo_pictures(run, options)
-    evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "judged": judging(settings.resolved)}
+    evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
     tell_of_paths(read_run(run.folder).evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:

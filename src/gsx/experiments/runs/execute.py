@@ -68,7 +68,9 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     ]  # trackers read the log
     if run.warm_starts is not None:
         general = settings.general
-        listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.trunk_gb * 1e9, general.trunk_at))
+        listeners.append(
+            warm_start.WarmStartKeeper(run.warm_starts, general.warm_start_gb * 1e9, general.warm_start_at)
+        )
     try:
         with plugins.listening(listeners), telling_of_failure(run, plugins):
             train(run, plugins)

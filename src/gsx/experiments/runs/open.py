@@ -15,7 +15,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.lpips import load_lpips
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
-from gsx.core.training.distributed import ranks_here, refuse_uneven
+from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import RunFiles, read_run
 from gsx.experiments.run_folder.run_key import (
@@ -27,7 +27,7 @@ from gsx.experiments.run_folder.run_key import (
     trained_on,
 )
 from gsx.experiments.runs import warm_start
-from gsx.experiments.runs.build import build, choose_device
+from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
@@ -88,12 +88,12 @@ def start(settings: Settings, plugins: Plugins) -> Run:
 
 
 def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
-    """The folder of a new run, with what is known before its first step; `init=trunk`: at a state it branches from."""
+    """The folder of a new run, with what is known before its first step; `init=warm_start`: at the state of another."""
     run.folder = new_folder(settings, run.scene)
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
         write_json(run.folder / "environment.json", environment(run, plugins))
-        if settings.general.init == "trunk":
+        if settings.general.init == "warm_start":
             run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
             warm_start.adopt(run, run.warm_starts)
             run.curves = read_curves(run.folder)
@@ -156,7 +156,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[P
         return folder, start(at_hand, plugins)
     logger.info("going on with %s at step %d", folder, run.step)
     write_config(folder / "config.yaml", settings.resolved)
-    if settings.general.init == "trunk":
+    if settings.general.init == "warm_start":
         run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
     return folder, run
 

@@ -167,7 +167,7 @@ class MetricsLog:
             "loss": float(step.loss),
             "psnr": step.psnr(),
             "primitives": len(run.backbone.table),
-            "pairs": step.rendering.pairs,
+            "pairs": step.rendering.intersections,
             "memory_mb": None if memory is None else round(memory, 1),
             **({"terms": step.terms} if step.terms else {}),
             **({"pseudo": step.pseudo} if step.pseudo else {}),

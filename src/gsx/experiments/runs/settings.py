@@ -1,7 +1,7 @@
 """A composed configuration, checked against typed schemas: mistakes get the nearest match. No Hydra here."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.options import idle_keys
+from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.checked_regenerator import Checks, WithChecks
@@ -19,6 +19,8 @@ from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
 
+RENAMED = {"trunk_at": "warm_start_at", "trunk_gb": "warm_start_gb", "sh_constant": "sh_dc"}
+"""Keys by which run folders of older versions call what has another name now."""
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""
 
@@ -146,6 +148,11 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     )
 
 
+def idle_keys(options: dict[str, type]) -> frozenset[str]:
+    """Dotted keys of a composition that change nothing of what is trained; `options`: schemas by key."""
+    return frozenset[str]().union(*(fields_with("none", schema, f"{key}.") for key, schema in options.items()))
+
+
 def refuse_unknown_roles(config: Any) -> None:
     """Raise ConfigError if an augmenter that checks pictures takes the role of no regenerator."""
     raw = OmegaConf.to_container(config, resolve=False)
@@ -224,8 +231,14 @@ def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
     key = ".".join(part for part in (path, inner) if part)
     if type(error).__name__ == "ConfigKeyError":
         options = [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)]
-        return f"'{key}' is no configuration key.{nearest(key, options)}"
+        return f"'{key}' is no configuration key.{right_key(key, options)}"
     return f"{key}: {first_line(error)}"
+
+
+def right_key(key: str, known: Iterable[str]) -> str:
+    """` It is now called 'x'.` for a key of older versions, else ` Did you mean 'x'?` or nothing."""
+    before, dot, last = key.rpartition(".")
+    return f" It is now called '{before}{dot}{RENAMED[last]}'." if last in RENAMED else nearest(key, known)
 
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
@@ -258,7 +271,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or key not in known:
-            raise ConfigError(f"'{key}' is no key of {path}.{nearest(key, known)}")
+            raise ConfigError(f"'{key}' is no key of {path}.{right_key(key, known)}")
         try:
             OmegaConf.update(config, key, OmegaConf.select(OmegaConf.create(f"value: {value}"), "value"))
         except Exception as error:  # the YAML parser has its own family of errors
@@ -267,13 +280,14 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 
 
 def add_newer_settings(config: Any) -> None:
-    """Give the configuration of an older gsx what it does not know, as older runs had it.
+    """Give the configuration of an older gsx what it does not know, as older runs had it, and keys their new names.
 
     Settings of the rasterizer at their defaults; checks of redrawn pictures, which were the strict ones; the gate of
     `clone_split`, which was a yes or no beside its numbers.
     """
     if not isinstance(config, DictConfig):
         return
+    give_new_names(config)
     if isinstance(config.get("rasterizer"), DictConfig):
         config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
     augmenters = config.get("augmenter")
@@ -285,6 +299,17 @@ def add_newer_settings(config: Any) -> None:
         waits = density.pop("gate")
         if config.backbone.densification == "clone_split":
             OmegaConf.update(config, "backbone.quirks.gate", "closed" if waits else "open", force_add=True)
+
+
+def give_new_names(config: DictConfig) -> None:
+    """Rename keys in place, at any depth; `init=trunk` is `init=warm_start`."""
+    if config.get("init") == "trunk":
+        config.init = "warm_start"
+    for key in list(config):
+        if isinstance(config._get_node(key), DictConfig):
+            give_new_names(config[key])
+        if key in RENAMED:
+            config[RENAMED[key]] = config.pop(key)
 
 
 def strict_node() -> Any:

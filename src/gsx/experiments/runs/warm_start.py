@@ -1,6 +1,6 @@
 """What runs have in common until the first of them makes pseudo views: trained once, kept, and branched from.
 
-With `init=trunk` a run starts from the latest state that an earlier run of the same composition, but for its
+With `init=warm_start` a run starts from the latest state that an earlier run of the same composition, but for its
 augmenters, has left behind, and leaves states for later ones. The result is bit for bit that of a run from scratch.
 """
 
@@ -48,7 +48,7 @@ def warm_start_folder(run: Run, plugins: Mapping[str, str]) -> Path:
         sorted(plugins.items()),
         machine,
     )
-    return cache_folder("trunks", content_key(*parts))
+    return cache_folder("warm_starts", content_key(*parts))
 
 
 def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def adopt(run: Run, folder: Path) -> None:
             logger.warning("%s", error)
             continue
         return
-    logger.info("init=trunk: no earlier run of this composition to branch from; its states will be kept")
+    logger.info("init=warm_start: no earlier run of this composition to branch from; its states will be kept")
 
 
 def branch(run: Run, sidecar: Path) -> None:
@@ -92,7 +92,7 @@ def branch(run: Run, sidecar: Path) -> None:
     (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
     checkpoint.restore(run)
     write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
-    logger.info("init=trunk: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
+    logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
 
 
 def default_steps(run: Run) -> set[int]:
@@ -121,7 +121,7 @@ class WarmStartKeeper:
         try:
             self.keep(run)
         except (OSError, InputError) as error:
-            logger.warning("init=trunk: the state of step %d is not kept (%s)", run.step, error)
+            logger.warning("init=warm_start: the state of step %d is not kept (%s)", run.step, error)
 
     def keep(self, run: Run) -> None:
         """Write the state where other runs look for it."""
@@ -130,4 +130,4 @@ class WarmStartKeeper:
             return
         write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
         checkpoint.write(run, folder)
-        trim("trunks", self.budget, folder)
+        trim("warm_starts", self.budget, folder)

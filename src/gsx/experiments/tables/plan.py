@@ -1,8 +1,8 @@
 """From a table to runs: which there are, which are done, and which have a beginning in common.
 
 Runs of one scene, backbone and seed that differ in their augmenters alone are identical until the first of them makes
-pseudo views. One of each such group, the one that goes on longest without (the control, where there is one), is trained
-first and leaves its state wherever another of them sets out; the others branch from there (`runs.warm_start`).
+pseudo views. One of each such group, the one that goes on longest without (the baseline, where there is one), is
+trained first and leaves its state wherever another of them sets out; the others branch from there (`runs.warm_start`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -190,10 +190,10 @@ def with_states(cell: Cell, others: Sequence[Cell]) -> list[str]:
     steps = sorted({other.begins for other in others if 0 < other.begins < other.settings.general.iterations})
     if not steps:
         return [*cell.overrides, "init=scratch"]
-    return [*cell.overrides, "init=trunk", f"trunk_at=[{','.join(map(str, steps))}]"]
+    return [*cell.overrides, "init=warm_start", f"warm_start_at=[{','.join(map(str, steps))}]"]
 
 
-def told(plan: Plan) -> list[str]:
+def plan_lines(plan: Plan) -> list[str]:
     """The plan in words."""
     runs = sum(map(len, plan.phases))
     rows, seeds = len(plan.experiment.chosen), len(plan.experiment.seeds)

@@ -15,7 +15,7 @@ from gsx.experiments.run_folder.run_key import sorted_items
 from gsx.experiments.runs.compose import Compositions, parse_overrides
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
-from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, planned, told
+from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned
 from gsx.experiments.tables.published import read_table
 from gsx.experiments.tables.table import Table, protocol_differences, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
@@ -30,7 +30,7 @@ TAKEN = {
     "dataset.scene": "experiment.scenes=[NAME,...] chooses scenes",
     "reuse": "leave it out",
     "init": "leave it out",
-    "trunk_at": "leave it out",
+    "warm_start_at": "leave it out",
     "folder": "output=FOLDER",
 }
 """Keys that are set for each run, and what to say instead."""
@@ -48,12 +48,12 @@ def is_below_dataset(word: str) -> bool:
     return word.lstrip("+~").startswith("dataset.")
 
 
-def is_table(words: Sequence[str]) -> bool:
+def is_table(overrides: Sequence[str]) -> bool:
     """Whether a command line asks for a table."""
-    return any(word.lstrip("+").startswith("experiment=") for word in words)
+    return any(word.lstrip("+").startswith("experiment=") for word in overrides)
 
 
-def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any]) -> tuple[str, int]:
+def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], Any]) -> tuple[str, int]:
     """Run what is missing of a table; returns its text and the exit code: 2 if figures are missing.
 
     `job` carries out one composition.
@@ -61,15 +61,15 @@ def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any])
     Raises:
         ConfigError: an experiment, dataset or override is wrong; nothing was run.
     """
-    words = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in words]
-    common = [word for word in words if key_of(word) not in OWN or is_below_dataset(word)]
-    launching = [word for word in words if key_of(word) == "hydra"]
+    overrides = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in overrides]
+    common = [word for word in overrides if key_of(word) not in OWN or is_below_dataset(word)]
+    launching = [word for word in overrides if key_of(word) == "hydra"]
     with Compositions(plugins) as compositions:
         refuse_sweeps(common)
         refuse_taken(common)
-        chosen = [word for word in words if key_of(word) == "experiment"]
+        chosen = [word for word in overrides if key_of(word) == "experiment"]
         experiment = experiment_of([*chosen, *launching], compositions)
-        datasets = datasets_of(experiment, words, compositions)
+        datasets = datasets_of(experiment, overrides, compositions)
         check_scenes(experiment, datasets)
         fitting = fitting_words(experiment, list(datasets), common, compositions)
         cells = list(cells_of(experiment, datasets, fitting.__getitem__, compositions.settings))
@@ -92,14 +92,14 @@ def run_table(words: Sequence[str], plugins: Plugins, job: Callable[[Any], Any])
 
 def launched(
     compositions: Compositions,
-    words: Sequence[str],
+    overrides: Sequence[str],
     folder: Path,
     jobs: Sequence[Sequence[str]],
     job: Callable[[Any], Any],
 ) -> None:
     """Carry out a phase. A launcher that gives up, for one killed process perhaps, does not cost the table."""
     try:
-        compositions.launch(words, folder, jobs, job)
+        compositions.launch(overrides, folder, jobs, job)
     except Exception as error:
         logger.warning(
             "the launcher gave up (%s: %s): give the same command again for what is missing",
@@ -108,22 +108,22 @@ def launched(
         )
 
 
-def experiment_of(words: Sequence[str], compositions: Compositions) -> Experiment:
-    """The table that these words choose and change."""
-    experiment: Experiment = typed(Experiment, compositions.node(words, "experiment"), "experiment")
+def experiment_of(overrides: Sequence[str], compositions: Compositions) -> Experiment:
+    """The table that these overrides choose and change."""
+    experiment: Experiment = typed(Experiment, compositions.node(overrides, "experiment"), "experiment")
     return experiment
 
 
 def fitting_words(
-    experiment: Experiment, datasets: Sequence[str], words: Sequence[str], compositions: Compositions
+    experiment: Experiment, datasets: Sequence[str], overrides: Sequence[str], compositions: Compositions
 ) -> dict[str, list[str]]:
     """The overrides of each variant: those of a component (PARTS) only where the variant has such a key.
 
     Raises:
         ConfigError: no variant has it.
     """
-    particular = [word for word in words if key_of(word) in PARTS and "." in word.partition("=")[0]]
-    others = [word for word in words if word not in particular]
+    particular = [word for word in overrides if key_of(word) in PARTS and "." in word.partition("=")[0]]
+    others = [word for word in overrides if word not in particular]
     variants = set(experiment.chosen.values())
     known = {v: compositions.keys([f"dataset={datasets[0]}", f"variant={v}", *others]) for v in variants if particular}
     every = sorted({key for keys in known.values() for key in keys})
@@ -134,30 +134,30 @@ def fitting_words(
     def fits(word: str, variant: str) -> bool:
         return word not in particular or word.startswith(("+", "~")) or word.partition("=")[0] in known[variant]
 
-    return {variant: [word for word in words if fits(word, variant)] for variant in variants}
+    return {variant: [word for word in overrides if fits(word, variant)] for variant in variants}
 
 
-def refuse_taken(words: Sequence[str]) -> None:
-    """Raise ConfigError for words that each run of a table has of its own."""
-    for word in words:
+def refuse_taken(overrides: Sequence[str]) -> None:
+    """Raise ConfigError for overrides that each run of a table has of its own."""
+    for word in overrides:
         key = word.lstrip("+~").partition("=")[0]
         if key in TAKEN or word.startswith("~dataset"):
             remedy = TAKEN.get(key, "experiment.scenes=[NAME,...] chooses scenes")
             raise ConfigError(f"'{word}' is not for tables, whose runs have it of their own: {remedy}")
 
 
-def refuse_sweeps(words: Sequence[str]) -> None:
-    """Raise ConfigError for words that ask for several values: a table has rows, scenes and seeds for that."""
-    for override in parse_overrides(words):
+def refuse_sweeps(overrides: Sequence[str]) -> None:
+    """Raise ConfigError for overrides that ask for several values: a table has rows, scenes and seeds for that."""
+    for override in parse_overrides(overrides):
         if override.is_sweep_override():
             remedy = "experiment.seeds=[0,1,2]" if override.key_or_group == "seed" else "another table"
             raise ConfigError(f"'{override.input_line}' asks for several values, which a table does not take: {remedy}")
 
 
-def datasets_of(experiment: Experiment, words: Sequence[str], compositions: Compositions) -> dict[str, Any]:
+def datasets_of(experiment: Experiment, overrides: Sequence[str], compositions: Compositions) -> dict[str, Any]:
     """The datasets of a table as composed, by name: that of the command line, or the paper's."""
-    asked = [word.partition("=")[2] for word in words if word.startswith("dataset=")]
-    below = [word for word in words if is_below_dataset(word)]
+    asked = [word.partition("=")[2] for word in overrides if word.startswith("dataset=")]
+    below = [word for word in overrides if is_below_dataset(word)]
     names = asked[-1:] or experiment.datasets
     return {name: compositions.node([f"dataset={name}", *below], "dataset") for name in names}
 
@@ -193,7 +193,7 @@ def folder_of(plan: Plan, plain: Experiment, config: dict[str, Any], common: Seq
 
 def tell(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:
     """Say what is about to happen."""
-    for line in told(plan):
+    for line in plan_lines(plan):
         logger.info("%s", line)
     for reason in dict.fromkeys(lacking.values()):
         logger.warning("not run: %s (`gsx datasets` says where to get it)", reason)

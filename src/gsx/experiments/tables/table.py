@@ -353,7 +353,7 @@ def listed(values: Sequence[str]) -> str:
 
 def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:
     """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
-    mine, theirs = (comparable(judged(config, idle)) for config in (own, paper))
+    mine, theirs = (comparable(protocol_settings(config, idle)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
     for key in dict.fromkeys([*mine, *theirs]):
         inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)
@@ -361,7 +361,7 @@ def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) 
             yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
 
 
-def judged(config: dict[str, Any], idle: frozenset[str]) -> dict[str, Any]:
+def protocol_settings(config: dict[str, Any], idle: frozenset[str]) -> dict[str, Any]:
     """What of a composition makes its protocol: all but where it runs, its seed, and which zooms are looked at."""
     known = without(config, idle)
     kept = {key: value for key, value in known.items() if key not in (*WHERE, *NAMES, "seed")}

@@ -86,7 +86,7 @@ def draw(
     rendering = rasterize(Splats(**leaves), camera, settings, background=background)
     rendering.image.backward(weights.to(rendering.image))
     gradients = {name: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for name, leaf in leaves.items()}
-    return Drawn(image=rendering.image.detach(), gradients=gradients, pairs=rendering.pairs)
+    return Drawn(image=rendering.image.detach(), gradients=gradients, pairs=rendering.intersections)
 
 
 def random_weights(camera: Camera, seed: int) -> Float[Tensor, "3 H W"]:

@@ -1,7 +1,7 @@
 """Which splats reach which tiles, front to back. Nothing here is differentiated.
 
 A splat is cut into its rows of tiles; on each row the ellipse alpha >= alpha_min spans an exact interval of columns, so
-no candidate is made that is not a pair. Screen splats come nearest first, hence so do the pairs, and one stable sort
+no candidate is made that is none. Screen splats come nearest first, hence so do the intersections, and one stable sort
 by tile keeps them so.
 """
 
@@ -20,13 +20,13 @@ from gsx.core.shapes import Bool, Float, Int
 
 FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""
-REACH_SLACK = 1e-3
+CUTOFF_SLACK = 1e-3
 """Added to ln(alpha / alpha_min) when tiles are chosen, so that rounding never drops a pixel at the cut-off."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pairs:
-    """P splat-tile pairs sorted by tile, within a tile by depth."""
+class TileIntersections:
+    """P intersections of splats and tiles, sorted by tile, within a tile by depth."""
 
     splats: Int[Tensor, "P"]
     """Row of the screen splat."""
@@ -70,9 +70,9 @@ def on_raster(first: Int[Tensor, "M 2"], last: Int[Tensor, "M 2"], camera: Camer
     return (last.minimum(corner + size) > first.maximum(corner)).all(1)
 
 
-def reach(log_opacities: Float[Tensor, "M"], alpha_min: float) -> Float[Tensor, "M"]:
+def cutoff(log_opacities: Float[Tensor, "M"], alpha_min: float) -> Float[Tensor, "M"]:
     """Largest value of s^2 + r^2 at which alpha is still at least alpha_min; negative: nowhere."""
-    return log_opacities - math.log(alpha_min) + REACH_SLACK
+    return log_opacities - math.log(alpha_min) + CUTOFF_SLACK
 
 
 def tile_ranges(
@@ -120,7 +120,7 @@ def row_spans(
     return first, torch.where(low <= high, last, first)
 
 
-def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pairs:
+def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
     """Pairs of every splat with every tile where its alpha may reach alpha_min.
 
     Raises:
@@ -128,7 +128,7 @@ def pair(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Pair
     """
     with torch.no_grad():
         grid = TileGrid.of(camera, settings.tile_size)
-        limits = reach(screen.log_opacities, settings.alpha_min)
+        limits = cutoff(screen.log_opacities, settings.alpha_min)
         radii = published_radii(screen.covariances)
         window_first, window_last = published_windows(screen.means, radii, camera.frame)
         first, last = tile_ranges(screen, limits, grid)
@@ -148,8 +148,8 @@ def reached_tiles(
     grid: TileGrid,
     settings: RasterSettings,
     radii: Int[Tensor, "M"],
-) -> Pairs:
-    """The pairs, given each splat's box of tiles (first, past the last)."""
+) -> TileIntersections:
+    """The intersections, given each splat's box of tiles (first, past the last)."""
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = torch.argsort(bits, stable=True)
@@ -177,8 +177,8 @@ def sorted_pairs(
     widths: Int[Tensor, "R"],
     grid: TileGrid,
     radii: Int[Tensor, "M"],
-) -> Pairs:
-    """Expand spans of `widths` tiles from column `begin` of a tile row into pairs, and sort them by tile."""
+) -> TileIntersections:
+    """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile."""
     columns, rows = grid.shape
     line = torch.repeat_interleave(widths)
     before = widths.cumsum(0) - widths
@@ -188,7 +188,7 @@ def sorted_pairs(
     tiles, slots = torch.sort(tiles, stable=True)
     counts = torch.zeros_like(order).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
-    return Pairs(
+    return TileIntersections(
         splats=order[rank].index_select(0, line).index_select(0, slots),
         tiles=tiles.int(),
         starts=torch.searchsorted(tiles.int(), edges),
@@ -203,6 +203,6 @@ def refuse_too_many(count: int, grid: TileGrid, settings: RasterSettings) -> Non
     """Raise TooManyPairs before memory for too many pairs is asked for."""
     if count > settings.max_pairs:
         raise TooManyPairs(
-            f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile pairs, more than "
+            f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile intersections, more than "
             f"rasterizer.max_pairs={settings.max_pairs:,}: render it in smaller pieces or raise the limit"
         )

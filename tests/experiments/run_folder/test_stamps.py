@@ -1,0 +1,62 @@
+"""Stamps of folders: what changes them, what does not."""
+
+import os
+from pathlib import Path
+
+from gsx.experiments.run_folder.stamps import tree_stamp
+
+
+def scene_in(folder: Path) -> Path:
+    """Two photos and a model, written at known times."""
+    for name in ("images/a.png", "images/b.png", "sparse/0/cameras.bin"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+        os.utime(folder / name, ns=(0, 10**9))
+    return folder
+
+
+def test_a_folder_is_known_by_what_it_holds_wherever_it_lies(tmp_path: Path) -> None:
+    first, second = (scene_in(tmp_path / name) for name in ("a", "b"))
+    stamp = tree_stamp(first, Path("outputs"))
+    assert tree_stamp(second, Path("outputs")) == stamp
+    first.rename(tmp_path / "elsewhere")
+    assert tree_stamp(tmp_path / "elsewhere", Path("outputs")) == stamp
+    photo = second / "images" / "a.png"
+    os.utime(photo, ns=(0, 10**9 + 1))
+    touched = tree_stamp(second, Path("outputs"))
+    photo.write_text("another photo")
+    os.utime(photo, ns=(0, 10**9))
+    larger = tree_stamp(second, Path("outputs"))
+    photo.write_text("images/a.png")
+    os.utime(photo, ns=(0, 10**9))
+    assert tree_stamp(second, Path("outputs")) == stamp
+    photo.rename(second / "images" / "c.png")
+    renamed = tree_stamp(second, Path("outputs"))
+    (second / "images" / "c.png").rename(second / "a.png")
+    moved = tree_stamp(second, Path("outputs"))
+    assert len({stamp, touched, larger, renamed, moved}) == 5
+
+
+def test_what_gsx_writes_beside_photos_and_hidden_names_change_no_stamp(tmp_path: Path) -> None:
+    scene = scene_in(tmp_path / "scene")
+    stamp = tree_stamp(scene, scene / "outputs")
+    for name in (".DS_Store", ".thumbnails/a.png", "outputs/experiments/t/table.csv", "runs/mine/config.yaml",
+                 "runs/mine/renders/a.png"):  # fmt: skip
+        (scene / name).parent.mkdir(parents=True, exist_ok=True)
+        (scene / name).write_text("new")
+        assert tree_stamp(scene, scene / "outputs") == stamp, name
+    (scene / "more.png").write_text("new")
+    assert tree_stamp(scene, scene / "outputs") != stamp
+
+
+def test_links_are_followed_and_lead_nobody_round_in_circles(tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "a.png").write_text("a")
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "images").symlink_to(tmp_path / "store")
+    stamp = tree_stamp(scene, Path("outputs"))
+    (tmp_path / "store" / "back").symlink_to(scene)
+    assert tree_stamp(scene, Path("outputs")) == stamp
+    (tmp_path / "store" / "a.png").write_text("another")
+    assert tree_stamp(scene, Path("outputs")) != stamp
