@@ -21,7 +21,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.geometry import LEAST_SHARE, log_compensation
-from gsx.core.rasterizer.intersections import pair
+from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
 
 MIP = RasterSettings(cull="tight", dilation=0.1, compensate=True, unrolled=2)
@@ -130,7 +130,7 @@ def test_the_logarithm_is_finite_for_all_determinants_and_constant_below_its_flo
 
 def test_bounds_see_the_compensated_opacity_and_the_published_radius_does_not() -> None:
     splats, camera, plain = small_splats(seed=7), front_camera(), replace(MIP, compensate=False)
-    fewer, more = (pair(project(splats, camera, rules), camera, rules) for rules in (MIP, plain))
+    fewer, more = (intersect_tiles(project(splats, camera, rules), camera, rules) for rules in (MIP, plain))
     assert len(fewer.splats) < len(more.splats)
     assert torch.equal(fewer.radii, more.radii)
     point = axis_splat(1e-4)  # its opacity falls to 9e-4

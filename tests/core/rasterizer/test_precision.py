@@ -23,7 +23,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.composite import composite, make_blocks, make_tables
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.intersections import pair
+from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import project
 
@@ -126,7 +126,7 @@ def blended(screen, dtype: torch.dtype, rules: RasterSettings) -> torch.Tensor:
     """The picture of given screen splats, their numbers held in `dtype`."""
     camera = front_camera()
     values = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
-    blocks = make_blocks(pair(screen, camera, rules), rules.chunk, len(screen.ids))
+    blocks = make_blocks(intersect_tiles(screen, camera, rules), rules.chunk, len(screen.ids))
     return composite(*(v.to(dtype) for v in values), blocks, TileGrid.of(camera, rules.tile_size), rules)
 
 
@@ -218,7 +218,7 @@ def test_the_bound_of_the_exponent_holds_and_is_reached(dilation: float, tile: i
     rules = RasterSettings(cull="tight", dilation=dilation, tile_size=tile)
     splats = random_splats(2000, size=1e-4)
     screen = project(splats, front_camera(), rules)
-    pairs = pair(screen, front_camera(), rules)
+    pairs = intersect_tiles(screen, front_camera(), rules)
     values = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     tables = make_tables(*values, make_blocks(pairs, 1, len(screen.ids)), TileGrid.of(front_camera(), tile), rules)
     log_alpha, _ = tables.exponent.log_alphas(tables.rows, tables.basis)

@@ -21,8 +21,8 @@ from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.training.run import Run
 from gsx.experiments.reports.baselines import key_of
-from gsx.experiments.reports.overview import flattened
 from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.run_key import comparable
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
@@ -219,13 +219,13 @@ def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> N
     settings = tiny_settings(tmp_path / "run", "iterations=2")
     run = start(settings, plugins())
     folder = warm_start_folder(run, {})
-    key, config = key_of(read_run(run.folder)), flattened(run.config)
+    key, config = key_of(read_run(run.folder)), comparable(run.config)
     write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *BOTH).resolved)
     run.config = compose(words(run.folder, "iterations=2", *BOTH), plugins()).resolved
     assert "mlflow" in run.config["tracker"]
     assert warm_start_folder(run, {}) == folder
     assert key_of(read_run(run.folder)) == key
-    assert flattened(run.config) == config
+    assert comparable(run.config) == config
 
 
 def test_the_configuration_of_a_run_from_before_trackers_opens(tmp_path: Path) -> None:

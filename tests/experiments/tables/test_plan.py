@@ -19,7 +19,7 @@ from gsx.experiments.run_folder.run_key import (
 )
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.settings import write_config
-from gsx.experiments.tables.plan import Cell, Experiment, cells_of, planned, told
+from gsx.experiments.tables.plan import Cell, Experiment, cells_of, plan_lines, planned
 from gsx.experiments.tables.sweep import run_table
 
 ROWS = {"control": "octree_gs", "UP": "octree_up", "UB": "octree_ub", "early": "octree_ub_start_10k",
@@ -70,7 +70,7 @@ def test_controls_go_first_and_leave_their_state_where_others_set_out(tmp_path: 
          ("octree_up", "[500,1000,1100]")],
     ]  # fmt: skip
     assert (plan.done, plan.steps, plan.shared) == (0, 5 * 2000, 500 + 1000 + 1100)
-    assert "2,600 of 10,000 steps are saved" in told(plan)[1]
+    assert "2,600 of 10,000 steps are saved" in plan_lines(plan)[1]
     (alone,) = planned(table, DATASETS, every).phases  # one after the other: each leader right before its followers
     assert [job[1] for job in alone] == [f"variant={v}" for v in
             ("octree_gs", "octree_up", "octree_ub", "octree_ub_start_10k", "3d_gs")]  # fmt: skip

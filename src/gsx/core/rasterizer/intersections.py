@@ -203,6 +203,6 @@ def refuse_too_many(count: int, grid: TileGrid, settings: RasterSettings) -> Non
     """Raise TooManyPairs before memory for too many pairs is asked for."""
     if count > settings.max_pairs:
         raise TooManyPairs(
-            f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile intersections, more than "
+            f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile pairs, more than "
             f"rasterizer.max_pairs={settings.max_pairs:,}: render it in smaller pieces or raise the limit"
         )
