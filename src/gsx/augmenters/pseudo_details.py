@@ -14,7 +14,6 @@ from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.augmenters.redraw import Redrawer
 from gsx.augmenters.store import Store
 from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
-from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.parameter_table import shared_colour
@@ -117,10 +116,12 @@ class PseudoDetails:
         scales, pictures = self.planned()
         count = pictures if options.reduce == "all" else scales
         frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and inside < 0.5)
-        whole = run.scene.train[views[0].parent].camera
+        width, height = run.scene.train[views[0].parent].camera.size
+        areas = [view.camera.width * view.camera.height / (width * height) for view in views]
+        sizes = areas if options.per_pixel else [1.0] * len(views)
         return Term(
             name=self.context.name,
-            parts=[(view, each / count * (area_share(view, whole) if options.per_pixel else 1.0)) for view in views],
+            parts=[(view, each / count * size) for view, size in zip(views, sizes, strict=True)],
             replaces=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
             shared=not frozen,
@@ -198,8 +199,3 @@ def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
     for view in views:
         found.setdefault(view.parent, []).append(view)
     return found
-
-
-def area_share(view: PseudoView, whole: Camera) -> float:
-    """Pixels of a pseudo view per pixel of a training view."""
-    return view.camera.width * view.camera.height / (whole.width * whole.height)

@@ -130,11 +130,6 @@ def without_bias(rows: dict[str, Tensor]) -> dict[str, Tensor]:
     return rows | {"bias": torch.zeros_like(rows["bias"])}
 
 
-def stacked(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Rows of several parts, one after another."""
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
 def bias_levels(table: ParameterTable, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
     """Let Gaussians with fair gradients be drawn from a little farther, by at most so many levels."""
     table["bias"][: len(biased)] += step * biased
@@ -201,7 +196,8 @@ class CloneSplitAcrossLevels:
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
         raw = detached_rows(table)
-        new = stacked([clones(raw, cloned), small_children(raw, split, levels, options.shrink, control.generator)])
+        parts = clones(raw, cloned), small_children(raw, split, levels, options.shrink, control.generator)
+        new = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         seen = kept(levels, new["means"], new["level"])
         keep = within_room(seen, gradient[torch.cat([cloned, split])], control.room(table))
         bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)

@@ -41,11 +41,6 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
     }
 
 
-def without_normals(columns: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The columns of a splat file but nx, ny, nz."""
-    return {name: column for name, column in columns.items() if name not in ("nx", "ny", "nz")}
-
-
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """The backbones gs3d and mip_splatting."""
     return GS3D(options, context, AllVisible(), CloneSplit())
@@ -168,7 +163,8 @@ class GS3D:
         if not more:
             return None
         columns = columns_of(self.gaussians(everything(self.table)))
-        return {axis: columns.pop(axis) for axis in "xyz"} | more | without_normals(columns)
+        rest = {name: column for name, column in columns.items() if name not in (*"xyz", "nx", "ny", "nz")}
+        return {axis: columns[axis] for axis in "xyz"} | more | rest
 
     def file_notes(self) -> list[str]:
         """Whether the 3D filter is in the file, and what visibility has to say."""

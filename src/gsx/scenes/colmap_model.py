@@ -129,6 +129,7 @@ def read_model(folder: Path) -> Model:
             f"{files['points3D']} holds no points with finite coordinates, but training starts from points: "
             "triangulate the model (colmap point_triangulator) or reconstruct the photos with scene=photos."
         )
+    dropped = int((~usable).sum())
     colours = torch.from_numpy(np.array([point.color for point in points]))
     return Model(
         folder=folder,
@@ -136,7 +137,7 @@ def read_model(folder: Path) -> Model:
         images=_images(reconstruction, dict(zip(numbers, positions, strict=True)), files["points3D"]),
         points=PointCloud(positions[usable].float(), colours[usable]),
         mean_error=reconstruction.compute_mean_reprojection_error(),
-        notes=_dropped_note(int((~usable).sum())),
+        notes=[f"Dropped {dropped} points with coordinates that are not finite."] if dropped else [],
     )
 
 
@@ -253,10 +254,6 @@ def _present(folder: Path) -> Iterator[Path]:
 def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
     """Which points are finite in float32; false for NaN as well."""
     return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
-
-
-def _dropped_note(dropped: int) -> list[str]:
-    return [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
 
 
 def _images(reconstruction: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> list[ModelImage]:

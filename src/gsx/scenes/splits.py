@@ -26,7 +26,8 @@ def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
     if kind == "none" and not argument:
         train, test = order, list[int]()
     elif kind == "every":
-        train, test = _every(order, _count(argument, rule))
+        k = _count(argument, rule)
+        train, test = [i for position, i in enumerate(order) if position % k], order[::k]
     elif kind == "counts":
         train, test = _counts(order, *(_count(count, rule) for count in _pair(argument, rule)))
     elif kind == "files":
@@ -40,10 +41,6 @@ def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
 def sort_key(name: str) -> tuple[str, str]:
     """Order of published splits: base name up to its first dot; the whole name decides between equal ones."""
     return PurePosixPath(name).name.split(".")[0], name
-
-
-def _every(order: list[int], k: int) -> Split:
-    return [i for position, i in enumerate(order) if position % k], order[::k]
 
 
 def _counts(order: list[int], train_count: int, test_count: int) -> Split:

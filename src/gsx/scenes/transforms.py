@@ -68,7 +68,7 @@ def load(options: TransformsOptions) -> Scene:
     file = _file(Path(options.path).expanduser())
     content, frames = read_frames(file)
     present, notes = present_frames(file.parent, frames, file)
-    shots = _shots(content, present, file)
+    shots = [_shot({**content, **frame}, photo, file) for frame, photo in present]
     views = views_of(shots, options)
     (train, test), split_notes = _split(content, views, options.split, file)
     refuse_too_few(train, file)
@@ -93,11 +93,6 @@ def _file(path: Path) -> Path:
     if not file.is_file() and (path / "transforms_train.json").is_file():
         raise InputError(f"'{path}' has transforms_train.json and no {FILE}: it is a scene=blender folder.")
     return file
-
-
-def _shots(content: Mapping[str, Any], present: Sequence[tuple[dict[str, Any], Path]], file: Path) -> list[Shot]:
-    """Shots in the order of the file."""
-    return [_shot({**content, **frame}, photo, file) for frame, photo in present]
 
 
 def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:

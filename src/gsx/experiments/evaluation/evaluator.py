@@ -53,11 +53,6 @@ class EvalOptions:
             raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
 
 
-def render_seconds(times: Sequence[float]) -> float:
-    """Median of up to 10 renders after the first, which warms up; of that one where there is no other."""
-    return statistics.median(times[1:11] or times)
-
-
 def peak_memory_mb(device: torch.device) -> float | None:
     """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes); None where Python is not told it."""
     if device.type == "cuda":
@@ -253,7 +248,7 @@ class Evaluator:
             "left_out": statistics.fmean(v["left_out"] for v in views),
             **gathered(run.curves),
             "megabytes": size / 1e6,
-            "render_fps": 1 / render_seconds(self.times),
+            "render_fps": 1 / statistics.median(self.times[1:11] or self.times),  # after the first, which warms up
             "render_path": path_of(run.raster, run.device),
             "train_seconds": run.seconds,
             "peak_memory_mb": highest([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),

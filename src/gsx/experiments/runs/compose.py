@@ -217,13 +217,8 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
     """Dotted keys of the composition made from the group choices alone."""
     from hydra import compose as hydra_compose
 
-    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],]+$", o) and is_group(o.split("=")[0])]
+    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],]+$", o) and o.split("=")[0] in known_groups()]
     return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
-
-
-def is_group(key: str) -> bool:
-    """Whether a key names a configuration group."""
-    return key in known_groups()
 
 
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:

@@ -95,11 +95,6 @@ def branch(run: Run, sidecar: Path) -> None:
     logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
 
 
-def default_steps(run: Run) -> set[int]:
-    """Where the paper's variants begin."""
-    return {round(share * run.iterations) for share in SHARES}
-
-
 def lines_of(sidecar: Path) -> list[dict[str, Any]]:
     """Lines of metrics.jsonl up to a kept state."""
     path = sidecar.with_name(f"lines_{sidecar.stem}.json")
@@ -115,7 +110,8 @@ class WarmStartKeeper:
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
         """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
-        wanted = {*(self.steps or default_steps(run)), common_steps(run)}
+        where_variants_begin = (round(share * run.iterations) for share in SHARES)
+        wanted = {*(self.steps or where_variants_begin), common_steps(run)}
         if run.step not in wanted or run.step > common_steps(run) or run.complete:
             return
         try:

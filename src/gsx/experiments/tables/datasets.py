@@ -5,14 +5,9 @@ from pathlib import Path
 from typing import Any
 
 
-def scene_folder(dataset: dict[str, Any], scene: str, root: Path) -> Path | None:
-    """Where a scene belongs; None for one that is built in."""
-    return root.expanduser() / dataset["folder"] / scene if dataset["folder"] else None
-
-
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     """What keeps a scene from being trained; empty if it is all there."""
-    folder = scene_folder(dataset, scene, root)
+    folder = root.expanduser() / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
     if folder is None:
         return ""
     if not folder.is_dir():

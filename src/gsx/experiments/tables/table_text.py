@@ -19,11 +19,6 @@ def digits(metric: str) -> int:
     return DIGITS.get(metric, 2)
 
 
-def name_of(metric: str) -> str:
-    """A metric as the paper calls it."""
-    return METRICS.get(metric, metric)
-
-
 def number(value: float | None, metric: str, sign: bool = False) -> str:
     """A figure, or nothing; with a sign where it is a difference."""
     return "" if value is None else f"{value:{'+' if sign else ''}.{digits(metric)}f}"
@@ -63,7 +58,7 @@ def shown(table: Table, scope: Scope) -> list[str]:
 def cells(table: Table, scope: Scope) -> list[list[str]]:
     """The grid of a scope: headings, then rows; with gains in the first metric over the baseline."""
     columns, lead = headings(table, scope), next(iter(shown(table, scope)), "")
-    head = ["", *(f"{name_of(m)} {what}" if what == "ours" else what for m, what in columns)]
+    head = ["", *(f"{METRICS.get(m, m)} {what}" if what == "ours" else what for m, what in columns)]
     gains = ["gain", "gain in the paper"] if lead else []
     rows = []
     for row in rows_of(table.experiment):

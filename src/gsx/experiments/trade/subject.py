@@ -84,7 +84,10 @@ def subject_of_run(folder: Path, overrides: Sequence[str], views: int, plugins: 
     """The model of a run, seen by its test views."""
     run, settings = open_run(folder, plugins, overrides)
     chosen, note = choose_views(run.scene, views)
-    shots = [Shot(name=v.name, camera=v.camera, splats=detached(splats_for(run, v.camera))) for v in chosen]
+    shots = []
+    for view in chosen:
+        values = {name: value.detach().clone() for name, value in vars(splats_for(run, view.camera)).items()}
+        shots.append(Shot(name=view.name, camera=view.camera, splats=Splats(**values)))
     return Subject(
         name=f"run {folder} at step {run.step:,}",
         notes=(note,),
@@ -102,11 +105,6 @@ def choose_views(scene: Scene, count: int) -> tuple[list[View], str]:
     count = min(count, len(pool))
     chosen = [pool[i * len(pool) // count] for i in range(count)]
     return chosen, f"{count} of {len(pool)} {kind}: {', '.join(view.name for view in chosen)}"
-
-
-def detached(splats: Splats) -> Splats:
-    """The same values as leaves of their own."""
-    return Splats(**{name: value.detach().clone() for name, value in vars(splats).items()})
 
 
 # -- points of a scene ---------------------------------------------------------------------------------------------

@@ -130,16 +130,6 @@ def spiral_camera(place: float, width: int, height: int) -> Camera:
     return look_at(eye, TARGET, fov_x=FIELD_OF_VIEW, width=width, height=height)
 
 
-def training_places(train: int) -> list[float]:
-    """Evenly along the spiral."""
-    return [index / train for index in range(train)]
-
-
-def test_places(train: int, test: int) -> list[float]:
-    """Half-way between neighbouring training cameras, spread over the spiral."""
-    return [(index * train // test + 0.5) / train for index in range(test)]
-
-
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Surface and sky points with their colours: what random rays of the cameras meet, equally many from each."""
     shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
@@ -199,8 +189,10 @@ def load(options: DemoOptions) -> Scene:
     """
     check(options)
     life, size = make_still_life(), training_size(options.width, options.height, options.downscale, options.max_width)
-    train = [spiral_camera(place, *size) for place in training_places(options.train_views)]
-    test = [spiral_camera(place, *size) for place in test_places(options.train_views, options.test_views)]
+    count = options.train_views  # evenly along the spiral, and test cameras half-way between neighbours
+    train = [spiral_camera(index / count, *size) for index in range(count)]
+    places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
+    test = [spiral_camera(place, *size) for place in places]
     folder = cache_folder("demo", content_key(scene_version(), options.samples))
     cache = ImageCache(int(options.cache_gb * 1e9))
     source = partial(DemoSource, life=life, samples=options.samples, cache=cache, folder=folder)
