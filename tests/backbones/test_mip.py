@@ -462,7 +462,7 @@ def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbo
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("backbone.filter=mop", r"backbone\.filter is 'mop'; choose none or mip"),
+        ("backbone.filter=mop", r"backbone\.filter is 'mop'; choose one of none, mip, magnified, resampled"),
         ("backbone.mip.kernel=0", r"backbone\.mip\.variance and kernel are 0\.2 and 0\.0; give positive numbers"),
         ("backbone.mip.variance=-1", "give positive numbers"),
     ],

@@ -1,4 +1,4 @@
-"""Mip-Splatting's filters for any backbone (Yu et al. 2024).
+"""Filters for any backbone: those of Mip-Splatting (Yu et al. 2024), and rules for zoomed cameras alone.
 
 The 3D filter widens each Gaussian by what the finest training camera can resolve, at the same integrated opacity. The
 2D filter is a rule of the rasterizer: a dilation of `kernel` px^2 with compensated opacity.
@@ -18,7 +18,7 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.schedule import Schedule
 
-FILTERS = ("none", "mip")
+FILTERS = ("none", "mip", "magnified", "resampled")
 LEAST_DEPTH = 1e-3
 """Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
 LEAST_SHARE = 1e-30
@@ -110,6 +110,21 @@ class NoFilter:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ZoomedRule(NoFilter):
+    """Gaussians as they are, dilated by what the training cameras dilate them by, whatever camera draws them."""
+
+    zoomed: str
+    """`RasterSettings.zoomed`."""
+    cameras: Sequence[Camera]
+    """Those of the training views."""
+
+    def rules(self, raster: RasterSettings) -> RasterSettings:
+        """With the focal length that dilation belongs to."""
+        focal = max(max(camera.fx, camera.fy) for camera in self.cameras)
+        return replace(raster, zoomed=self.zoomed, training_focal=focal)
+
+
+@dataclass(frozen=True, kw_only=True)
 class MipFilter:
     """Both filters of Mip-Splatting; sizes of the 3D filter are a column of the table, world units."""
 
@@ -151,13 +166,15 @@ def filter_named(name: str, options: MipOptions, cameras: Sequence[Camera], sche
     """The filter of that name; see `MipFilter`."""
     if name == "none":
         return NoFilter()
+    if name in ("magnified", "resampled"):
+        return ZoomedRule(zoomed=name, cameras=cameras)
     return MipFilter(options=options, cameras=cameras, schedule=schedule, settled=settled)
 
 
 def checked_filter(name: str) -> None:
     """Raise ValueError for a name that is no filter."""
     if name not in FILTERS:
-        raise ValueError(f"backbone.filter is '{name}'; choose {' or '.join(FILTERS)}")
+        raise ValueError(f"backbone.filter is '{name}'; choose one of {', '.join(FILTERS)}")
 
 
 def seen_depths(

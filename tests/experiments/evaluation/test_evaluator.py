@@ -16,11 +16,11 @@ from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Splats
-from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.lpips import LpipsOptions
 
 SIZE = (24, 16)
 LEVELS = {"a": {1: 100.4, 2: 110.0}, "b": {1: 60.0, 2: 70.0}, "c": {1: 200.0, 2: 90.0}}

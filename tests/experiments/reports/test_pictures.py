@@ -18,7 +18,6 @@ from gsx.core.data.resize import linear_from_display
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.quality.lpips import LpipsOptions
 from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer import RasterSettings, Rendering, TiledRendering
 from gsx.core.training.backbone import DrawnSplats
@@ -27,6 +26,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.evaluation import evaluator
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.reports import pictures
 from gsx.experiments.reports.pictures import (
     Pictures,

@@ -69,7 +69,7 @@ def screen_axes(
     return p, q
 
 
-def covariance_and_factor(p: Columns, q: Columns, dilation: float) -> tuple[Columns, Columns, Columns]:
+def covariance_and_factor(p: Columns, q: Columns, dilation: float | Tensor) -> tuple[Columns, Columns, Columns]:
     """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
 
     Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
@@ -91,6 +91,17 @@ def log_compensation(bare: Float[Tensor, "M"], added: Float[Tensor, "M"]) -> Flo
     return logsigmoid((bare / added).clamp_min(LEAST_SHARE).log()) / 2
 
 
+def log_exchange(
+    p: Columns, q: Columns, bare: Float[Tensor, "M"], added: Float[Tensor, "M"], yy: Float[Tensor, "M"], drawn: Tensor
+) -> Float[Tensor, "M"]:
+    """ln sqrt(|S + drawn I| / |S + d I|): what keeps the mass of a splat whose dilation becomes d instead of `drawn`.
+
+    `bare`, `added` and yy as `covariance_and_factor` has them for d.
+    """
+    before = bare + drawn * ((dot(p, p) + dot(q, q) + drawn) / yy)
+    return (before.log() - (bare + added).log()) / 2
+
+
 def geometry(
     points: Float[Tensor, "M 3"],
     scales: Float[Tensor, "M 3"],
@@ -99,12 +110,14 @@ def geometry(
     intrinsics: Float[Tensor, "4"],
     low: Float[Tensor, "2"],
     high: Float[Tensor, "2"],
-    dilation: float,
+    dilation: float | Tensor,
     compensate: bool,
+    drawn: Tensor | None = None,
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
     """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
 
-    Fourth is the ln of the factor on opacities that makes up for dilation; None unless asked for.
+    Fourth is the ln of the factor on opacities that makes up for dilation, all of it (`compensate`) or as far as it
+    differs from `drawn`; None unless asked for.
     `points` and `intrinsics` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
     """
     x, y, z = points.unbind(1)
@@ -119,4 +132,7 @@ def geometry(
     p, q = screen_axes(clamped, stretches, sizes, unit(quats), rotation)
     covariances, conic_factors, determinants = covariance_and_factor(p, q, dilation)
     compensation = log_compensation(*determinants) if compensate else None
+    if drawn is not None:
+        bare, added = determinants
+        compensation = log_exchange(p, q, bare, added, covariances[2], drawn)
     return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(conic_factors, 1), compensation

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -147,12 +147,18 @@ def project(
     )
     low, high = slope_bounds(intrinsics, camera.frame, margin)
     rotation = camera.rotation.to(scales)
-    rules = settings.dilation, settings.compensate
+    dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
+    rules: tuple[Any, ...] = dilation, settings.compensate
+    if settings.zoomed != "plain":  # numbers that differ from camera to camera are no constants of compiled code
+        rules = scales.new_tensor(dilation), False, scales.new_tensor(drawn) if drawn else None
     worthwhile = len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type)
-    compute = compiled_geometry(settings.compensate) if worthwhile else geometry
+    compute = compiled_geometry(settings.zoomed, settings.compensate, bool(drawn)) if worthwhile else geometry
     means, covariances, conic_factors, compensation = compute(
         points, scales, quats, rotation, intrinsics, low.to(scales), high.to(scales), *rules
     )
+    if drawn and compensation is not None:  # nothing becomes more opaque than alpha_max by it
+        most = log_opacities.clamp_min(math.log(settings.alpha_max))
+        compensation = torch.minimum(compensation, most - log_opacities)
     return ScreenSplats(
         ids=ids,
         means=means,
@@ -186,6 +192,6 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 
 
 @functools.lru_cache
-def compiled_geometry(compensate: bool) -> Geometry:
+def compiled_geometry(zoomed: str, compensate: bool, exchange: bool) -> Geometry:
     """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
     return compile_rows(geometry)

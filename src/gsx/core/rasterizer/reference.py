@@ -42,8 +42,17 @@ def screen_roots(
     row_y = torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1)
     jacobian = torch.stack([row_x, row_y], 1) @ camera.rotation.double()
     spread = rotation_matrices(splats.quats.double()) @ torch.diag_embed(splats.scales.double())
-    dilation = (settings.dilation**0.5 * torch.eye(2, dtype=torch.float64)).expand(len(points), 2, 2)
+    dilation = (dilations(camera, settings)[0] ** 0.5 * torch.eye(2, dtype=torch.float64)).expand(len(points), 2, 2)
     return torch.cat([(jacobian @ spread).mT, dilation], 1)
+
+
+def dilations(camera: Camera, settings: RasterSettings) -> tuple[float, float]:
+    """(what is drawn by, what was trained by, in px^2 of this camera) of cameras finer or coarser than in training."""
+    zoom = max(camera.fx, camera.fy) / settings.training_focal if settings.training_focal > 0 else 1.0
+    trained = settings.dilation * zoom * zoom
+    if settings.zoomed == "resampled":
+        return trained - 0.1 * zoom * zoom + 0.1, trained
+    return (trained if settings.zoomed == "magnified" and zoom > 1 else settings.dilation), trained
 
 
 def squared_distances(roots: Float[Tensor, "N 5 2"], offset: Float[Tensor, "N H W 2"]) -> Float[Tensor, "N H W"]:
@@ -89,6 +98,13 @@ def alpha_maps(
     alpha = torch.exp(chosen.log_opacities.double()[:, None, None] - distance / 2)
     if settings.compensate:
         alpha = alpha * compensation(roots)[:, None, None]
+    if settings.zoomed == "resampled":
+        trained = dilations(camera, settings)[1] ** 0.5 * torch.eye(2, dtype=torch.float64)
+        widened = torch.cat([roots[:, :3], trained.expand_as(roots[:, 3:])], 1)
+        factor = torch.linalg.svdvals(widened).prod(1) / torch.linalg.svdvals(roots).prod(1)
+        opacity = chosen.log_opacities.double().exp()
+        factor = torch.minimum(factor, torch.maximum(opacity, torch.full_like(opacity, settings.alpha_max)) / opacity)
+        alpha = alpha * factor[:, None, None]
     clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (3D-GS, backward.cu)
     keep = clamped >= settings.alpha_min
     if settings.cull == "published":

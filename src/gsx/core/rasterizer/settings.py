@@ -8,6 +8,7 @@ WINDOW_TILE = 16
 
 CHOICES = {
     "cull": ("published", "tight"),
+    "zoomed": ("plain", "magnified", "resampled"),
     "path": ("auto", "eager", "compiled"),
     "schedule": ("auto", "chunks", "segments"),
     "exponent": ("squares", "direct", "expanded"),
@@ -18,6 +19,8 @@ CHOICES = {
 
 SIGNIFICANT_BITS = {"float64": 53, "float32": 24, "tf32": 24, "bfloat16": 8, "float16": 11}
 LEAST_NORMAL = {"bfloat16": 2.0**-126, "float16": 2.0**-14}
+PIXEL_VARIANCE = 0.1
+"""Variance of the Gaussian that zoomed=resampled takes a rendered pixel for, px^2 (Mip-Splatting)."""
 LARGEST_HALF = 65504.0
 """Of float16."""
 LARGEST_BATCH = 1 << 27
@@ -33,6 +36,15 @@ class RasterSettings:
     compensate: bool = False
     """Opacity times sqrt(|S| / |S + dilation I|), S the screen covariance before dilation: Mip-Splatting's 2D filter
     with dilation 0.1 (Mip-Splatting, forward.cu); published 3D-GS draws without."""
+    zoomed: str = "plain"
+    """How cameras draw that are finer or coarser than the training cameras, k = focal length / `training_focal`.
+    `plain`: by the same dilation, as published: thinner splats, with gaps. `magnified`: dilation x k^2 for k > 1, the
+    picture at k = 1 sampled more finely (SA-GS). `resampled`: what it is sampled from, sampled by the pixels of this
+    camera: dilation (d - 0.1) k^2 + 0.1, opacities (at most alpha_max) compensated from d k^2. Backbones choose it
+    (`backbone.filter`)."""
+    training_focal: float = 0.0
+    """Largest focal length of the training cameras, px, as the backbone knows it; 0: every camera counts as one of
+    them."""
     alpha_min: float = 1 / 255
     """Contributions below are skipped (3D-GS, renderCUDA)."""
     alpha_max: float = 0.99
@@ -90,6 +102,14 @@ class RasterSettings:
     def _check_rules(self) -> None:
         if not self.dilation > 0:
             raise ValueError(f"rasterizer.dilation is {self.dilation}; give a positive number of px^2")
+        if not 0 <= self.training_focal < math.inf:
+            raise ValueError(f"rasterizer.training_focal is {self.training_focal}; give px, or 0 where it is unknown")
+        if self.zoomed != "plain" and self.compensate:
+            raise ValueError(f"rasterizer.zoomed={self.zoomed} is for models without compensated opacities")
+        if self.zoomed == "resampled" and self.dilation <= PIXEL_VARIANCE:
+            raise ValueError(
+                f"rasterizer.zoomed=resampled needs a dilation above {PIXEL_VARIANCE}, not {self.dilation}"
+            )
         if not 0 < self.alpha_min < self.alpha_max < 1:
             raise ValueError(f"need 0 < alpha_min < alpha_max < 1, got {self.alpha_min} and {self.alpha_max}")
         if not 0 <= self.transmittance_stop < 1:
@@ -137,7 +157,17 @@ class RasterSettings:
                 f"tile_size={self.tile_size} and dilation={self.dilation} px^2 allow; choose bfloat16 or smaller tiles"
             )
 
+    def dilation_at(self, focal: float) -> tuple[float, float]:
+        """(dilation, the dilation that opacities are compensated from or 0), px^2, for a focal length in px."""
+        ratio = focal / self.training_focal if self.training_focal else 1.0
+        if self.zoomed == "magnified":
+            return self.dilation * max(1.0, ratio) ** 2, 0.0
+        if self.zoomed == "resampled" and ratio != 1:
+            return (self.dilation - PIXEL_VARIANCE) * ratio**2 + PIXEL_VARIANCE, self.dilation * ratio**2
+        return self.dilation, 0.0
+
     @property
     def largest_exponent(self) -> float:
         """Bound of s^2 + r^2 in a tile that a splat reaches: dilation alone is the narrowest splat, a diagonal away."""
-        return (self.tile_size / math.sqrt(self.dilation) + math.sqrt(-math.log(self.alpha_min))) ** 2
+        least = PIXEL_VARIANCE if self.zoomed == "resampled" else self.dilation
+        return (self.tile_size / math.sqrt(least) + math.sqrt(-math.log(self.alpha_min))) ** 2

@@ -19,13 +19,14 @@ from torch import Tensor
 
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
-from gsx.core.quality.lpips import LpipsOptions, load_lpips
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.detail import Detail, detail_of, explained
+from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import gathered
 
 LEAST_TILE_PIXELS = 16 * 16
@@ -110,6 +111,8 @@ class Zoomed:
     truth: Float[Tensor, "3 H W"]
     render: Float[Tensor, "3 H W"]
     enlarged: Float[Tensor, "3 H W"]
+    photograph: Float[Tensor, "3 H W"]
+    """The truth at the training resolution, enlarged: the most that can be had without new detail."""
 
 
 @runtime_checkable
@@ -186,16 +189,18 @@ class Evaluator:
             truth=finer.image(),
             render=self.measured(image),
             enlarged=self.measured(bicubic(whole, *finer.camera.size)),
+            photograph=self.measured(bicubic(view.image(), *finer.camera.size)),
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
-        """Figures of one view at a zoom, beside those of its competitor."""
+        """Figures of one view at a zoom, beside those of its competitors."""
         kind = self.options.ssim
         return {
             "psnr": psnr(zoomed.render, zoomed.truth),
             "ssim": ssim(zoomed.render, zoomed.truth, kind),
             "enlarged_psnr": psnr(zoomed.enlarged, zoomed.truth),
             "enlarged_ssim": ssim(zoomed.enlarged, zoomed.truth, kind),
+            "photograph_psnr": psnr(zoomed.photograph, zoomed.truth),
         }
 
     def work(self) -> float:
@@ -217,6 +222,7 @@ class Evaluator:
     ) -> dict[str, dict[str, Any]]:
         """Mean figures at each zoom, from those of `views` and of zoomed views; all of them are drawn on the way."""
         found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
+        details: dict[float, list[dict[str, Detail]]] = {factor: [] for factor in self.options.zoom}
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))
@@ -225,10 +231,11 @@ class Evaluator:
                     figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
                 elif zoomed := self.zoomed(view, factor):
                     figures.append(self.zoom_figures(zoomed))
+                    details[factor] += details_of(zoomed)
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")
-        return {f"{factor:g}": zoom_entry(factor, figures) for factor, figures in found.items()}
+        return {f"{factor:g}": zoom_entry(factor, figures, details[factor]) for factor, figures in found.items()}
 
     def evaluate(self, drawing: Drawing | None = None, advance: Advance = silent) -> dict[str, Any]:
         """The content of evaluation.json."""
@@ -258,13 +265,27 @@ class Evaluator:
         }
 
 
-def zoom_entry(factor: float, figures: Sequence[dict[str, float]]) -> dict[str, Any]:
+def details_of(zoomed: Zoomed) -> list[dict[str, Detail]]:
+    """What a render and its competitors have of the detail of a view; empty where that cannot be told."""
+    found = {
+        name: detail_of(getattr(zoomed, name), zoomed.truth, zoomed.factor)
+        for name in ("render", "enlarged", "photograph")
+    }
+    known = {name: detail for name, detail in found.items() if detail is not None}
+    return [known] if known else []
+
+
+def zoom_entry(
+    factor: float, figures: Sequence[dict[str, float]], details: Sequence[dict[str, Detail]]
+) -> dict[str, Any]:
     """Mean figures at one zoom, with the verdict; or a reason why there are none."""
     if not figures:
         return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
     means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
     gain = means["psnr"] - means["enlarged_psnr"]
-    return means | {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
+    found = {name: explained([detail[name] for detail in details]) for name in details[0]} if details else {}
+    verdict = {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
+    return means | verdict | ({"detail": found} if found else {})
 
 
 def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:

@@ -12,11 +12,11 @@ from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
-from gsx.core.quality.lpips import load_lpips
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.run_folder.files import RunFiles, read_run
 from gsx.experiments.run_folder.run_key import (
     composition_key,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from gsx.core.errors import InputError
-from gsx.core.quality.lpips import Lpips, LpipsOptions, load_lpips
+from gsx.experiments.evaluation.lpips import Lpips, LpipsOptions, load_lpips
 
 # layers of torchvision's `features`: number, channels in and out, kernel; the head reads the last of each stage
 VGG = {
@@ -144,7 +144,7 @@ def test_name_tells_weights_apart(weights: dict, tmp_path: Path) -> None:
 
 
 def test_without_weights_there_is_no_figure(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, "gsx.core.quality.lpips"):
+    with caplog.at_level(logging.INFO, "gsx.experiments.evaluation.lpips"):
         assert load_lpips(options("", "")) is None
     assert "n/a" in caplog.text
     assert "metrics.lpips.trunk" in caplog.text

@@ -1,0 +1,96 @@
+"""Detail above the Nyquist frequency of the training pictures: how much a zoomed picture has of it, or invents.
+
+PSNR at x4 is ruled by what the picture at x1 already holds. An orthonormal DCT-II of the difference and of the truth
+splits both at the frequency that the training pictures end at, 1/2 cycle per training px.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsx.core.shapes import Float
+
+BORDER_PIXELS, BORDER_SHARE = 8, 0.02
+"""Left out along each border: so many training px, or this share of the side if that is more."""
+RECOVERABLE = 1.5
+"""Reduced photographs hold something up to this many times their Nyquist frequency (3/4 cycle per training px)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detail:
+    """Mean squares of a picture's difference from the truth, and of the truth, by band; means over channels."""
+
+    low: float
+    """Of the difference, below the Nyquist frequency of training."""
+    high: float
+    """Above it; both add up to the MSE of the window."""
+    recoverable: float
+    """Of `high` up to RECOVERABLE times that frequency."""
+    truth_high: float
+    truth_recoverable: float
+
+
+def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
+    """Orthonormal DCT-II along the last axis, through an FFT of the even and then the odd samples (Makhoul 1980)."""
+    size = values.shape[-1]
+    shuffled = torch.cat([values[..., ::2], values[..., 1::2].flip(-1)], -1)
+    turn = torch.exp(-0.5j * math.pi * torch.arange(size, dtype=values.dtype) / size)
+    out = (torch.fft.fft(shuffled) * turn).real * math.sqrt(2 / size)
+    out[..., 0] /= math.sqrt(2)
+    return out
+
+
+def powers(picture: Float[Tensor, "3 H W"], bands: Sequence[Tensor]) -> list[float]:
+    """Mean square of a picture in each band, over all of its pixels and channels."""
+    square = dct(dct(picture).mT).mT.square().mean(0)
+    return [float(square[band].sum()) / square.numel() for band in bands]
+
+
+def detail_of(image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], factor: float) -> Detail | None:
+    """How a picture differs from the truth, `factor` times as fine as training; None where nothing lies within the
+    borders or no frequency above those of training."""
+    window = interior(truth.shape[1], factor), interior(truth.shape[2], factor)
+    exact = truth[:, *window].double()
+    if min(exact.shape[1:]) < 2 or factor <= 1:
+        return None
+    rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in exact.shape[1:])
+    frequency = torch.maximum(rows[:, None], columns[None, :])  # in units of the Nyquist frequency of training
+    high = frequency >= 1
+    bands = (~high, high, high & (frequency < RECOVERABLE))
+    low, above, recoverable = powers(image[:, *window].double() - exact, bands)
+    _, truth_high, truth_recoverable = powers(exact, bands)
+    return Detail(
+        low=low, high=above, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
+    )
+
+
+def interior(size: int, factor: float) -> slice:
+    """Pixels of a side without its borders."""
+    border = math.ceil(max(BORDER_PIXELS * factor, BORDER_SHARE * size))
+    return slice(border, max(border, size - border))
+
+
+def decibel(mean_square: float) -> float:
+    """-10 log10; inf for 0."""
+    return -10 * math.log10(mean_square) if mean_square > 0 else math.inf
+
+
+def explained(details: Sequence[Detail]) -> dict[str, float]:
+    """Figures over views: PSNR below and above the Nyquist frequency of training, dB, and the explained shares.
+
+    `explained` is 1 - sum of `high` / sum of `truth_high`: 0 without any detail, 1 for the truth, negative for detail
+    that is invented or misplaced. `recoverable` is the same of that band.
+    """
+    low, high, band, truth, truth_band = (
+        math.fsum(getattr(detail, name) for detail in details)
+        for name in ("low", "high", "recoverable", "truth_high", "truth_recoverable")
+    )
+    return {
+        "psnr_low": decibel(low / len(details)),
+        "psnr_high": decibel(high / len(details)),
+        "explained": 1 - high / truth if truth > 0 else math.nan,
+        "recoverable": 1 - band / truth_band if truth_band > 0 else math.nan,
+    }
