@@ -451,6 +451,22 @@ def test_the_run_is_drawn_with_the_2d_filter(tmp_path: Path) -> None:
     assert built(tmp_path, "backbone=mip_splatting", "backbone.mip.kernel=0.3").raster.dilation == 0.3
 
 
+@pytest.mark.parametrize("backbone", ["gs3d", "scaffold"])
+@pytest.mark.parametrize("rule", ["magnified", "resampled"])
+def test_rules_for_zoomed_cameras_know_the_focal_length_of_training(tmp_path: Path, backbone: str, rule: str) -> None:
+    run = built(tmp_path, f"backbone={backbone}", f"backbone.filter={rule}", "rasterizer.dilation=0.4")
+    assert (run.raster.zoomed, run.raster.dilation, run.raster.compensate) == (rule, 0.4, False)
+    assert run.raster.training_focal == max(view.camera.fx for view in run.scene.train)
+    assert "filter" not in run.backbone.table.columns
+    export(run, tmp_path / "model.ply")
+    header = (tmp_path / "model.ply").read_bytes().split(b"end_header")[0].decode()
+    written = {
+        "magnified": "dilation 0.4 k^2 px^2 for k > 1",
+        "resampled": "dilation 0.3 k^2 + 0.1 px^2, opacity x sqrt(",
+    }
+    assert f"px: {written[rule]}" in header
+
+
 @pytest.mark.parametrize("backbone", ["backbone=gs3d", "backbone=mip_splatting"])
 def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbone: str) -> None:
     rules = ("rasterizer.dilation=0.7", "rasterizer.compensate=true")

@@ -186,6 +186,15 @@ def test_zoom_verdicts_say_what_they_mean(page: Page) -> None:
     assert "the images hold no truth at x8" in text
 
 
+def test_detail_stands_beside_that_of_its_competitors(tmp_path: Path) -> None:
+    shares = {"render": 0.125, "enlarged": -0.004, "photograph": 0.05}
+    detail = {"detail": {kind: {"explained": share} for kind, share in shares.items()}}
+    result = evaluation(zoom={"2": zoom_entry(23.5, 23.0) | detail, "4": zoom_entry(20.0, 21.5) | {"detail": [1]}})
+    text = Page(write_report(make_run(tmp_path / "run", result=result))).text("zoom")
+    assert "×2 23.50 23.00 +0.50 +0.1000 +0.125 −0.004 +0.050 win" in text
+    assert "×4 20.00 21.50 −1.50 +0.1000 loss" in text
+
+
 def test_zooming_out_is_told_in_its_own_words(tmp_path: Path) -> None:
     result = evaluation(zoom={"0.25": zoom_entry(20.0, 26.0), "0.5": zoom_entry(26.5, 26.0), "2": zoom_entry(25, 24)})
     text = Page(write_report(make_run(tmp_path / "run", result=result))).text("zoom")

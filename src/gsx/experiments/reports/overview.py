@@ -19,15 +19,25 @@ from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
 from gsx.experiments.reports.side_by_side import pictures_of
-from gsx.experiments.run_folder.files import STATES, RunFiles, gain_of, is_number, part, read_run, runs_below, state_of
+from gsx.experiments.run_folder.files import (
+    STATES,
+    RunFiles,
+    detail_share,
+    gain_of,
+    is_number,
+    part,
+    read_run,
+    runs_below,
+    state_of,
+)
 from gsx.experiments.run_folder.run_key import comparable
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
-    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "protocol",
-    "comparable",
+    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "zoom_detail",
+    "protocol", "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 
@@ -139,6 +149,9 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
         "seconds": e.get("train_seconds"),
         "gains": gains,
         "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},
+        "zoom_detail": " ".join(
+            f"x{factor}:{share:+.3f}" for factor, entry in zoom.items() if (share := detail_share(entry)) is not None
+        ),
         "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
         "protocol": run.protocol_hash,
     }

@@ -221,6 +221,12 @@ def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
     return render - enlarged if is_number(render) and is_number(enlarged) else None
 
 
+def detail_share(entry: dict[str, Any], kind: str = "render") -> float | None:
+    """Explained detail above the training Nyquist frequency of a zoom's render, or of what it competes with."""
+    share = part(part(entry, "detail"), kind).get("explained")
+    return share if is_number(share) else None
+
+
 def state_of(files: RunFiles) -> tuple[str, str]:
     """One of STATES, and the reason where it is not `ok`."""
     recorded = files.status.get("state")

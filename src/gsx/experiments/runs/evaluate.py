@@ -9,13 +9,16 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
-from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.files import detail_share, read_run
 from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
+
+DETAIL_OF = ("render", "enlarged", "photograph")
+"""Pictures whose explained detail is told, the model's first."""
 
 
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
@@ -63,7 +66,7 @@ def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
     lost = [
         factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
     ]
-    if not lost or not remedy or run.raster.compensate:
+    if not lost or not remedy or run.raster.compensate or run.raster.zoomed != "plain":
         return []
     return [f"a model that is filtered for zooming in: the same command with {remedy}"]
 
@@ -76,6 +79,9 @@ def zoom_line(factor: str, result: dict[str, Any]) -> str:
         return f"zoom x1: {result['psnr']:.2f} dB"
     resized = "enlarged" if float(factor) > 1 else "reduced"
     verdict = "wins against" if result["beats_enlarged"] else "loses to"
-    return (
-        f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the {resized} x1 render ({result['enlarged_psnr']:.2f} dB)"
-    )
+    text = f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the {resized} x1 render"
+    text += f" ({result['enlarged_psnr']:.2f} dB)"
+    shares = [share for kind in DETAIL_OF if (share := detail_share(result, kind)) is not None]
+    if len(shares) < len(DETAIL_OF):
+        return text
+    return text + "; detail {:+.3f} (x1 {}: {:+.3f}, photograph: {:+.3f})".format(shares[0], resized, *shares[1:])

@@ -9,6 +9,7 @@ from gsx.core.data.scene import View
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.rasterizer.settings import PIXEL_VARIANCE
 from gsx.core.training.backbone import WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -26,6 +27,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
     comments = [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
+        *zoomed_note(run.raster),
         *(own.file_notes() if own else ()),
         *([f"SplatRenderMode: {render_mode(run.raster)}"] if columns is None else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
@@ -35,6 +37,17 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
     else:
         write_columns(path, columns, comments)
     return columns is None
+
+
+def zoomed_note(raster: RasterSettings) -> list[str]:
+    """How cameras draw that are k times as fine as those of training, where they do not as those."""
+    finer = f"at k times the focal length of {raster.training_focal:.6g} px: dilation"
+    if raster.zoomed == "magnified":
+        return [f"{finer} {raster.dilation} k^2 px^2 for k > 1"]
+    if raster.zoomed == "resampled":
+        opacity = f"opacity x sqrt(|S + {raster.dilation} k^2 I| / |S + dilation I|), at most {raster.alpha_max}"
+        return [f"{finer} {raster.dilation - PIXEL_VARIANCE:.6g} k^2 + {PIXEL_VARIANCE} px^2, {opacity}"]
+    return []
 
 
 def render_mode(raster: RasterSettings) -> str:

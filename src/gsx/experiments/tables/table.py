@@ -10,7 +10,7 @@ from gsx.core.cache import source_revision
 from gsx.core.files import read_json
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
-from gsx.experiments.run_folder.files import RunFiles, is_number, part, read_run, state_of
+from gsx.experiments.run_folder.files import RunFiles, detail_share, is_number, part, read_run, state_of
 from gsx.experiments.run_folder.run_key import NAMES, WHERE, asked_for, comparable, other_revision, without
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
@@ -153,7 +153,12 @@ def table_of(
     files = {cell.folder: read_run(cell.folder) for cell in cells}
     scopes = scopes_of(datasets, experiment.scenes, published)
     zooms = sorted({z for run in files.values() for z in part(run.evaluation, "zoom") if float(z) > 1}, key=float)
-    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS"]), *(f"PSNR x{zoom}" for zoom in zooms)]
+    zoomed = [f"PSNR x{zoom}" for zoom in zooms]
+    detailed = [f"detail x{zoom}" for zoom in zooms]
+    zoomed += [
+        name for name in detailed if any(zoom_figure(run.evaluation, name) is not None for run in files.values())
+    ]
+    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS"]), *zoomed]
     figures = [
         figure(row, scope, metric, [c for c in cells if c.row == row], files, published, lacking)
         for scope in scopes
@@ -222,11 +227,18 @@ def measured(files: RunFiles, metric: str, group: str) -> float | None:
     """A figure of a run that is done."""
     if state_of(files)[0] != "ok":
         return None
-    if metric.startswith("PSNR x"):
-        entry = part(files.evaluation, "zoom").get(metric.removeprefix("PSNR x")) or {}
-        value = None if group else entry.get("psnr")
+    if " x" in metric:
+        value = None if group else zoom_figure(files.evaluation, metric)
     else:
         value = MEASURES[metric](part(part(files.evaluation, "groups"), group) if group else files.evaluation)
+    return value if is_number(value) else None
+
+
+def zoom_figure(evaluation: dict[str, Any], metric: str) -> float | None:
+    """`PSNR xK`, or `detail xK`: explained detail above the training Nyquist frequency."""
+    name, _, factor = metric.partition(" x")
+    entry = part(part(evaluation, "zoom"), factor)
+    value = entry.get("psnr") if name == "PSNR" else detail_share(entry)
     return value if is_number(value) else None
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsx.experiments.tables.published import METRICS
 from gsx.experiments.tables.table import Figure, Scope, Table, rows_of
 
-DIGITS = {"PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1}
+DIGITS = {"detail": 3, "PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1}
 FIELDS = (
     "row", "scope", "scenes", "of_scenes", "seeds", "metric", "ours", "spread", "paper", "difference", "gain",
     "paper_gain", "problem", "remarks",
@@ -16,7 +16,7 @@ FIELDS = (
 
 def digits(metric: str) -> int:
     """Decimals of a metric, as the paper prints it."""
-    return DIGITS.get(metric, 2)
+    return DIGITS.get(metric.partition(" x")[0], 2)
 
 
 def number(value: float | None, metric: str, sign: bool = False) -> str:
