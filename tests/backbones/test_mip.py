@@ -140,6 +140,27 @@ def test_the_largest_focal_counts_even_of_a_camera_that_sees_nothing() -> None:
     assert sizes.item() == pytest.approx(2 * UNIT / 400)
 
 
+def test_by_the_paper_a_camera_counts_by_its_own_focal_length_and_depth() -> None:
+    """Focal length 100 at depth 2 and 400 at depth 10: 50 px per unit, where the release has 400 / 2."""
+    near = replace(look_at([0, -2, 0], [0, 0, 0], fov_x=1.0, width=100, height=100), fx=100.0, fy=100.0)
+    far = replace(look_at([0, -10, 0], [0, 0, 0], fov_x=1.0, width=100, height=100), fx=400.0, fy=400.0)
+    for rate, expected in (("paper", 0.00894), ("release", 0.00224)):
+        sizes = filter_sizes(torch.zeros(1, 3), [near, far], replace(OPTIONS, rate=rate))
+        assert sizes.item() == pytest.approx(expected, abs=5e-6), rate
+
+
+def test_by_the_paper_a_long_lens_sharpens_only_what_it_sees() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1.5, 0, 0], [900.0, 0, 0]])
+    whole = look_at([0, -4, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
+    window = whole.zoom(4).narrow(0.25)
+    options = replace(OPTIONS, rate="paper")
+    before, after = (filter_sizes(points, cameras, options) for cameras in ([whole], [whole, window]))
+    torch.testing.assert_close(after[0], before[0] / 4)
+    assert torch.equal(after[1:], before[1:])  # seen by the first alone; seen by none
+    released = filter_sizes(points, [whole, window], OPTIONS)
+    torch.testing.assert_close(released, before / 4)
+
+
 def test_depth_along_the_axis_counts_and_of_many_the_least() -> None:
     near = look_at([0, -2, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
     far = look_at([0, -9, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
@@ -481,6 +502,7 @@ def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbo
         ("backbone.filter=mop", r"backbone\.filter is 'mop'; choose one of none, mip, magnified, resampled"),
         ("backbone.mip.kernel=0", r"backbone\.mip\.variance and kernel are 0\.2 and 0\.0; give positive numbers"),
         ("backbone.mip.variance=-1", "give positive numbers"),
+        ("backbone.mip.rate=best", r"backbone\.mip\.rate is 'best'; choose release or paper"),
     ],
 )
 def test_wrong_options_are_refused(override: str, message: str) -> None:

@@ -19,6 +19,7 @@ from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.schedule import Schedule
 
 FILTERS = ("none", "mip", "magnified", "resampled")
+RATES = ("release", "paper")
 LEAST_DEPTH = 1e-3
 """Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
 LEAST_SHARE = 1e-30
@@ -41,8 +42,14 @@ class MipOptions:
     """Published steps between updates of the 3D filter after density control, every event of which updates it too."""
     stop: int
     """Published step from which the 3D filter is frozen."""
+    rate: str = "release"
+    """What the finest camera is of those that see a primitive. `release`: one of the largest focal length of all, at
+    the least depth of any. `paper`: the one with the largest quotient of its own focal length and depth, which is the
+    same where all focal lengths are."""
 
     def __post_init__(self) -> None:
+        if self.rate not in RATES:
+            raise ValueError(f"backbone.mip.rate is '{self.rate}'; choose {' or '.join(RATES)}")
         if not (self.variance > 0 and self.kernel > 0):
             raise ValueError(
                 f"backbone.mip.variance and kernel are {self.variance} and {self.kernel}; give positive numbers of "
@@ -192,16 +199,20 @@ def seen_depths(
 
 @torch.no_grad()
 def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], options: MipOptions) -> Float[Tensor, "N"]:
-    """Standard deviation of the 3D filter at each point, world units: (least depth / largest focal) sqrt(variance).
+    """Standard deviation of the 3D filter at each point, world units: sqrt(variance) times the depth over the focal
+    length of the finest camera that sees it (`MipOptions.rate`).
 
-    Points that no camera sees get the largest depth of those that are seen (Mip-Splatting, compute_3D_filter).
+    Points that no camera sees get the largest size of those that are seen (Mip-Splatting, compute_3D_filter).
 
     Raises:
         InputError: no camera sees any point.
     """
     nearest = torch.full_like(points[:, 0], torch.inf)
+    focal = max(camera.fx for camera in cameras)
     for camera in cameras:
         depth, seen = seen_depths(points, camera, options)
+        if options.rate == "paper":  # as far away as a camera of the largest focal length would be that is as fine
+            depth = depth * (focal / camera.fx)
         nearest = torch.where(seen, nearest.minimum(depth), nearest)
     seen = torch.isfinite(nearest)
     if len(points) and not bool(seen.any()):
@@ -211,7 +222,6 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
             "filters by backbone.filter=none"
         )
     farthest = nearest[seen].max() if len(points) else nearest.new_zeros(())
-    focal = max(camera.fx for camera in cameras)
     return torch.where(seen, nearest, farthest) / focal * options.variance**0.5
 
 
