@@ -129,7 +129,10 @@ def main(words: Sequence[str]) -> None:
     machine, load = describe_machine(torch.device("cpu")), told_load()
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "zoom_cpu.json")  # what cannot be added to is refused before training
+    unknown = [name for name in given.only.split(",") if name not in SUBJECTS]
     scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
+    if unknown or not scenes:
+        sys.exit(f"--only {given.only}: choose from {', '.join(SUBJECTS)}; all but demo need --scenes FOLDER")
     with ThreadPoolExecutor(given.jobs) as pool:
         for future in [pool.submit(train_and_look, s, seed, given) for seed in range(given.seeds) for s in scenes]:
             future.result()

@@ -488,6 +488,18 @@ def test_rules_for_zoomed_cameras_know_the_focal_length_of_training(tmp_path: Pa
     assert f"px: {written[rule]}" in header
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("backbone.filter=magnified", "rasterizer.compensate=true"),
+        ("backbone.filter=resampled", "rasterizer.dilation=0.1"),
+    ],
+)
+def test_rules_that_do_not_go_together_are_refused_in_a_sentence(tmp_path: Path, overrides: tuple[str, str]) -> None:
+    with pytest.raises(ConfigError, match=overrides[0]):
+        built(tmp_path, "backbone=gs3d", *overrides)
+
+
 @pytest.mark.parametrize("backbone", ["backbone=gs3d", "backbone=mip_splatting"])
 def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbone: str) -> None:
     rules = ("rasterizer.dilation=0.7", "rasterizer.compensate=true")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
@@ -118,7 +118,7 @@ class NoFilter:
 
 @dataclass(frozen=True, kw_only=True)
 class ZoomedRule(NoFilter):
-    """Gaussians as they are, dilated by what the training cameras dilate them by, whatever camera draws them."""
+    """Gaussians as they are, dilated by what the finest training camera dilates them by, whatever camera draws them."""
 
     zoomed: str
     """`RasterSettings.zoomed`."""
@@ -128,7 +128,10 @@ class ZoomedRule(NoFilter):
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """With the focal length that dilation belongs to."""
         focal = max(max(camera.fx, camera.fy) for camera in self.cameras)
-        return replace(raster, zoomed=self.zoomed, training_focal=focal)
+        try:
+            return replace(raster, zoomed=self.zoomed, training_focal=focal)
+        except ValueError as error:
+            raise ConfigError(f"backbone.filter={self.zoomed}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)

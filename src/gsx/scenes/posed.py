@@ -46,7 +46,7 @@ def shot_through(
     """A photo taken through `intrinsics`, a pycolmap camera, as the pinhole photo that gsx uses.
 
     Raises:
-        InputError: the photo's size is no uniform reduction of the intrinsics's, or that has no pinhole equivalent.
+        InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
     """
     pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
     size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))

@@ -8,7 +8,11 @@ from torch import Tensor
 
 from gsx.core.data.reduction import Reduction
 from gsx.core.quality.metrics import bicubic
-from gsx.experiments.evaluation.detail import Detail, dct, detail_of, explained, interior, powers
+from gsx.experiments.evaluation.detail import Detail, dct, details_of, explained, interior, powers
+
+
+def detail_of(image: Tensor, truth: Tensor, factor: float) -> Detail | None:
+    return details_of({"it": image}, truth, factor).get("it")
 
 
 @pytest.mark.parametrize(

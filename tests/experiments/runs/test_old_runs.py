@@ -12,8 +12,13 @@ import pytest
 from gsx.builtin import plugins
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.trainer import train
+from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.renamed import renamed
+from gsx.experiments.run_folder.run_key import composition_key, evaluation_settings, finished
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import read_config, write_config
 
 OLD = Path(__file__).parents[2] / "old_run"
 
@@ -42,3 +47,41 @@ def test_an_old_run_goes_on(folder: Path) -> None:
     assert run.complete
     assert before["adam.offsets.step"] == 11  # one event cost its step
     assert table_tensors(run.backbone.table)["adam.offsets.step"] == 13
+
+
+def test_keys_of_an_old_run_have_their_new_names_wherever_it_is_read(folder: Path) -> None:
+    config, (_, settings) = read_run(folder).config, open_run(folder, plugins())
+    for found in (config, settings.resolved):
+        assert (found["warm_start_at"], found["warm_start_gb"]) == ([], 10.0)
+        assert found["backbone"]["rates"]["sh_dc"] == {"first": 0.0025, "last": 0.0025}
+        assert found["backbone"]["clone_split"]["rates"]["sh_dc"] == 0.0025
+        assert not {"trunk_at", "trunk_gb", "sh_constant"} & found.keys()
+    assert renamed({"init": "trunk", "backbone": None}) == {"init": "warm_start", "backbone": None}
+
+
+def test_a_configuration_that_was_read_back_is_the_same_composition(tmp_path: Path) -> None:
+    loaded = plugins()
+    made = compose(["backbone=mip_splatting", "augmenter=[upscale]", f"folder={tmp_path / 'run'}"], loaded)
+    write_config(tmp_path / "config.yaml", made.resolved)
+    again = read_config(tmp_path / "config.yaml", loaded)
+    write_config(tmp_path / "config.yaml", again.resolved)  # as resuming does
+    once_more = read_config(tmp_path / "config.yaml", loaded)
+    assert "zoomed" not in once_more.resolved["rasterizer"]
+    assert len({composition_key(one.resolved, "", one.idle) for one in (made, again, once_more)}) == 1
+
+
+def test_figures_by_another_filter_are_not_those_of_the_composition(tmp_path: Path) -> None:
+    made = compose(["backbone=gs3d", "iterations=1"], plugins())
+    write_config(tmp_path / "config.yaml", made.resolved)
+    (tmp_path / "status.json").write_text('{"state": "ok", "step": 1}')
+    (tmp_path / "environment.json").write_text('{"scene": {"stamp": ""}}')
+    own = evaluation_settings(made.resolved)
+    cases = [
+        ({"settings": own}, True),
+        ({"settings": own | {"filter": "resampled"}}, False),
+        ({"judged": {key: value for key, value in own.items() if key != "filter"}}, True),
+        ({"judged": {"eval": None, "metrics": None}}, False),
+    ]
+    for saved, expected in cases:
+        (tmp_path / "evaluation.json").write_text(json.dumps({"step": 1, "psnr": 20.0, **saved}))
+        assert finished(read_run(tmp_path), made.resolved, "", made.idle) is expected, saved

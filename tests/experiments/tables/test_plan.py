@@ -54,7 +54,7 @@ def finish(cell: Cell) -> None:
     write_config(cell.folder / "config.yaml", cell.config)
     steps = cell.config["iterations"]
     (cell.folder / "evaluation.json").write_text(
-        json.dumps({"step": steps, "psnr": 20.0, "views": [], "judged": evaluation_settings(cell.config)})
+        json.dumps({"step": steps, "psnr": 20.0, "views": [], "settings": evaluation_settings(cell.config)})
     )
     (cell.folder / "status.json").write_text(json.dumps({"state": "ok", "step": steps}))
 

@@ -215,7 +215,7 @@ class Segments:
     """Share of light that passes each block."""
     before: Float[Tensor, "S P L"]
     """Transmittance in front of each block."""
-    accumulated: Float[Tensor, "C_1 S P L"]
+    contribution: Float[Tensor, "C_1 S P L"]
     """What each block adds to the channels and the coverage."""
 
 
@@ -241,7 +241,7 @@ def segment_moments(
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, all blocks at once."""
     seen = [g[job.lanes.groups] for g in gradient]
-    shine = sum(channel * g for channel, g in zip(kept.accumulated, seen, strict=True))
+    shine = sum(channel * g for channel, g in zip(kept.contribution, seen, strict=True))
     own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
     behind = behind_blocks(kept.passed, own, job.lanes)
     return torch.cat(

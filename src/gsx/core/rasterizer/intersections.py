@@ -1,8 +1,8 @@
 """Which splats reach which tiles, front to back. Nothing here is differentiated.
 
 A splat is cut into its rows of tiles; on each row the ellipse alpha >= alpha_min spans an exact interval of columns, so
-no candidate is made that is none. Screen splats come nearest first, hence so do the intersections, and one stable sort
-by tile keeps them so.
+no candidate is made that is no intersection. Screen splats come nearest first, hence so do their intersections, and one
+stable sort by tile keeps them so.
 """
 
 import math
@@ -33,13 +33,13 @@ class TileIntersections:
     tiles: Int[Tensor, "P"]
     """Tile, row-major over the grid."""
     starts: Int[Tensor, "T_plus_1"]
-    """First pair of each tile, then P."""
+    """First intersection of each tile, then P."""
     slots: Int[Tensor, "P"]
-    """Place of each pair in the list sorted by splat, nearest splat first: a permutation."""
+    """Place of each in the list sorted by splat, nearest splat first: a permutation."""
     order: Int[Tensor, "V"]
     """Rows of the screen splats that have a tile in their box, nearest first."""
     counts: Int[Tensor, "V"]
-    """Pairs of each of them."""
+    """How many each of them has."""
     radii: Int[Tensor, "M"]
     """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
 
@@ -121,7 +121,7 @@ def row_spans(
 
 
 def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
-    """Pairs of every splat with every tile where its alpha may reach alpha_min.
+    """Of every splat with every tile where its alpha may reach alpha_min.
 
     Raises:
         TooManyPairs: more than `settings.max_pairs` pairs would be needed.

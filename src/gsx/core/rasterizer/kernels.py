@@ -319,7 +319,8 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     }
     if loop.__name__ in SHARING:
         # no guards on symbols, which are the number of blocks, the same in all arguments, and where in storage a view
-        # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one
+        # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one, and 32-bit
+        # indices suffice (RasterSettings.compiled_values)
         options["guard_filter_fn"] = lambda guards: [guard.guard_type != "SHAPE_ENV" for guard in guards]
     return first_sizes_free(torch.compile(own, fullgraph=True, options=options), varying)
 

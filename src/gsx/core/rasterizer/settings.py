@@ -19,6 +19,8 @@ CHOICES = {
 
 SIGNIFICANT_BITS = {"float64": 53, "float32": 24, "tf32": 24, "bfloat16": 8, "float16": 11}
 LEAST_NORMAL = {"bfloat16": 2.0**-126, "float16": 2.0**-14}
+OF_BACKBONES = ("zoomed", "training_focal")
+"""Fields that are no options of the rasterizer: backbones set them."""
 PIXEL_VARIANCE = 0.1
 """Variance of the Gaussian that zoomed=resampled takes a rendered pixel for, px^2 (Mip-Splatting)."""
 LARGEST_HALF = 65504.0

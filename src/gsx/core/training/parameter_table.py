@@ -209,7 +209,8 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     Raises:
         CheckpointError: something of it was not saved: the run had other options.
     """
-    tensors = {name.replace("sh_constant", "sh_dc"): value for name, value in tensors.items()}  # as it was called once
+    if "sh_dc" in like.parameters and "parameters.sh_dc" not in tensors:  # as it was called once
+        tensors = {name.replace(".sh_constant", ".sh_dc"): value for name, value in tensors.items()}
     found = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
     device = next(iter(like.parameters.values())).device
     rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}

@@ -5,8 +5,9 @@ splits both at the frequency that the training pictures end at, 1/2 cycle per tr
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -33,6 +34,10 @@ class Detail:
     truth_recoverable: float
 
 
+Details: TypeAlias = dict[str, Detail]
+"""By picture."""
+
+
 def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
     """Orthonormal DCT-II along the last axis, through an FFT of the even and then the odd samples (Makhoul 1980)."""
     size = values.shape[-1]
@@ -43,28 +48,33 @@ def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
     return out
 
 
-def powers(picture: Float[Tensor, "3 H W"], bands: Sequence[Tensor]) -> list[float]:
-    """Mean square of a picture in each band, over all of its pixels and channels."""
-    square = dct(dct(picture).mT).mT.square().mean(0)
-    return [float(square[band].sum()) / square.numel() for band in bands]
+def powers(picture: Float[Tensor, "C H W"], bands: Sequence[Tensor]) -> list[float]:
+    """Mean square of a picture in each band, over all of its pixels and channels; a channel at a time."""
+    square = torch.zeros_like(picture[0])
+    for channel in picture:
+        square += dct(dct(channel).mT).mT.square_()
+    return [float(square[band].sum()) / picture.numel() for band in bands]
 
 
-def detail_of(image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], factor: float) -> Detail | None:
-    """How a picture differs from the truth, `factor` times as fine as training; None where nothing lies within the
-    borders or no frequency above those of training."""
+def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor, "3 H W"], factor: float) -> Details:
+    """How pictures differ from the truth, `factor` times as fine as training, by name; none where nothing lies within
+    the borders or no frequency above those of training."""
     window = interior(truth.shape[1], factor), interior(truth.shape[2], factor)
     exact = truth[:, *window].double()
     if min(exact.shape[1:]) < 2 or factor <= 1:
-        return None
+        return {}
     rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in exact.shape[1:])
     frequency = torch.maximum(rows[:, None], columns[None, :])  # in units of the Nyquist frequency of training
     high = frequency >= 1
     bands = (~high, high, high & (frequency < RECOVERABLE))
-    low, above, recoverable = powers(image[:, *window].double() - exact, bands)
     _, truth_high, truth_recoverable = powers(exact, bands)
-    return Detail(
-        low=low, high=above, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
-    )
+    out = {}
+    for name, image in images.items():
+        low, above, recoverable = powers(image[:, *window].double() - exact, bands)
+        out[name] = Detail(
+            low=low, high=above, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
+        )
+    return out
 
 
 def interior(size: int, factor: float) -> slice:

@@ -25,7 +25,7 @@ from gsx.core.shapes import Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.detail import Detail, detail_of, explained
+from gsx.experiments.evaluation.detail import Details, details_of, explained
 from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import gathered
 
@@ -222,7 +222,7 @@ class Evaluator:
     ) -> dict[str, dict[str, Any]]:
         """Mean figures at each zoom, from those of `views` and of zoomed views; all of them are drawn on the way."""
         found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
-        details: dict[float, list[dict[str, Detail]]] = {factor: [] for factor in self.options.zoom}
+        details: dict[float, list[Details]] = {factor: [] for factor in self.options.zoom}
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))
@@ -231,7 +231,8 @@ class Evaluator:
                     figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
                 elif zoomed := self.zoomed(view, factor):
                     figures.append(self.zoom_figures(zoomed))
-                    details[factor] += details_of(zoomed)
+                    shown = {name: getattr(zoomed, name) for name in ("render", "enlarged", "photograph")}
+                    details[factor].append(details_of(shown, zoomed.truth, factor))
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")
@@ -265,25 +266,14 @@ class Evaluator:
         }
 
 
-def details_of(zoomed: Zoomed) -> list[dict[str, Detail]]:
-    """What a render and its competitors have of the detail of a view; empty where that cannot be told."""
-    found = {
-        name: detail_of(getattr(zoomed, name), zoomed.truth, zoomed.factor)
-        for name in ("render", "enlarged", "photograph")
-    }
-    known = {name: detail for name, detail in found.items() if detail is not None}
-    return [known] if known else []
-
-
-def zoom_entry(
-    factor: float, figures: Sequence[dict[str, float]], details: Sequence[dict[str, Detail]]
-) -> dict[str, Any]:
+def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequence[Details]) -> dict[str, Any]:
     """Mean figures at one zoom, with the verdict; or a reason why there are none."""
     if not figures:
         return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
     means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
     gain = means["psnr"] - means["enlarged_psnr"]
-    found = {name: explained([detail[name] for detail in details]) for name in details[0]} if details else {}
+    known = [detail for detail in details if detail]
+    found = {name: explained([detail[name] for detail in known]) for name in known[0]} if known else {}
     verdict = {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
     return means | verdict | ({"detail": found} if found else {})
 

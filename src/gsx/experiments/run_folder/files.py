@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from gsx.experiments.run_folder.renamed import renamed
+
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -86,6 +88,7 @@ def read_run(folder: Path) -> RunFiles:
     """Everything that can be read of a run."""
     problems: dict[str, str] = {}
     config, text = read_yaml(folder / "config.yaml", problems)
+    config = renamed(config)
 
     def read(name: str, sound: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
         return read_mapping(folder, name, problems, sound)

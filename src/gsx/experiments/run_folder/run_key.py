@@ -111,7 +111,13 @@ def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
 
 def evaluation_settings(config: dict[str, Any]) -> dict[str, Any]:
     """How a composition is to be evaluated; saved with every evaluation (once as `judged`)."""
-    return {key: config.get(key) for key in EVALUATION}
+    return {key: config.get(key) for key in EVALUATION} | {"filter": part(config, "backbone").get("filter")}
+
+
+def evaluated_as(files: RunFiles, config: dict[str, Any]) -> dict[str, Any]:
+    """The settings that a run was evaluated by; those of older gsx do not tell the filter, which was the run's own."""
+    own = {"filter": evaluation_settings(config)["filter"]}
+    return own | part(files.evaluation, "settings" if "settings" in files.evaluation else "judged")
 
 
 def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collection[str]) -> bool:
@@ -120,7 +126,7 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
     return (
         files.status.get("state") == "ok"
         and files.evaluation.get("step") == config["iterations"]
-        and files.evaluation.get("settings", files.evaluation.get("judged")) == evaluation_settings(config)
+        and evaluated_as(files, config) == evaluation_settings(config)
         and composition_key(files.config, trained_on(files), idle) == composition_key(config, stamp, idle)
     )
 

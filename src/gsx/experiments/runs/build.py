@@ -1,11 +1,12 @@
 """From settings to a run in memory: device, backbone, augmenters."""
 
 import os
-from functools import partial
+import weakref
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsx.core.cache import cache_root
 from gsx.core.data.scene import Scene
@@ -94,7 +95,14 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         idle=settings.idle,
         ranks=ranks,
     )
-    run.held_out = partial(held_out_renders, run, anew) if training else None
+    itself = weakref.ref(run)  # a circle would keep a finished run's tensors for a while
+
+    def held_out(share: float, seed: int) -> list[Tensor]:
+        run = itself()
+        assert run is not None
+        return held_out_renders(run, anew, share, seed)
+
+    run.held_out = held_out if training else None
     return run
 
 

@@ -17,7 +17,7 @@ from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.lpips import load_lpips
-from gsx.experiments.run_folder.files import RunFiles, read_run
+from gsx.experiments.run_folder.files import RunFiles, is_number, read_run
 from gsx.experiments.run_folder.run_key import (
     composition_key,
     finished,
@@ -122,6 +122,9 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
     checkpoint.restore(run)
+    focal = read_run(folder).environment.get("training_focal")
+    if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
+        run.raster = run.backbone.raster = replace(run.raster, training_focal=float(focal))
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     for tally in run.tallies:
         tally.recall(run.curves)

@@ -41,7 +41,7 @@ def compile_now(settings: RasterSettings, device: torch.device) -> float:
     begun = time.perf_counter()
     splats = warm_splats(device)
     camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
-    rasterize(splats, camera, settings).image.sum().backward()
+    rasterize(splats, camera, replace(settings, training_focal=0.0)).image.sum().backward()  # as a camera of training
     return time.perf_counter() - begun
 
 

@@ -14,13 +14,13 @@ from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
+from gsx.experiments.run_folder.renamed import RENAMED, renamed
 
-RENAMED = {"trunk_at": "warm_start_at", "trunk_gb": "warm_start_gb", "sh_constant": "sh_dc"}
-"""Keys by which run folders of older versions call what has another name now."""
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""
 
@@ -237,8 +237,7 @@ def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
 
 def right_key(key: str, known: Iterable[str]) -> str:
     """` It is now called 'x'.` for a key of older versions, else ` Did you mean 'x'?` or nothing."""
-    before, dot, last = key.rpartition(".")
-    return f" It is now called '{before}{dot}{RENAMED[last]}'." if last in RENAMED else nearest(key, known)
+    return f" It is now called '{RENAMED[key]}'." if key in RENAMED else nearest(key, known)
 
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
@@ -266,6 +265,8 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         config = OmegaConf.load(path)
     except Exception as error:
         raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
+    if isinstance(config, DictConfig):
+        config = OmegaConf.create(renamed(OmegaConf.to_container(config)))  # type: ignore[arg-type]
     add_newer_settings(config)
     known = list(dotted(OmegaConf.to_container(config)))
     for override in overrides:
@@ -280,16 +281,16 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 
 
 def add_newer_settings(config: Any) -> None:
-    """Give the configuration of an older gsx what it does not know, as older runs had it, and keys their new names.
+    """Give the configuration of an older gsx what it does not know, as older runs had it.
 
     Settings of the rasterizer at their defaults; checks of redrawn pictures, which were the strict ones; the gate of
     `clone_split`, which was a yes or no beside its numbers.
     """
     if not isinstance(config, DictConfig):
         return
-    give_new_names(config)
     if isinstance(config.get("rasterizer"), DictConfig):
-        config.rasterizer = OmegaConf.merge(dataclasses.asdict(RasterSettings()), config.rasterizer)
+        options = {key: v for key, v in dataclasses.asdict(RasterSettings()).items() if key not in OF_BACKBONES}
+        config.rasterizer = OmegaConf.merge(options, config.rasterizer)
     augmenters = config.get("augmenter")
     for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
         if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
@@ -299,17 +300,6 @@ def add_newer_settings(config: Any) -> None:
         waits = density.pop("gate")
         if config.backbone.densification == "clone_split":
             OmegaConf.update(config, "backbone.quirks.gate", "closed" if waits else "open", force_add=True)
-
-
-def give_new_names(config: DictConfig) -> None:
-    """Rename keys in place, at any depth; `init=trunk` is `init=warm_start`."""
-    if config.get("init") == "trunk":
-        config.init = "warm_start"
-    for key in list(config):
-        if isinstance(config._get_node(key), DictConfig):
-            give_new_names(config[key])
-        if key in RENAMED:
-            config[RENAMED[key]] = config.pop(key)
 
 
 def strict_node() -> Any:

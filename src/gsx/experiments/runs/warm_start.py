@@ -33,7 +33,7 @@ SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 
 
 def common_steps(run: Run) -> int:
-    """Steps that the run shares with its control: up to the first pseudo views, or all of them."""
+    """Steps that the run shares with its baseline: up to the first pseudo views, or all of them."""
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
 
 
@@ -52,7 +52,7 @@ def warm_start_folder(run: Run, plugins: Mapping[str, str]) -> Path:
 
 
 def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The composition of the control."""
+    """The composition of the baseline."""
     return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator", "checks")}
 
 

@@ -1,7 +1,7 @@
 """From a table to runs: which there are, which are done, and which have a beginning in common.
 
 Runs of one scene, backbone and seed that differ in their augmenters alone are identical until the first of them makes
-pseudo views. One of each such group, the one that goes on longest without (the baseline, where there is one), is
+pseudo views. One of each such group, the one that goes on longest without (the run without any, where there is one), is
 trained first and leaves its state wherever another of them sets out; the others branch from there (`runs.warm_start`).
 """
 
