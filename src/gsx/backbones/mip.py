@@ -127,7 +127,7 @@ class ZoomedRule(NoFilter):
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """With the focal length that dilation belongs to."""
-        focal = max(max(camera.fx, camera.fy) for camera in self.cameras)
+        focal = max(camera.focal for camera in self.cameras)
         try:
             return replace(raster, zoomed=self.zoomed, training_focal=focal)
         except ValueError as error:

@@ -69,6 +69,11 @@ class Camera:
         """(width, height) in pixels."""
         return self.width, self.height
 
+    @property
+    def focal(self) -> float:
+        """The larger focal length, px."""
+        return max(self.fx, self.fy)
+
     def draws_as(self, other: "Camera") -> bool:
         """Whether both draw the same picture, bit for bit."""
         numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")

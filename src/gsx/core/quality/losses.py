@@ -10,8 +10,9 @@ from gsx.core.shapes import Float
 
 WINDOW, SIGMA = 11, 1.5
 """SSIM window edge and standard deviation, px (Wang et al. 2004; 3D-GS, loss_utils.py)."""
-WEIGHTS = [math.exp(-((i - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for i in range(WINDOW)]
-"""The window along one axis, but for a factor."""
+GAUSSIAN = [math.exp(-((i - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for i in range(WINDOW)]
+WEIGHTS = [value / sum(GAUSSIAN) for value in GAUSSIAN]
+"""The window along one axis, sum 1."""
 C1, C2 = 0.01**2, 0.03**2
 """SSIM constants for values in [0, 1]."""
 
@@ -19,7 +20,7 @@ C1, C2 = 0.01**2, 0.03**2
 def correlate(maps: Float[Tensor, "M H W"], axis: int) -> Float[Tensor, "M h w"]:
     """The window along one axis, where it fits. Shifted sums are 3 x faster than a grouped convolution on a CPU."""
     size = maps.shape[axis] - WINDOW + 1
-    first, *others = (weight / sum(WEIGHTS) for weight in WEIGHTS)
+    first, *others = WEIGHTS
     total = maps.narrow(axis, 0, size) * first
     for shift, weight in enumerate(others, 1):
         total.add_(maps.narrow(axis, shift, size), alpha=weight)

@@ -21,8 +21,12 @@ def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
 
 def psnr(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
     """20 log10(1 / sqrt(MSE)) over all pixels and channels, dB; inf for equal images."""
-    error = float((image.double() - target.double()).square().mean())
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return decibel(float((image.double() - target.double()).square().mean()))
+
+
+def decibel(mean_square: float) -> float:
+    """20 log10(1 / sqrt(mean square)), dB; inf for 0."""
+    return -10 * math.log10(mean_square) if mean_square > 0 else math.inf
 
 
 def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant: str) -> float:

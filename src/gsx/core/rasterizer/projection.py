@@ -147,9 +147,9 @@ def project(
     )
     low, high = slope_bounds(intrinsics, camera.frame, margin)
     rotation = camera.rotation.to(scales)
-    dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
-    rules: tuple[Any, ...] = dilation, settings.compensate
+    drawn, rules = 0.0, tuple[Any, ...]((settings.dilation, settings.compensate))
     if settings.zoomed != "plain":  # numbers that differ from camera to camera are no constants of compiled code
+        dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
         rules = scales.new_tensor(dilation), False, scales.new_tensor(drawn) if drawn else None
     worthwhile = len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type)
     compute = compiled_geometry(settings.zoomed, settings.compensate, bool(drawn)) if worthwhile else geometry

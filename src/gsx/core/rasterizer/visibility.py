@@ -54,7 +54,7 @@ def screen_radii(
 ) -> Float[Tensor, "N"]:
     """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
     screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
-    dilation, _ = settings.dilation_at(max(camera.fx, camera.fy))
+    dilation, _ = settings.dilation_at(camera.focal)
     xx, xy, yy = (screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])).unbind(1)
     largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
     return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], largest.clamp_min(0).sqrt())

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from gsx.core.quality.metrics import decibel
 from gsx.core.shapes import Float
 
 BORDER_PIXELS, BORDER_SHARE = 8, 0.02
@@ -81,11 +82,6 @@ def interior(size: int, factor: float) -> slice:
     """Pixels of a side without its borders."""
     border = math.ceil(max(BORDER_PIXELS * factor, BORDER_SHARE * size))
     return slice(border, max(border, size - border))
-
-
-def decibel(mean_square: float) -> float:
-    """-10 log10; inf for 0."""
-    return -10 * math.log10(mean_square) if mean_square > 0 else math.inf
 
 
 def explained(details: Sequence[Detail]) -> dict[str, float]:

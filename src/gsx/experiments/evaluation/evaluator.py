@@ -28,6 +28,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.detail import Details, details_of, explained
 from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import gathered
+from gsx.experiments.run_folder.files import DETAIL_OF
 
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
@@ -231,7 +232,7 @@ class Evaluator:
                     figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
                 elif zoomed := self.zoomed(view, factor):
                     figures.append(self.zoom_figures(zoomed))
-                    shown = {name: getattr(zoomed, name) for name in ("render", "enlarged", "photograph")}
+                    shown = {name: getattr(zoomed, name) for name in DETAIL_OF}
                     details[factor].append(details_of(shown, zoomed.truth, factor))
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)

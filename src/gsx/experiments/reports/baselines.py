@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from gsx.core.options import flattened
 from gsx.experiments.run_folder.files import RunFiles, is_number, part
 from gsx.experiments.run_folder.run_key import EVALUATION, NAMES, WHERE
 
@@ -87,21 +88,13 @@ def told(found: dict[tuple[str, str], Comparison]) -> None:
     for (shared, choice), entry in found.items():
         groups.setdefault((shared, entry.augmenters), []).append((choice, entry))
     for members in groups.values():
-        flat = [dict(leaves(json.loads(choice))) for choice, _ in members]
+        chosen = [[node for node in json.loads(choice) if isinstance(node, dict)] for choice, _ in members]
+        flat = [{key: value for node in nodes for key, value in flattened(node).items()} for nodes in chosen]
         keys = [
             key for key in dict.fromkeys(key for one in flat for key in one) if len({str(f.get(key)) for f in flat}) > 1
         ]
         for one, (_, entry) in zip(flat, members, strict=True):
             entry.told = ", ".join(f"{key}={one.get(key, 'absent')}" for key in keys)
-
-
-def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Dotted keys and values of nested mappings; lists of two are augmenter and regenerator."""
-    if isinstance(node, dict):
-        return [leaf for key, value in node.items() for leaf in leaves(value, f"{prefix}.{key}" if prefix else key)]
-    if isinstance(node, list) and not prefix:
-        return [leaf for part_of in node for leaf in leaves(part_of)]
-    return [(prefix, node)]
 
 
 def baseline_rows(runs: Sequence[RunFiles]) -> list[dict[str, Any]]:

@@ -19,7 +19,16 @@ from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
 from gsx.experiments.reports.page import NONE, duration, fixed, template, time_unit
 from gsx.experiments.reports.pictures import ERROR_COLOURS
-from gsx.experiments.run_folder.files import RunFiles, detail_share, gain_of, is_number, part, read_run, state_of
+from gsx.experiments.run_folder.files import (
+    DETAIL_OF,
+    RunFiles,
+    detail_share,
+    gain_of,
+    is_number,
+    part,
+    read_run,
+    state_of,
+)
 
 __all__ = ["report_on", "write_overview", "write_report"]
 
@@ -156,7 +165,7 @@ def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
                 "factor": factor,
                 "entry": entry,
                 "gain": gain,
-                "detail": {kind: detail_share(entry, kind) for kind in ("render", "enlarged", "photograph")},
+                "detail": {kind: detail_share(entry, kind) for kind in DETAIL_OF},
                 "ssim_gain": None if factor == "1" else gain_of(entry, "ssim"),
                 "verdict": "" if gain is None else ("win" if gain > 0 else "loss"),
                 "sentence": zoom_sentence(factor, entry),

@@ -9,6 +9,8 @@ from typing import Any, TypeGuard
 
 from gsx.experiments.run_folder.renamed import renamed
 
+DETAIL_OF = ("render", "enlarged", "photograph")
+"""Pictures of a zoom whose explained detail is told, the model's own first."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 

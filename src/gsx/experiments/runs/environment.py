@@ -40,7 +40,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
         "plan": plan_of(run),
-        "training_focal": max(max(view.camera.fx, view.camera.fy) for view in run.scene.train),
+        "training_focal": max(view.camera.focal for view in run.scene.train),
         "scene": {
             "stamp": scene_stamp(run.config),
             "train_views": len(run.scene.train),

@@ -9,16 +9,13 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
-from gsx.experiments.run_folder.files import detail_share, read_run
+from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run
 from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
-
-DETAIL_OF = ("render", "enlarged", "photograph")
-"""Pictures whose explained detail is told, the model's first."""
 
 
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
