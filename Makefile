@@ -17,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 .PHONY: demo test test-slow lint wheel clean
 
 demo: $(READY)
-	$(BIN)/gsx 'eval.zoom=[1,2,4]'
+	$(BIN)/gsx preset=zoom 'eval.zoom=[1,2,4]'
 	@echo "Open the report named in the last line above."
 
 test: $(READY_DEV)

@@ -1,17 +1,21 @@
-"""Ways of looking closer at one trained model, on held-out true pixels: the tables of docs/zoom.md.
+"""Looking closer, and from afar, on held-out true pixels: the tables of docs/zoom.md.
 
-    python benchmarks/zoom.py --scenes FOLDER [--only fox,lego] [--seeds 3] [--jobs 2]
+    python benchmarks/zoom.py [--what compositions,afar] --scenes FOLDER [--only fox,lego] [--seeds 3] [--jobs 2]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
-the built-in scene is measured. Each scene is trained by plain 3D-GS, once with every seed, and drawn by every rule for
-zoomed cameras: nothing is trained anew. Finished runs below --runs are not trained again. An hour on two cores.
+the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and
+drawn by every rule for zoomed cameras. `compositions`: each is trained by compositions made for zooming in, and by the
+backbones without them. `pictures`: the best of them with pseudo details, enlarged or true. `afar`: what they draw from
+four times as far as photographs were taken, by each way of looking. Finished runs below --runs are not trained again.
+Some hours on two cores.
 """
 
 import argparse
+import re
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,7 +27,7 @@ from gsx.core.files import read_json, write_json
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.open import open_run
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.results import read_sections, stamped, text_table, write_results
 from measuring.runs import train
 
 RESULTS = Path(__file__).parent / "results"
@@ -37,12 +41,42 @@ SUBJECTS = {
 RULES = ("none", "magnified", "resampled")
 """Values of backbone.filter that suit a model of plain 3D-GS."""
 ZOOMS = ("1", "2", "4")
+COMPOSITIONS = {
+    "mip_splatting": ("backbone=mip_splatting",),
+    "mip_splatting, rates of preset=zoom": ("backbone=mip_splatting", "preset=zoom", "training.supersample=1"),
+    "mip_splatting preset=zoom": ("backbone=mip_splatting", "preset=zoom"),
+}
+"""Overrides by the name of a row."""
+PICTURES = {
+    "preset=zoom": ("backbone=mip_splatting", "preset=zoom"),
+    "augmenter=upscale, lanczos": (
+        "backbone=mip_splatting",
+        "preset=zoom",
+        "augmenter=upscale",
+        "regenerator/upscale=lanczos",
+    ),
+    "augmenter=upscale, oracle": (
+        "backbone=mip_splatting",
+        "preset=zoom",
+        "augmenter=upscale",
+        "regenerator/upscale=oracle",
+    ),
+}
+WAYS = {
+    "samples of its pixels": ("eval.supersample=1",),
+    "windows of its pixels": ("eval.supersample=1", "rasterizer.pixel=window"),
+    "four times as fine, reduced": ("eval.supersample=4",),
+    "as trained": (),
+}
+"""Of looking from afar: overrides by the name of a row."""
+AFAR = "0.25"
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser.add_argument("--what", default="rules,compositions,pictures,afar", help="tables, by commas")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
@@ -51,23 +85,29 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def folder_of(scene: str, seed: int, given: argparse.Namespace) -> Path:
-    """Where a run is kept."""
-    return given.runs / f"{scene}_{seed}"
+def folder_of(scene: str, seed: int, given: argparse.Namespace, name: str = "") -> Path:
+    """Where a run is kept; `name`: of its composition, plain 3D-GS without one."""
+    return given.runs / "_".join([*re.findall(r"\w+", name), scene, str(seed)])
 
 
-def train_and_look(scene: str, seed: int, given: argparse.Namespace) -> None:
-    """One model, and what it shows by every rule; what is there already is left alone."""
+def trained(scene: str, seed: int, given: argparse.Namespace, overrides: Sequence[str], name: str = "") -> Path:
+    """The folder of a run, which is trained unless it is there."""
     where = () if scene == "demo" else (f"scene.path={given.scenes / scene}",)
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    folder = folder_of(scene, seed, given)
+    folder = folder_of(scene, seed, given, name)
     print(time.strftime("%H:%M"), folder.name, flush=True)
-    overrides = ["backbone=gs3d", *SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    train(folder, overrides, threads, folder.with_suffix(".log"))
-    for rule in RULES:
-        if not (folder / f"zoom_{rule}.json").is_file():
-            run, settings = open_run(folder, plugins(), [f"backbone.filter={rule}"])
-            write_json(folder / f"zoom_{rule}.json", Evaluator(run, settings.evaluation).evaluate()["zoom"])
+    words = [*overrides, *SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    train(folder, words, threads, folder.with_name(f"{folder.name}.log"))
+    return folder
+
+
+def looked_at(folder: Path, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Figures by zoom of a trained run under other settings; kept beside it."""
+    path = folder / f"zoom_{name}.json"
+    if not path.is_file():
+        run, settings = open_run(folder, plugins(), overrides)
+        write_json(path, Evaluator(run, settings.evaluation).evaluate()["zoom"])
+    return read_json(path)
 
 
 def figure(shown: Sequence[dict[str, Any]], factor: str, *keys: str) -> list[float]:
@@ -87,59 +127,156 @@ def told(values: Sequence[float], form: str) -> str:
     return f"{statistics.mean(values):{form}}{half}"
 
 
-def rows_of(scene: str, given: argparse.Namespace) -> list[dict[str, Any]]:
-    """A line for every rule, over the seeds that are there."""
-    rows = []
-    for rule in RULES:
-        paths = [folder_of(scene, seed, given) / f"zoom_{rule}.json" for seed in range(given.seeds)]
-        shown = [read_json(path) for path in paths if path.is_file()]
-        row: dict[str, Any] = {"scene": scene, "rule": rule, "seeds": len(shown)}
-        for factor in ZOOMS if shown else ():
-            own = figure(shown, factor, "psnr")
-            row[f"x{factor}"] = told(own, ".2f")
-            if factor != "1":
-                enlarged = figure(shown, factor, "enlarged_psnr")
-                row[f"over{factor}"] = told([a - b for a, b in zip(own, enlarged, strict=True)], "+.2f")
-                row[f"photograph{factor}"] = told(figure(shown, factor, "photograph_psnr"), ".2f")
-                for name in ("render", "enlarged", "photograph"):
-                    share = figure(shown, factor, "detail", name, "explained")
-                    row[f"{name}_detail{factor}"] = f"{statistics.mean(share):+.3f}"
-        rows.append(row)
-    return rows
+def row_of(shown: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Figures over seeds at each zoom, beside the competitors'."""
+    row: dict[str, Any] = {"seeds": len(shown)}
+    for factor in ZOOMS if shown else ():
+        own = figure(shown, factor, "psnr")
+        row[f"x{factor}"] = told(own, ".2f")
+        if factor != "1":
+            enlarged = figure(shown, factor, "enlarged_psnr")
+            row[f"over{factor}"] = told([a - b for a, b in zip(own, enlarged, strict=True)], "+.2f")
+            row[f"photograph{factor}"] = told(figure(shown, factor, "photograph_psnr"), ".2f")
+            for name in ("render", "enlarged", "photograph"):
+                share = figure(shown, factor, "detail", name, "explained")
+                row[f"{name}_detail{factor}"] = f"{statistics.mean(share):+.3f}"
+    return row
 
 
-def section(given: argparse.Namespace, rows: list[dict[str, Any]], load: float, command: str) -> Section:
-    """The table of all scenes."""
-    columns = [["scene", "scene"], ["rule", "backbone.filter"], ["seeds", "seeds"], ["x1", "x1"]]
+def columns_of(kind: str, competitors: bool) -> list[list[str]]:
+    """Keys and headings; with what competitors have of detail."""
+    columns = [["scene", "scene"], ["name", kind], ["seeds", "seeds"], ["x1", "x1"]]
     for factor in ZOOMS[1:]:
         columns += [[f"x{factor}", f"x{factor}"], [f"over{factor}", f"x{factor} - x1 enlarged"]]
-        columns += [[f"photograph{factor}", f"photograph enlarged to x{factor}"]]
+        if competitors:
+            columns += [[f"photograph{factor}", f"photograph enlarged to x{factor}"]]
         columns += [[f"render_detail{factor}", f"detail x{factor}"]]
-        columns += [[f"enlarged_detail{factor}", "of x1 enlarged"], [f"photograph_detail{factor}", "of the photograph"]]
+        if competitors:
+            columns += [
+                [f"enlarged_detail{factor}", "of x1 enlarged"],
+                [f"photograph_detail{factor}", "of the photograph"],
+            ]
+    return columns
+
+
+Measured = tuple[str, list[list[str]], list[dict[str, Any]], str]
+"""Title, columns, rows, a note."""
+
+
+def rules(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Plain 3D-GS by each rule for zoomed cameras."""
+
+    def look(scene: str, seed: int) -> dict[str, Any]:
+        folder = trained(scene, seed, given, ["backbone=gs3d"])
+        return {rule: looked_at(folder, rule, [f"backbone.filter={rule}"]) for rule in RULES}
+
+    found = over_seeds(look, scenes, given)
+    rows = [{"scene": s, "name": rule} | row_of([one[rule] for one in found[s]]) for s in scenes for rule in RULES]
     note = (
         "Plain 3D-GS trained by photographs alone, drawn by each rule; PSNR on held-out views and explained detail "
         "above the training Nyquist frequency, means over seeds ± half their range; differences seed by seed."
     )
-    return stamped("Ways of looking closer", columns, rows, [note], load, command)
+    return "Ways of looking closer", columns_of("backbone.filter", competitors=True), rows, note
+
+
+def compositions(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Trained for zooming in, and not."""
+    return "Compositions for zooming in", *compared(COMPOSITIONS, scenes, given)
+
+
+def pictures(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """With pseudo details, enlarged by a filter or true."""
+    return "Pseudo details on a composition for zooming in", *compared(PICTURES, scenes, given)
+
+
+def compared(
+    named: dict[str, tuple[str, ...]], scenes: Sequence[str], given: argparse.Namespace
+) -> tuple[list[list[str]], list[dict[str, Any]], str]:
+    """(columns, rows, a note) of compositions by name, each against the first with the same seed."""
+    base = next(iter(named))
+
+    def look(scene: str, seed: int) -> dict[str, Any]:
+        folders = {name: trained(scene, seed, given, words, name) for name, words in named.items()}
+        return {name: read_json(folder / "evaluation.json") for name, folder in folders.items()}
+
+    found, rows = over_seeds(look, scenes, given), []
+    for scene in scenes:
+        for name in named:
+            pairs = [(one[name], one[base]) for one in found[scene]]
+            row = {"scene": scene, "name": name} | row_of([own["zoom"] for own, _ in pairs])
+            for factor in ZOOMS:
+                gains = [own["zoom"][factor]["psnr"] - first["zoom"][factor]["psnr"] for own, first in pairs]
+                row[f"more{factor}"] = told(gains, "+.2f")
+            times = [own["train_seconds"] / first["train_seconds"] for own, first in pairs]
+            row["primitives"] = round(statistics.mean(own["primitives"] for own, _ in pairs))
+            rows.append(row | {"times": f"{statistics.median(times):.2f}"})
+    columns = columns_of("composition", competitors=False)
+    columns += [[f"more{factor}", f"x{factor} - {base}"] for factor in ZOOMS]
+    columns += [["primitives", "primitives"], ["times", f"training time / {base}"]]
+    note = (
+        "PSNR on held-out views and explained detail above the training Nyquist frequency, means over seeds ± half "
+        "their range; differences seed by seed. Runs take the same steps; times are medians of ratios, two at a time."
+    )
+    return columns, rows, note
+
+
+def afar(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """A quarter of the resolution of training, by each way of looking."""
+
+    def look(scene: str, seed: int) -> dict[str, Any]:
+        out = {}
+        for name, words in COMPOSITIONS.items():
+            folder = trained(scene, seed, given, words, name)
+            for way, more in WAYS.items():
+                kept = "_".join(["afar", *re.findall(r"\w+", way)])
+                out[name, way] = looked_at(folder, kept, [f"eval.zoom=[{AFAR}]", *more])[AFAR]
+        return out
+
+    found, rows = over_seeds(look, scenes, given), []
+    for scene in scenes:
+        for name in COMPOSITIONS:
+            for way in WAYS:
+                shown = [one[name, way]["psnr"] for one in found[scene]]
+                rows.append({"scene": scene, "name": name, "way": way, "seeds": len(shown), "psnr": told(shown, ".2f")})
+    columns = [["scene", "scene"], ["name", "composition"], ["way", "looked at by"], ["seeds", "seeds"]]
+    note = "PSNR on held-out views at a quarter of the training resolution, means over seeds ± half their range."
+    return "Looking from afar", [*columns, ["psnr", "x1/4"]], rows, note
+
+
+def over_seeds(
+    look: Callable[[str, int], dict[Any, Any]], scenes: Sequence[str], given: argparse.Namespace
+) -> dict[str, list[dict[Any, Any]]]:
+    """What was found with every seed, by scene."""
+    with ThreadPoolExecutor(given.jobs) as pool:
+        tasks = {(scene, seed): pool.submit(look, scene, seed) for seed in range(given.seeds) for scene in scenes}
+        return {scene: [tasks[scene, seed].result() for seed in range(given.seeds)] for scene in scenes}
+
+
+WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
+    "rules": rules,
+    "compositions": compositions,
+    "pictures": pictures,
+    "afar": afar,
+}
 
 
 def main(words: Sequence[str]) -> None:
-    """Train and look, and write the table."""
+    """Train and look, and write the tables."""
     given = arguments(words)
     machine, load = describe_machine(torch.device("cpu")), told_load()
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "zoom_cpu.json")  # what cannot be added to is refused before training
-    unknown = [name for name in given.only.split(",") if name not in SUBJECTS]
+    for asked, known in ((given.only, SUBJECTS), (given.what, WHAT)):
+        if unknown := [name for name in asked.split(",") if name not in known]:
+            sys.exit(f"{', '.join(unknown)}: choose from {', '.join(known)}")
     scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
-    if unknown or not scenes:
-        sys.exit(f"--only {given.only}: choose from {', '.join(SUBJECTS)}; all but demo need --scenes FOLDER")
-    with ThreadPoolExecutor(given.jobs) as pool:
-        for future in [pool.submit(train_and_look, s, seed, given) for seed in range(given.seeds) for s in scenes]:
-            future.result()
-    rows = [row for scene in scenes for row in rows_of(scene, given)]
-    table = section(given, rows, load, shown_command(words, "benchmarks/zoom.py"))
-    write_results(given.to, "zoom_cpu", machine, {"rules": table})
-    print(text_table(table))
+    if not scenes:
+        sys.exit(f"--only {given.only}: all but demo need --scenes FOLDER")
+    for name in given.what.split(","):
+        title, columns, rows, note = WHAT[name](scenes, given)
+        table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/zoom.py"))
+        write_results(given.to, "zoom_cpu", machine, {name: table})
+        print(text_table(table))
 
 
 if __name__ == "__main__":

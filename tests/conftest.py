@@ -9,7 +9,7 @@ from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
 
-COMPILED = {"gsx.core.rasterizer.kernels", "gsx.core.rasterizer.geometry"}
+COMPILED = {f"gsx.core.rasterizer.{name}" for name in ("kernels", "geometry", "pixel_windows")}
 """torch.compile must see these functions themselves, not the checks around them."""
 
 

@@ -50,16 +50,23 @@ def published_options(**density: float) -> GS3DOptions:
     return replace(options, density=replace(options.density, **density))
 
 
-def small_gs3d(scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None) -> GS3D:
-    """The backbone at step 0."""
-    context = BackboneContext(
+def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **more: int) -> BackboneContext:
+    """What a backbone on the CPU is built from."""
+    return BackboneContext(
         scene=scene,
         iterations=iterations,
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
+        **more,
     )
-    return gs3d(options or published_options(), context)
+
+
+def small_gs3d(
+    scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None, **more: int
+) -> GS3D:
+    """The backbone at step 0; `more`: of its context."""
+    return gs3d(options or published_options(), small_context(scene, iterations=iterations, seed=seed, **more))
 
 
 def spread(count: int, seed: int = 0) -> Tensor:

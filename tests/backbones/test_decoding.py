@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_scene import small_context, small_scene, spread
 from test_heads import SMALL, heads_of
 from torch import Tensor
 from torch.nn import Parameter
@@ -36,7 +37,7 @@ class Fixed(Heads):
 
 MIP = MipFilter(
     options=MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=1000),
-    cameras=[],
+    context=small_context(small_scene(spread(4))),
     schedule=Schedule(iterations=1000, published_iterations=1000, views=1),
     settled=500,
 )

@@ -82,12 +82,12 @@ class Anchors:
     ) -> None:
         scene, points = context.scene, context.points()
         self.options, self.representation, self.sh = options, representation, sh
-        self.network_rates, self.extent = network_rates, scene.extent
+        self.network_rates, self.extent, self.finer_after = network_rates, scene.extent, context.finer_after
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
         self.views = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = context.schedule(options.published_iterations)
-        self.filter = filter_named(options.filter, options.mip, self.cameras, self.schedule, options.growth.stop)
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, options.growth.stop)
         self.raster = self.filter.rules(context.raster)
         self.grid = grid_of(options, context, self.schedule, points.positions.float())
         self.table = self.initial_table(points, networks, context.device)
@@ -153,10 +153,10 @@ class Anchors:
 
     def densify_and_prune(self, step: int) -> dict[str, int]:
         """Grow and prune when due (Scaffold-GS, train.py)."""
-        if not self.growth_due(step):
+        if not self.growth_due(step) and step != self.finer_after:
             return {}
-        done = self.grow_and_prune(step)
-        self.filter.refresh(self.table, self.table["anchors"])
+        done = self.grow_and_prune(step) if self.growth_due(step) else {}
+        self.filter.refresh(self.table, self.table["anchors"], step)
         return done
 
     def growth_due(self, step: int) -> bool:

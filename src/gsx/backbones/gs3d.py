@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
-from gsx.backbones.mip import filter_named, logit_of_log
+from gsx.backbones.mip import absorb, filter_named, logit_of_log
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
@@ -56,10 +56,9 @@ class GS3D:
         self.options, self.visibility, self.extent = options, visibility, scene.extent
         self.schedule = context.schedule(options.published_iterations)
         self.control = DensityControl(density, options.max_primitives, context, self.schedule, densification)
-        cameras = [view.camera for view in scene.train]
-        self.filter = filter_named(options.filter, options.mip, cameras, self.schedule, density.stop)
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, density.stop)
         self.raster = self.filter.rules(context.raster)
-        self.absolute_gradient = density.absolute
+        self.absolute_gradient, self.finer_after = density.absolute, context.finer_after
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
 
@@ -113,7 +112,10 @@ class GS3D:
         """Clone, split, prune and reset when due."""
         done = self.control.densify(self.table, step) if self.control.due(step) else {}
         if done or self.filter.due(step):
-            self.filter.refresh(self.table, self.table["means"])
+            before = self.table.columns.get("filter")
+            self.filter.refresh(self.table, self.table["means"], step)
+            if step == self.finer_after and before is not None:  # the picture goes on as it was
+                absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)
             done["opacity_resets"] = 1
@@ -125,11 +127,12 @@ class GS3D:
 
     def set_rates(self, step: int) -> None:
         """Learning rates of a step (3D-GS, arguments)."""
-        rates = self.options.rates
-        of_means = log_linear(step, self.means_rate_steps(), rates.means_first, rates.means_last)
+        rates, faster = self.options.rates, self.schedule.shortened(self.options.rates.shortened)
+        of_means = log_linear(step, self.means_rate_steps(), faster * rates.means_first, rates.means_last)
         self.table.set_rate("means", self.extent * of_means)
-        for name in ("sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"):
-            self.table.set_rate(name, getattr(rates, name))
+        self.table.set_rate("opacity_logits", rates.opacity_logits)
+        for name in ("sh_dc", "sh_rest", "log_scales", "quats"):
+            self.table.set_rate(name, faster * getattr(rates, name))
 
     def update(self, step: int) -> None:
         """One Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
@@ -177,7 +180,7 @@ class GS3D:
             **self.control.plan(),
             "sh_degree": {"every": max(1, self.schedule.step(self.options.sh_every)), "up_to": self.options.sh_degree},
             "means_rate": {
-                "from": rates.means_first * self.extent,
+                "from": self.schedule.shortened(rates.shortened) * rates.means_first * self.extent,
                 "to": rates.means_last * self.extent,
                 "over": self.means_rate_steps(),
             },

@@ -16,6 +16,13 @@ class Rates:
     opacity_logits: float
     log_scales: float
     quats: float
+    shortened: float = 0.0
+    """In a run of fewer steps than published, all but that of opacities are (published / taken)^shortened times as
+    high, that of means at first; 0: as published."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.shortened <= 1:
+            raise ValueError(f"backbone.rates.shortened is {self.shortened}; give an exponent from 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True)

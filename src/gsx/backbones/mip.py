@@ -10,11 +10,13 @@ from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.schedule import Schedule
 
@@ -70,8 +72,8 @@ class Filter(Protocol):
         """The rasterizer's rules with the 2D filter."""
         ...
 
-    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
-        """Bring the column `filter`, if there is one, to where the primitives are now."""
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
+        """Bring the column `filter`, if there is one, to where the primitives are after a step."""
         ...
 
     def due(self, step: int) -> bool:
@@ -98,7 +100,7 @@ class NoFilter:
         """Those given."""
         return raster
 
-    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """There is no column."""
 
     def due(self, step: int) -> bool:
@@ -139,8 +141,8 @@ class MipFilter:
     """Both filters of Mip-Splatting; sizes of the 3D filter are a column of the table, world units."""
 
     options: MipOptions
-    cameras: Sequence[Camera]
-    """Those of the training views."""
+    context: BackboneContext
+    """With the cameras of the training views."""
     schedule: Schedule
     settled: int
     """Published step at which density control ends: from there on the filter has a clock of its own."""
@@ -150,13 +152,16 @@ class MipFilter:
         """Dilation by the kernel, with compensated opacities."""
         return replace(raster, dilation=self.options.kernel, compensate=True)
 
-    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"]) -> None:
-        """Sizes from where the primitives are now (Mip-Splatting, compute_3D_filter)."""
-        table.columns["filter"] = filter_sizes(means.detach(), self.cameras, self.options)
+    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
+        """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
+        table.columns["filter"] = filter_sizes(means.detach(), self.context.rendered_cameras(step), self.options)
 
     def due(self, step: int) -> bool:
-        """Every interval between the end of density control and the freezing of the filter (Mip-Splatting)."""
+        """Every interval between the end of density control and the freezing of the filter (Mip-Splatting), and where
+        renders become finer."""
         options, schedule = self.options, self.schedule
+        if step == self.context.finer_after:
+            return True
         inside = schedule.step(self.settled) < step < schedule.step(options.stop)
         return inside and step % schedule.interval(options.every) == 0
 
@@ -172,13 +177,14 @@ class MipFilter:
         return smoothed(scales, log_opacities, sizes if rows is None else sizes[rows])
 
 
-def filter_named(name: str, options: MipOptions, cameras: Sequence[Camera], schedule: Schedule, settled: int) -> Filter:
-    """The filter of that name; see `MipFilter`."""
+def filter_named(name: str, options: MipOptions, context: BackboneContext, schedule: Schedule, settled: int) -> Filter:
+    """The filter of that name; see `MipFilter`. Supersampled training counts as cameras that are so much finer for the
+    3D filter, which bounds what can be learnt, and not for the dilation, which is a part of what is learnt."""
     if name == "none":
         return NoFilter()
     if name in ("magnified", "resampled"):
-        return ZoomedRule(zoomed=name, cameras=cameras)
-    return MipFilter(options=options, cameras=cameras, schedule=schedule, settled=settled)
+        return ZoomedRule(zoomed=name, cameras=[view.camera for view in context.scene.train])
+    return MipFilter(options=options, context=context, schedule=schedule, settled=settled)
 
 
 def checked_filter(name: str) -> None:
@@ -237,6 +243,17 @@ def smoothed(
     """
     wide = torch.hypot(scales, sizes[:, None])
     return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
+
+
+@torch.no_grad()
+def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tensor, "N"]) -> None:
+    """Change stored scales and opacities so that what is drawn stays as it is when the 3D filter goes from sizes
+    `before` to smaller ones `after`: s'^2 = s^2 + before^2 - after^2, o' = o prod_k s_k / s'_k."""
+    scales = table["log_scales"].exp()
+    wider = (scales.square() + (before.square() - after.square()).clamp_min(0)[:, None]).sqrt()
+    log_opacities = logsigmoid(table["opacity_logits"]) + (scales / wider).clamp_min(LEAST_SHARE).log().sum(1)
+    table["log_scales"].copy_(wider.log())
+    table["opacity_logits"].copy_(logit_of_log(log_opacities))
 
 
 def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:

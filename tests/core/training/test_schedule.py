@@ -1,9 +1,11 @@
 """Schedules against the published step numbers."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_scene import small_gs3d, small_scene, spread
+from small_scene import published_options, small_gs3d, small_scene, spread
 
 from gsx.core.training.schedule import Schedule, log_linear
 
@@ -18,6 +20,26 @@ def schedule(iterations: int, views: int = 100) -> Schedule:
 )
 def test_position_rate_at_published_steps(step: int, rate: float) -> None:
     assert log_linear(step, 30000, 1.6e-4, 1.6e-6) == pytest.approx(rate, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "exponent", "factor"),
+    [(30000, 0.4, 1), (60000, 0.4, 1), (3000, 0.0, 1), (3000, 0.5, 10**0.5), (1200, 1.0, 25), (1000, 0.4, 3.89806)],
+)
+def test_shortened_runs_learn_faster_by_a_power_of_how_short_they_are(
+    iterations: int, exponent: float, factor: float
+) -> None:
+    assert schedule(iterations).shortened(exponent) == pytest.approx(factor, rel=1e-6)
+    published = published_options()
+    options = replace(published, rates=replace(published.rates, shortened=exponent))
+    model = small_gs3d(small_scene(spread(4)), iterations=iterations, options=options)
+    model.set_rates(0)
+    for name, own in (("sh_dc", 0.0025), ("sh_rest", 1.25e-4), ("log_scales", 0.005), ("quats", 0.001)):
+        assert model.table.group(name)["lr"] == pytest.approx(factor * own, rel=1e-6)
+    assert model.table.group("opacity_logits")["lr"] == 0.05
+    assert model.table.group("means")["lr"] == pytest.approx(factor * 1.6e-4, rel=1e-6)
+    model.set_rates(iterations)
+    assert model.table.group("means")["lr"] == pytest.approx(1.6e-6, rel=1e-6)
 
 
 @given(middle=st.integers(1, 999), reach=st.integers(1, 500), first=st.floats(1e-6, 1), last=st.floats(1e-6, 1))

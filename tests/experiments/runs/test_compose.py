@@ -1,5 +1,6 @@
 """Composition: every file composes, typed options, nearest matches."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant
 NEEDS = {
     ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
     ("preset", "octree"): ("backbone=octree_scaffold",),
+    ("preset", "zoom"): ("backbone=mip_splatting",),
     ("preset", "clone"): ("backbone=octree_gs3d",),
     ("dataset", "own"): ("+dataset.scenes.yard=Yard", "dataset.scene=yard"),
 }
@@ -86,6 +88,16 @@ def test_published_values_of_gs3d() -> None:
     assert (density.start, density.stop, density.every, density.reset_every) == (500, 15000, 100, 3000)
 
 
+@pytest.mark.parametrize("backbone", ["gs3d", "mip_splatting"])
+def test_the_preset_for_zooming_in_holds_for_both_forms_of_gaussians(backbone: str) -> None:
+    plain, zoom = (compose([f"backbone={backbone}", *words], plugins()) for words in ([], ["preset=zoom"]))
+    assert (plain.training.supersample, plain.backbone.options.rates.shortened) == (1, 0.0)
+    assert (zoom.training.supersample, zoom.training.supersample_from) == (2, 0.5)
+    assert (zoom.backbone.options.filter, zoom.backbone.options.rates.shortened) == ("mip", 0.4)
+    published = compose([f"backbone={backbone}", "preset=zoom", "iterations=30000"], plugins()).backbone.options
+    assert published.rates == replace(plain.backbone.options.rates, shortened=0.4)  # the same where nothing is shorter
+
+
 def test_common_scene_defaults_agree_with_the_schema() -> None:
     values = OmegaConf.to_container(OmegaConf.load(CONF / "images.yaml"))
     built = SceneOptions(name="x", background=[0, 0, 0], **values)
@@ -121,6 +133,9 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["backbone.sh_degree=4"], "choose 0 to 3"),
         (["backbone.initial_opacity=1"], "between 0 and 1"),
         (["backbone.rates.means_first=0"], "must be positive"),
+        (["backbone.rates.shortened=2"], "backbone.rates.shortened is 2.0; give an exponent from 0 to 1"),
+        (["training.supersample_from=1"], "training.supersample_from is 1.0; give a share of the steps"),
+        (["backbone=scaffold", "preset=zoom"], "'backbone.rates.shortened' is no configuration key"),
         (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
         (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),
     ],

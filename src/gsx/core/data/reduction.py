@@ -47,10 +47,14 @@ class Reduction:
         results are clamped to [0, 1], like photographs."""
         if factor == 1:
             return image
-        if self.light == "linear":
-            return display_from_linear(self.linear(linear_from_display(image.clamp(0, 1)), factor))
-        low = self.linear(image, factor)
-        return low if self.filter == "area" else low.clamp(0, 1)
+        low = self.formed(image.clamp(0, 1) if self.light == "linear" else image, factor)
+        return low if (self.filter, self.light) == ("area", "display") else low.clamp(0, 1)
+
+    def formed(self, image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
+        """The same without a clamp: what lies beyond [0, 1] is pulled back by a loss."""
+        if self.light == "display":
+            return self.linear(image, factor)
+        return display_from_linear(self.linear(linear_from_display(image), factor), limited=False)
 
     def linear(self, image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
         """The filter alone, on display values or light: D."""

@@ -16,13 +16,14 @@ LIGHTS = ("display", "linear")
 
 
 def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Light of display values in [0, 1] (IEC 61966-2-1, sRGB)."""
-    return torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    """Light of display values (IEC 61966-2-1, sRGB), below 0 by the straight part of the curve."""
+    bright = display.clamp_min(0.04045)  # a power of what is negative is nan, and so is its gradient
+    return torch.where(display <= 0.04045, display / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
-def display_from_linear(light: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Display values of light, clamped to [0, 1] (IEC 61966-2-1, sRGB)."""
-    light = light.clamp(0, 1)
+def display_from_linear(light: Float[Tensor, "*shape"], limited: bool = True) -> Float[Tensor, "*shape"]:
+    """Display values of light, clamped to [0, 1] unless not `limited` (IEC 61966-2-1, sRGB)."""
+    light = light.clamp(0, 1) if limited else light
     bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
 

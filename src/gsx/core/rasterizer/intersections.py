@@ -22,6 +22,9 @@ FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""
 CUTOFF_SLACK = 1e-3
 """Added to ln(alpha / alpha_min) when tiles are chosen, so that rounding never drops a pixel at the cut-off."""
+WINDOW_REACH = 1.25
+"""Px from its centre within which all light of a pixel lies where windows are kept: half a diagonal, and as much as a
+window grows where a needle leaves light at both of its sides."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,16 +73,21 @@ def on_raster(first: Int[Tensor, "M 2"], last: Int[Tensor, "M 2"], camera: Camer
     return (last.minimum(corner + size) > first.maximum(corner)).all(1)
 
 
+def reach_of(settings: RasterSettings) -> float:
+    """How far from a pixel's centre a splat still matters to it, px."""
+    return WINDOW_REACH if settings.pixel == "window" else 0.0
+
+
 def cutoff(log_opacities: Float[Tensor, "M"], alpha_min: float) -> Float[Tensor, "M"]:
     """Largest value of s^2 + r^2 at which alpha is still at least alpha_min; negative: nowhere."""
     return log_opacities - math.log(alpha_min) + CUTOFF_SLACK
 
 
 def tile_ranges(
-    screen: ScreenSplats, limits: Float[Tensor, "M"], grid: TileGrid
+    screen: ScreenSplats, limits: Float[Tensor, "M"], grid: TileGrid, reach: float
 ) -> tuple[Int[Tensor, "M 2"], Int[Tensor, "M 2"]]:
     """First and past-the-last tile (counted on the frame) of each splat's bounding box, cut to the raster."""
-    half = (2 * limits.clamp_min(0)[:, None] * screen.covariances[:, ::2]).sqrt()
+    half = (2 * limits.clamp_min(0)[:, None] * screen.covariances[:, ::2]).sqrt() + reach
     begin = torch.tensor(grid.first, device=half.device, dtype=torch.int32)
     end = begin + torch.tensor(grid.shape, device=half.device, dtype=torch.int32)
     first, last = touched(screen.means - half, grid.tile), touched(screen.means + half, grid.tile, past=True)
@@ -99,15 +107,17 @@ def row_spans(
     limit: Float[Tensor, "R"],
     row: Int[Tensor, "R"],
     tile: int,
+    reach: float = 0.0,
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
-    """First and past-the-last column (counted on the frame) at which the ellipse s^2 + r^2 <= limit meets a tile row.
+    """First and past-the-last column (counted on the frame) at which the ellipse s^2 + r^2 <= limit meets a tile row,
+    or comes as near to its outermost pixel centres as `reach` px.
 
     Exact: the part of an ellipse between two lines is convex, so its tiles on the row are those of its x-interval.
     """
     u0, u1, u2 = factor.unbind(1)
-    top = row * tile + 0.5 - mean[:, 1]
+    top = row * tile + (0.5 - reach) - mean[:, 1]
     height = limit.sqrt() / u2
-    low, high = top.maximum(-height), (top + (tile - 1)).minimum(height)
+    low, high = top.maximum(-height), (top + (tile - 1 + 2 * reach)).minimum(height)
     rightmost = -u1 * height * torch.rsqrt(u1 * u1 + u2 * u2)
 
     def half_width(y: Tensor) -> Tensor:
@@ -116,7 +126,7 @@ def row_spans(
     at_right, at_left = rightmost.maximum(low).minimum(high), (-rightmost).maximum(low).minimum(high)
     right = mean[:, 0] + (half_width(at_right) - u1 * at_right) / u0
     left = mean[:, 0] - (half_width(at_left) + u1 * at_left) / u0
-    first, last = touched(left, tile), touched(right, tile, past=True)
+    first, last = touched(left - reach, tile), touched(right + reach, tile, past=True)
     return first, torch.where(low <= high, last, first)
 
 
@@ -131,8 +141,8 @@ def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettin
         limits = cutoff(screen.log_opacities, settings.alpha_min)
         radii = published_radii(screen.covariances)
         window_first, window_last = published_windows(screen.means, radii, camera.frame)
-        first, last = tile_ranges(screen, limits, grid)
-        if settings.cull == "published":
+        first, last = tile_ranges(screen, limits, grid, reach_of(settings))
+        if settings.cull == "published" and settings.pixel == "sample":
             first = first.maximum(window_first // grid.tile)
             last = last.minimum(window_last // grid.tile).maximum(first)
         seen = on_raster(window_first, window_last, camera)
@@ -162,7 +172,8 @@ def reached_tiles(
     top = first[order, 1] - (heights.cumsum(0) - heights).int()
     top, left, right = torch.stack([top, first[order, 0], last[order, 0]], 1).index_select(0, rank).unbind(1)
     row = top + torch.arange(len(rank), device=rank.device, dtype=torch.int32)
-    begin, end = row_spans(shapes[:, :2], shapes[:, 2:5], shapes[:, 5], row, grid.tile)
+    reach = reach_of(settings)
+    begin, end = row_spans(shapes[:, :2], shapes[:, 2:5], shapes[:, 5], row, grid.tile, reach)
     begin, end = begin.maximum(left), end.minimum(right)
     widths = (end - begin).clamp_min_(0).long()
     refuse_too_many(int(widths.sum()), grid, settings)

@@ -148,11 +148,13 @@ def project(
     low, high = slope_bounds(intrinsics, camera.frame, margin)
     rotation = camera.rotation.to(scales)
     drawn, rules = 0.0, tuple[Any, ...]((settings.dilation, settings.compensate))
-    if settings.zoomed != "plain":  # numbers that differ from camera to camera are no constants of compiled code
+    if not settings.published_dilation:  # numbers that differ from camera to camera are no constants of compiled code
         dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
         rules = scales.new_tensor(dilation), False, scales.new_tensor(drawn) if drawn else None
     worthwhile = len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type)
-    compute = compiled_geometry(settings.zoomed, settings.compensate, bool(drawn)) if worthwhile else geometry
+    compute = (
+        compiled_geometry(settings.published_dilation, settings.compensate, bool(drawn)) if worthwhile else geometry
+    )
     means, covariances, conic_factors, compensation = compute(
         points, scales, quats, rotation, intrinsics, low.to(scales), high.to(scales), *rules
     )
@@ -192,6 +194,6 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 
 
 @functools.lru_cache
-def compiled_geometry(zoomed: str, compensate: bool, exchange: bool) -> Geometry:
+def compiled_geometry(published: bool, compensate: bool, exchange: bool) -> Geometry:
     """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
     return compile_rows(geometry)

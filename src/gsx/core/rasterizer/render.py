@@ -12,6 +12,7 @@ from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
+from gsx.core.rasterizer.pixel_windows import composite_windows
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -75,6 +76,8 @@ def blend(
     """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for."""
     inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, channels)
     grid = TileGrid.of(camera, settings.tile_size)
+    if settings.pixel == "window":
+        return blend_in_windows(screen, means2d_offset, channels, intersections, grid, settings, absgrad, max_weight)
     if takes(settings, channels.shape[1], len(intersections.splats), max_weight, means2d_offset.device.type):
         return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
@@ -84,6 +87,27 @@ def blend(
         return blended, None
     zeros = by_entry.new_zeros(len(screen.ids) + 1)
     return blended, zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
+
+
+def blend_in_windows(
+    screen: ScreenSplats,
+    means2d_offset: Float[Tensor, "M 2"],
+    channels: Float[Tensor, "M C"],
+    intersections: TileIntersections,
+    grid: TileGrid,
+    settings: RasterSettings,
+    absgrad: Float[Tensor, "M 2"] | None,
+    max_weight: bool,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+    """The same by Gaussian Blending."""
+    means, splats = screen.means + means2d_offset, intersections.splats
+    most = means.new_zeros(len(splats)) if max_weight else None
+    blended = composite_windows(
+        screen, means, channels, intersections, grid, settings, absgrad=absgrad, max_weights=most
+    )
+    if most is None:
+        return blended, None
+    return blended, means.new_zeros(len(screen.ids)).scatter_reduce_(0, splats, most, "amax")
 
 
 def rasterize(

@@ -8,6 +8,7 @@ WINDOW_TILE = 16
 
 CHOICES = {
     "cull": ("published", "tight"),
+    "pixel": ("sample", "window"),
     "zoomed": ("plain", "magnified", "resampled"),
     "path": ("auto", "eager", "compiled"),
     "schedule": ("auto", "chunks", "segments"),
@@ -23,6 +24,10 @@ OF_BACKBONES = ("zoomed", "training_focal")
 """Fields that are no options of the rasterizer: backbones set them."""
 PIXEL_VARIANCE = 0.1
 """Variance of the Gaussian that zoomed=resampled takes a rendered pixel for, px^2 (Mip-Splatting)."""
+BOX_VARIANCE = 1 / 12
+"""Of a pixel as a square, px^2: pixel=window takes it from a dilation, because the integral over the pixel adds it."""
+LEAST_VARIANCE = 1e-6
+"""Dilation of splats that are to have none, px^2: everything stays positive."""
 LARGEST_HALF = 65504.0
 """Of float16."""
 LARGEST_BATCH = 1 << 27
@@ -44,6 +49,11 @@ class RasterSettings:
     picture at k = 1 sampled more finely (SA-GS). `resampled`: what it is sampled from, sampled by the pixels of this
     camera: dilation (d - 0.1) k^2 + 0.1, opacities (at most alpha_max) compensated from d k^2. Backbones choose it
     (`backbone.filter`)."""
+    pixel: str = "sample"
+    """What a splat is to a pixel. `sample`: its value at the pixel's centre, dilated, as published (compensated for it:
+    Mip-Splatting). `window`: its integral over what is left of the pixel (Gaussian Blending): exact where splats cover
+    parts of pixels, above all from afar; several times slower. Instead of the dilation, of which 1/12 px^2 are the
+    pixel's own: all of a compensated one is left out."""
     training_focal: float = 0.0
     """Largest focal length of the training cameras, px, as the backbone knows it; 0: every camera counts as one of
     them."""
@@ -112,6 +122,8 @@ class RasterSettings:
             raise ValueError(
                 f"rasterizer.zoomed=resampled needs a dilation above {PIXEL_VARIANCE}, not {self.dilation}"
             )
+        if self.pixel == "window":
+            self._check_windows()
         if not 0 < self.alpha_min < self.alpha_max < 1:
             raise ValueError(f"need 0 < alpha_min < alpha_max < 1, got {self.alpha_min} and {self.alpha_max}")
         if not 0 <= self.transmittance_stop < 1:
@@ -120,6 +132,15 @@ class RasterSettings:
             )
         if not self.jacobian_margin >= 0:
             raise ValueError(f"rasterizer.jacobian_margin is {self.jacobian_margin}; give a number of 0 or more")
+
+    def _check_windows(self) -> None:
+        if not self.compensate and self.dilation <= BOX_VARIANCE:
+            raise ValueError(f"rasterizer.pixel=window needs a dilation above 1/12 px^2, not {self.dilation}")
+        for role in ("evaluation", "accumulation"):
+            if getattr(self, role) not in ("float32", "float64"):
+                raise ValueError(
+                    f"rasterizer.pixel=window works in float32 or float64, not {role}={getattr(self, role)}"
+                )
 
     def _check_sizes(self) -> None:
         if self.tile_size < 1:
@@ -162,11 +183,20 @@ class RasterSettings:
     def dilation_at(self, focal: float) -> tuple[float, float]:
         """(dilation, the dilation that opacities are compensated from or 0), px^2, for a focal length in px."""
         ratio = focal / self.training_focal if self.training_focal else 1.0
+        dilation, drawn = self.dilation, 0.0
         if self.zoomed == "magnified":
-            return self.dilation * max(1.0, ratio) ** 2, 0.0
-        if self.zoomed == "resampled" and ratio != 1:
-            return (self.dilation - PIXEL_VARIANCE) * ratio**2 + PIXEL_VARIANCE, self.dilation * ratio**2
-        return self.dilation, 0.0
+            dilation = self.dilation * max(1.0, ratio) ** 2
+        elif self.zoomed == "resampled" and ratio != 1:
+            dilation = (self.dilation - PIXEL_VARIANCE) * ratio**2 + PIXEL_VARIANCE
+            drawn = self.dilation * ratio**2
+        if self.pixel == "sample":
+            return dilation, drawn
+        return (LEAST_VARIANCE, 0.0) if self.compensate else (dilation - BOX_VARIANCE, drawn or dilation)
+
+    @property
+    def published_dilation(self) -> bool:
+        """Whether all cameras dilate by `dilation`, compensated or not."""
+        return self.zoomed == "plain" and self.pixel == "sample"
 
     @property
     def largest_exponent(self) -> float:

@@ -31,6 +31,15 @@ class BackboneContext:
     """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
+    supersample: int = 1
+    """How many times as fine as photographs they are rendered (`training.supersample`)."""
+    finer_after: int = 0
+    """Step after which they are."""
+
+    def rendered_cameras(self, step: int) -> list[Camera]:
+        """Those that the next step renders by: of the photographs, as fine as they are rendered then."""
+        times = self.supersample if step >= self.finer_after else 1
+        return [view.camera.zoom(times) for view in self.scene.train]
 
     def points(self) -> PointCloud:
         """What the model starts from.

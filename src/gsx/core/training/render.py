@@ -1,11 +1,14 @@
 """A run's model drawn for one camera, as it is now."""
 
+from dataclasses import replace
+
 import torch
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.training.run import Run
+from gsx.core.training.supersampling import reduced, times_as_fine, with_rim
 
 
 @torch.no_grad()
@@ -15,11 +18,18 @@ def splats_for(run: Run, camera: Camera) -> Splats:
 
 
 @torch.no_grad()
-def render(run: Run, camera: Camera, pixels: int = TILE_PIXELS) -> TiledRendering:
+def render(
+    run: Run, camera: Camera, pixels: int = TILE_PIXELS, supersample: int = 0, splats: Splats | None = None
+) -> TiledRendering:
     """The model after the run's steps, over the scene's background; colours clamped to [0, 1].
 
-    Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU.
+    Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
+    `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
     """
-    tiled = rasterize_tiled(splats_for(run, camera), camera, run.raster, background=run.background, pixels=pixels)
-    tiled.image.clamp_(0, 1)
-    return tiled
+    times = supersample or times_as_fine(camera, run.scene.train, run.supersample_at(run.model_step))
+    wide, window = with_rim(camera, run.scene.reduction, times)
+    finer = wide if times == 1 else wide.zoom(times)
+    drawn = splats_for(run, wide) if splats is None else splats
+    tiled = rasterize_tiled(drawn, finer, run.raster, background=run.background, pixels=pixels)
+    image, alpha = (reduced(part, window, run.scene.reduction, times) for part in (tiled.image, tiled.alpha[None]))
+    return replace(tiled, image=image.clamp_(0, 1), alpha=alpha[0])

@@ -32,13 +32,26 @@ class TrainingOptions:
     test_points: int = without_effect()
     batch: int = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
+    supersample: int = 1
+    """Renders are so many times as fine as photographs, and are reduced as these were before they are compared
+    (`core.training.supersampling`); whoever looks at the model does the same. 1: published."""
+    supersample_from: float = 0.0
+    """Share of the steps that are rendered at the photographs' resolution before that."""
 
     def __post_init__(self) -> None:
-        for name in ("batch", "log_every", "checkpoint_every", "checkpoints_kept"):
+        for name in ("batch", "supersample", "log_every", "checkpoint_every", "checkpoints_kept"):
             if getattr(self, name) < 1:
                 raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
+        if not 0 <= self.supersample_from < 1:
+            raise ValueError(
+                f"training.supersample_from is {self.supersample_from}; give a share of the steps from 0 to below 1"
+            )
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"training.ssim_weight is {self.ssim_weight}; give a value from 0 to 1")
+
+    def finer_after(self, iterations: int) -> int:
+        """Steps that a run of so many takes at the photographs' resolution before it renders more finely, if it does."""
+        return round(self.supersample_from * iterations) if self.supersample > 1 else 0
 
 
 @dataclass(eq=False)
@@ -147,6 +160,10 @@ class Run:
     def model_step(self) -> int:
         """The step by whose rules the model is drawn between steps: the last one done; before the first that one."""
         return max(1, self.step)
+
+    def supersample_at(self, step: int) -> int:
+        """How many times as fine as photographs they are rendered at a step."""
+        return self.training.supersample if step > self.training.finer_after(self.iterations) else 1
 
     @property
     def background(self) -> Float[Tensor, "3"]:

@@ -23,6 +23,10 @@ class Schedule:
         floor = min(published, math.ceil(passes * self.views))
         return max(1, self.step(published), floor)
 
+    def shortened(self, exponent: float) -> float:
+        """How many times fewer steps this run takes than the published one, to a power; 1 for longer runs."""
+        return max(1.0, self.published_iterations / self.iterations) ** exponent
+
 
 def log_linear(step: int, steps: int, first: float, last: float) -> float:
     """Interpolates from `first` to `last` with the logarithm linear in step / steps, held at `last` (3D-GS)."""

@@ -20,6 +20,7 @@ from torch import Tensor
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
+from gsx.core.rasterizer import TiledRendering
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Float
 from gsx.core.training.parameter_table import size_of
@@ -43,12 +44,16 @@ class EvalOptions:
     ssim: str
     tile_pixels: int
     lpips: LpipsOptions
+    supersample: int = 0
+    """Renders are so many times as fine as each picture and are reduced; 0: as the run was trained."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
+        if self.supersample < 0:
+            raise ValueError(f"eval.supersample is {self.supersample}; give at least 1, or 0 for what training does")
         if not self.zoom or not all(0 < factor < math.inf for factor in self.zoom):
             raise ValueError(f"eval.zoom is {list(self.zoom)}; give positive factors, for example [1,2,4]")
         if self.tile_pixels < LEAST_TILE_PIXELS:
@@ -156,10 +161,18 @@ class Evaluator:
         """The picture as metrics see it."""
         return quantise(image) if self.options.quantise else image
 
+    def rendered(self, view: View, factor: float = 1) -> TiledRendering:
+        """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
+        renders is drawn as finely as it was trained."""
+        times = self.options.supersample
+        if factor < 1 and not times and self.run.supersample_at(self.run.model_step) > 1:
+            times = math.ceil(self.run.supersample_at(self.run.model_step) / factor)
+        return render(self.run, view.camera, self.options.tile_pixels, times)
+
     def view(self, view: View) -> dict[str, Any]:
         """Figures of one view at the training resolution."""
         begun = time.perf_counter()
-        tiled = render(self.run, view.camera, self.options.tile_pixels)
+        tiled = self.rendered(view)
         self.times.append(time.perf_counter() - begun)
         image, truth = self.measured(tiled.image), view.image()
         self.kept[view] = to_uint8(image) if self.options.quantise else image
@@ -183,7 +196,7 @@ class Evaluator:
         finer = view.zoom(factor)
         if finer is None:
             return None
-        whole, image = self.whole(view), render(self.run, finer.camera, self.options.tile_pixels).image
+        whole, image = self.whole(view), self.rendered(finer, factor).image
         return Zoomed(
             view=finer,
             factor=factor,

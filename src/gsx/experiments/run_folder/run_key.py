@@ -111,12 +111,13 @@ def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
 
 def evaluation_settings(config: dict[str, Any]) -> dict[str, Any]:
     """How a composition is to be evaluated; saved with every evaluation (once as `judged`)."""
-    return {key: config.get(key) for key in EVALUATION} | {"filter": part(config, "backbone").get("filter")}
+    looked_by = {"filter": part(config, "backbone").get("filter"), "pixel": part(config, "rasterizer").get("pixel")}
+    return {key: config.get(key) for key in EVALUATION} | looked_by
 
 
 def evaluated_as(files: RunFiles, config: dict[str, Any]) -> dict[str, Any]:
-    """The settings that a run was evaluated by; those of older gsx do not tell the filter, which was the run's own."""
-    own = {"filter": evaluation_settings(config)["filter"]}
+    """The settings that a run was evaluated by; older gsx does not tell filter and pixel, which were the run's own."""
+    own = {key: evaluation_settings(config)[key] for key in ("filter", "pixel")}
     return own | part(files.evaluation, "settings" if "settings" in files.evaluation else "judged")
 
 

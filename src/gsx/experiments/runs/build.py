@@ -74,7 +74,15 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
 
     def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
-        context = BackboneContext(scene=scene, iterations=iterations, device=device, raster=raster, generator=generator)
+        context = BackboneContext(
+            scene=scene,
+            iterations=iterations,
+            device=device,
+            raster=raster,
+            generator=generator,
+            supersample=settings.training.supersample,
+            finer_after=settings.training.finer_after(iterations),
+        )
         return settings.backbone.component.factory(settings.backbone.options, context)
 
     backbone = anew(scene, general.iterations, generator)

@@ -8,7 +8,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
 from gsx.core.quality.metrics import psnr
-from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
 from gsx.core.training.backbone import WithOwnFile
 from gsx.core.training.render import render
@@ -28,6 +28,7 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *zoomed_note(run.raster),
+        *supersampling_note(run),
         *(own.file_notes() if own else ()),
         *([f"SplatRenderMode: {render_mode(run.raster)}"] if columns is None else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
@@ -50,6 +51,13 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
     return []
 
 
+def supersampling_note(run: Run) -> list[str]:
+    """How training saw the model, where that was through finer pixels."""
+    times = run.supersample_at(run.model_step)
+    filter_ = run.scene.reduction.filter
+    return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
+
+
 def render_mode(raster: RasterSettings) -> str:
     """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
 
@@ -63,7 +71,6 @@ def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View
     gaussians, pixels = read_gaussians(path), settings.evaluation.tile_pixels
     figures = []
     for view in views[:5]:
-        splats = splats_of(gaussians, view.camera.centre)
-        again = rasterize_tiled(splats, view.camera, run.raster, background=run.background.cpu(), pixels=pixels)
-        figures.append(psnr(again.image.clamp(0, 1), render(run, view.camera, pixels).image))
+        again = render(run, view.camera, pixels, splats=splats_of(gaussians, view.camera.centre))
+        figures.append(psnr(again.image, render(run, view.camera, pixels).image))
     return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical)"
