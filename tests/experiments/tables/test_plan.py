@@ -228,6 +228,20 @@ def test_words_of_a_component_go_to_the_rows_that_have_it(tmp_path: Path, capsys
     assert "regenerator.upscale.model=models/x2" in upscaled
 
 
+def test_a_row_may_be_overrides_instead_of_a_variant(tmp_path: Path) -> None:
+    words = ["+experiment=zoom_truth", "dataset=demo", f"output={tmp_path}", "experiment.dry=true", "iterations=400",
+             "experiment.seeds=[0]", "experiment.only=[zoom,zoom lanczos]"]  # fmt: skip
+    commands, _ = run_table([*words, "augmenter.upscale.weight_split=run"], plugins(), lambda config: None)
+    baseline, lanczos = sorted(commands.splitlines(), key=len)
+    for command in (baseline, lanczos):
+        assert command.startswith("gsx dataset=demo backbone=mip_splatting preset=zoom ")
+        assert "variant=" not in command
+    assert "augmenter=upscale regenerator/upscale=lanczos" in lanczos
+    assert "init=warm_start" in lanczos
+    assert "weight_split=run" in lanczos
+    assert "weight_split=run" not in baseline
+
+
 def test_a_changed_experiment_is_another_table_and_says_so(tmp_path: Path) -> None:
     words = ["+experiment=table_frameworks", "dataset=own", "+dataset.scenes.yard=Yard", f"output={tmp_path}",
              f"data_root={tmp_path}", "experiment.only=[3D-GS]"]  # fmt: skip

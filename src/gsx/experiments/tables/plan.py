@@ -32,7 +32,7 @@ class Experiment:
     baseline: str
     """Row that gains are over."""
     rows: dict[str, str]
-    """Variants by row."""
+    """By row a variant's name, or overrides with spaces between them."""
     quoted: dict[str, str] = field(default_factory=dict)
     """Rows that are not run, and why."""
     overrides: list[str] = field(default_factory=list)
@@ -57,8 +57,13 @@ class Experiment:
 
     @property
     def chosen(self) -> dict[str, str]:
-        """Variants by row that is run."""
+        """What each row is that is run."""
         return {row: variant for row, variant in self.rows.items() if not self.only or row in self.only}
+
+
+def words_of(row: str) -> list[str]:
+    """The overrides that a row of `Experiment.rows` stands for."""
+    return row.split() if "=" in row else [f"variant={row}"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,7 +132,8 @@ def cells_of(
     words: Callable[[str], Sequence[str]],
     compose: Callable[[list[str]], Settings],
 ) -> Iterator[Cell]:
-    """Every run of a table, in its order: scene by scene, row by row, seed by seed. `words`: overrides by variant.
+    """Every run of a table, in its order: scene by scene, row by row, seed by seed. `words`: of the command
+    line, by what a row is.
 
     Raises:
         ConfigError: a composition is wrong.
@@ -137,9 +143,9 @@ def cells_of(
         for scene in dataset["scenes"]:
             if experiment.scenes and scene not in experiment.scenes:
                 continue
-            for row, variant in experiment.chosen.items():
+            for row, what in experiment.chosen.items():
                 for seed in experiment.seeds:
-                    overrides = [f"dataset={name}", f"variant={variant}", *experiment.overrides, *words(variant)]
+                    overrides = [f"dataset={name}", *words_of(what), *experiment.overrides, *words(what)]
                     overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true"]
                     settings = compose(overrides)
                     options = str(settings.resolved["scene"])  # folders may be large: each is looked at once

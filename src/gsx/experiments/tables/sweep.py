@@ -15,7 +15,7 @@ from gsx.experiments.run_folder.run_key import sorted_items
 from gsx.experiments.runs.compose import Compositions, parse_overrides
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
-from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned
+from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned, words_of
 from gsx.experiments.tables.published import read_table
 from gsx.experiments.tables.table import Table, protocol_differences, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
@@ -117,24 +117,24 @@ def experiment_of(overrides: Sequence[str], compositions: Compositions) -> Exper
 def fitting_words(
     experiment: Experiment, datasets: Sequence[str], overrides: Sequence[str], compositions: Compositions
 ) -> dict[str, list[str]]:
-    """The overrides of each variant: those of a component (PARTS) only where the variant has such a key.
+    """The overrides for each row, by what it is: those of a component (PARTS) only where it has such a key.
 
     Raises:
-        ConfigError: no variant has it.
+        ConfigError: no row has it.
     """
     particular = [word for word in overrides if key_of(word) in PARTS and "." in word.partition("=")[0]]
     others = [word for word in overrides if word not in particular]
-    variants = set(experiment.chosen.values())
-    known = {v: compositions.keys([f"dataset={datasets[0]}", f"variant={v}", *others]) for v in variants if particular}
+    rows = set(experiment.chosen.values())
+    known = {row: compositions.keys([f"dataset={datasets[0]}", *words_of(row), *others]) for row in rows if particular}
     every = sorted({key for keys in known.values() for key in keys})
     for word in particular:
         if not word.startswith(("+", "~")) and (key := word.partition("=")[0]) not in every:
             raise ConfigError(f"'{key}' is no configuration key of any row.{nearest(key, every)}")
 
-    def fits(word: str, variant: str) -> bool:
-        return word not in particular or word.startswith(("+", "~")) or word.partition("=")[0] in known[variant]
+    def fits(word: str, row: str) -> bool:
+        return word not in particular or word.startswith(("+", "~")) or word.partition("=")[0] in known[row]
 
-    return {variant: [word for word in overrides if fits(word, variant)] for variant in variants}
+    return {row: [word for word in overrides if fits(word, row)] for row in rows}
 
 
 def refuse_taken(overrides: Sequence[str]) -> None:
@@ -169,8 +169,8 @@ def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Com
 
     def published(cell: Cell) -> dict[str, Any]:
         name = cell.dataset if cell.dataset in experiment.datasets else home
-        variant = experiment.rows[cell.row]
-        return compositions.settings([f"dataset={name}", f"variant={variant}", *experiment.overrides]).resolved
+        words = words_of(experiment.rows[cell.row])
+        return compositions.settings([f"dataset={name}", *words, *experiment.overrides]).resolved
 
     return protocol_differences([(cell.config, published(cell), cell.settings.idle) for cell in of_rows])
 
