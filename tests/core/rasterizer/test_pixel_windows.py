@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from raster_scenes import changed, front_camera, gradients, leaves, random_splats, soft_splats
+from tiny import tiny_run
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
+from gsx.core.files import read_json
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.available import available
@@ -261,6 +264,17 @@ def test_the_compiled_step_draws_the_same() -> None:
     eager = rasterize(splats, camera, WINDOW).image
     compiled = rasterize(splats, camera, replace(WINDOW, path="compiled")).image
     assert (compiled - eager).abs().max() <= 2e-5
+
+
+def test_a_run_is_trained_and_looked_at_by_windows(tmp_path: Path) -> None:
+    words = ["iterations=12", "rasterizer=eager", "backbone=mip_splatting"]
+    found = {}
+    for pixel in ("sample", "window"):
+        tiny_run(tmp_path / pixel, [*words, f"rasterizer.pixel={pixel}"])
+        found[pixel] = read_json(tmp_path / pixel / "evaluation.json")
+        assert found[pixel]["settings"]["pixel"] == pixel
+    assert found["window"]["psnr"] == pytest.approx(found["sample"]["psnr"], abs=0.5)
+    assert found["window"]["psnr"] != found["sample"]["psnr"]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import CheckpointError, ConfigError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians
+from gsx.core.training import checkpoint
 from gsx.experiments.runs.evaluate import remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
@@ -31,7 +33,7 @@ def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
 
 
 def resume(folder: Path, *overrides: str) -> None:
-    run, settings = open_run(folder, plugins(), overrides)
+    run, settings = open_run(folder, plugins(), overrides, training=True)
     execute(run, settings, plugins())
 
 
@@ -224,11 +226,32 @@ def test_the_zooms_looked_at_do_not_change_the_protocol_hash(finished: Path, tmp
     assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] != before
 
 
+def test_a_checkpoint_that_is_written_while_an_older_one_is_read_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
+    read = checkpoint.read
+
+    def slowly(sidecar: Path) -> Any:
+        found = read(sidecar)
+        for suffix in (".safetensors", ".json"):
+            shutil.copy(sidecar.with_suffix(suffix), sidecar.with_name("step_0000099").with_suffix(suffix))
+        return found
+
+    monkeypatch.setattr(checkpoint, "read", slowly)
+    open_run(folder, plugins(), training=True)
+    assert (folder / "checkpoints" / "step_0000099.json").is_file()
+
+
 def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
     newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
     shutil.copy(newest, newest.with_name("step_0000099.safetensors"))
     newest.with_name("step_0000099.json").write_text("{")
+    before = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    open_run(folder, plugins())  # who looks leaves all as it is
+    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == before
     resume(folder)
     assert [path.name for path in (folder / "checkpoints").glob("*.json")] == ["step_0000006.json"]

@@ -107,34 +107,37 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return meta, from_bytes(data)
 
 
-def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The newest undamaged checkpoint of a run folder; damaged ones are named in the log.
+def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]:
+    """The newest undamaged checkpoint of a run folder, and the newer ones that are damaged; these are named in the log.
 
     Raises:
         CheckpointError: there is none.
     """
-    problems = []
+    problems, damaged = [], list[Path]()
     for sidecar in reversed(sidecars(folder / "checkpoints")):
         try:
-            return read(sidecar)
+            return *read(sidecar), damaged
         except CheckpointError as error:
             logger.warning("%s", error)
             problems.append(str(error))
+            damaged.append(sidecar)
     if problems:
         raise CheckpointError(f"no checkpoint in {folder / 'checkpoints'} is usable: {problems[0]}")
     raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
 
 
-def restore(run: Run) -> None:
-    """Bring a freshly built run to the state of its newest checkpoint."""
-    meta, tensors = newest(run.folder)
+def restore(run: Run, training: bool = False) -> None:
+    """Bring a freshly built run to the state of its newest checkpoint.
+
+    Where it is to go on (`training`), newer ones that were read and found damaged are set aside: they must not outlive
+    good ones. Who only looks changes nothing: what it cannot read may be another process's, half written.
+    """
+    meta, tensors, damaged = newest(run.folder)
     refuse_other_views(run, meta["views"])
     run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
     run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
-    for sidecar in sidecars(run.folder / "checkpoints") if run.ranks.first else ():
-        # newer ones are damaged; they must not outlive good ones
-        if sidecar.stem > f"step_{run.step:07d}":
-            sidecar.rename(sidecar.with_suffix(".damaged"))
+    for sidecar in damaged if training and run.ranks.first else ():
+        sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -42,6 +42,8 @@ class TrainingOptions:
         for name in ("batch", "supersample", "log_every", "checkpoint_every", "checkpoints_kept"):
             if getattr(self, name) < 1:
                 raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
+        if self.test_points < 0:
+            raise ValueError(f"training.test_points is {self.test_points}; give a number of times, 0: never")
         if not 0 <= self.supersample_from < 1:
             raise ValueError(
                 f"training.supersample_from is {self.supersample_from}; give a share of the steps from 0 to below 1"
@@ -50,7 +52,7 @@ class TrainingOptions:
             raise ValueError(f"training.ssim_weight is {self.ssim_weight}; give a value from 0 to 1")
 
     def finer_after(self, iterations: int) -> int:
-        """Steps that a run of so many takes at the photographs' resolution before it renders more finely, if it does."""
+        """Steps that a run of so many takes at the photographs' own resolution before it renders more finely; or 0."""
         return round(self.supersample_from * iterations) if self.supersample > 1 else 0
 
 

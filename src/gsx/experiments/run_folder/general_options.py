@@ -5,6 +5,10 @@ from dataclasses import dataclass
 from gsx.core.options import label, without_effect
 
 
+LARGEST_SEED = 2**63
+"""Seeds are below: generators take 64 bits with a sign."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class GeneralOptions:
     """Top-level values; conf/config.yaml gives them."""
@@ -30,6 +34,11 @@ class GeneralOptions:
     """Disk for the states that runs branch from, 10^9 bytes; those used longest ago make room."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.seed < LARGEST_SEED:
+            raise ValueError(f"seed is {self.seed}; give a number from 0 to below 2^63")
+        for step in self.warm_start_at:
+            if step < 1:
+                raise ValueError(f"warm_start_at has {step}; give steps from 1")
         if self.init not in ("scratch", "warm_start"):
             raise ValueError(f"init is '{self.init}'; choose scratch or warm_start")
         if self.reuse and self.folder:

@@ -83,7 +83,7 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
-        checkpoint.restore(run)
+        checkpoint.restore(run, training=True)
     return run
 
 
@@ -121,7 +121,7 @@ def open_run(
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
-    checkpoint.restore(run)
+    checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
         run.raster = run.backbone.raster = replace(run.raster, training_focal=float(focal))

@@ -1,6 +1,7 @@
 """A composed configuration, checked against typed schemas: mistakes get the nearest match. No Hydra here."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -200,6 +201,7 @@ def chosen(kind: str, node: Any, plugins: Plugins, inner: str = "") -> Chosen:
 
 def typed(schema: type, values: Any, path: str) -> Any:
     """An instance of a dataclass from plain values; see `settings_from` for errors."""
+    refuse_not_finite(values, path)
     try:
         given = values if isinstance(values, dict) else {}
         merged = OmegaConf.merge(writable(OmegaConf.structured(schema), given), OmegaConf.create(values or {}))
@@ -208,6 +210,18 @@ def typed(schema: type, values: Any, path: str) -> Any:
         raise ConfigError(complaint(error, schema, path)) from error
     except ValueError as error:  # a dataclass refused the combination
         raise ConfigError(str(error)) from error
+
+
+def refuse_not_finite(value: Any, path: str) -> None:
+    """Raise ConfigError for a number that is none, anywhere below a key: every comparison with nan lets it pass."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            refuse_not_finite(inner, f"{path}.{key}".lstrip("."))
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            refuse_not_finite(inner, path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path} is {value}; give a finite number")
 
 
 def writable(node: DictConfig, given: dict[str, Any]) -> DictConfig:

@@ -90,7 +90,7 @@ def branch(run: Run, sidecar: Path) -> None:
     for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
         shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
     (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
-    checkpoint.restore(run)
+    checkpoint.restore(run, training=True)
     write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
     logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
 
