@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from gsx.core.options import label, without_effect
 
-
 LARGEST_SEED = 2**63
 """Seeds are below: generators take 64 bits with a sign."""
 
