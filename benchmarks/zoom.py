@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ import torch
 
 from gsx.builtin import plugins
 from gsx.core.files import read_json, write_json
+from gsx.core.quality.metrics import psnr
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.open import open_run
 from measuring.machine import describe_machine, shown_command, told_load
@@ -59,13 +59,12 @@ PICTURES = {
 }
 WAYS = {
     "samples of its pixels": ("eval.supersample=1",),
-    "windows of its pixels": ("eval.supersample=1", "rasterizer.pixel=window"),
     "four times as fine, reduced": ("eval.supersample=4",),
     "as trained": (),
 }
 """Of looking from afar: overrides by the name of a row."""
-AFAR, FEW = "0.25", 25
-"""The zoom, and of how many test views: windows take a few seconds each."""
+AFAR, FEW = 0.25, 25
+"""The zoom, and of how many test views."""
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
@@ -97,12 +96,23 @@ def trained(scene: str, seed: int, given: argparse.Namespace, overrides: Sequenc
     return folder
 
 
-def looked_at(folder: Path, name: str, overrides: Sequence[str], most: int = 1000) -> dict[str, Any]:
+def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:
+    """Mean PSNR of a trained run at AFAR times the training resolution, by one way of looking; kept beside it."""
+    path = (folder / "_".join(["afar", *re.findall(r"\w+", way)])).with_suffix(".json")
+    if not path.is_file():
+        run, settings = open_run(folder, plugins(), overrides)
+        evaluator, test = Evaluator(run, settings.evaluation), run.scene.test
+        views = [view.zoom(AFAR) for view in test[:: -(-len(test) // FEW)]]
+        shown = [(evaluator.measured(evaluator.rendered(v, AFAR).image), v.image()) for v in views if v is not None]
+        write_json(path, {"psnr": statistics.mean(psnr(image, truth) for image, truth in shown)})
+    return float(read_json(path)["psnr"])
+
+
+def looked_at(folder: Path, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Figures by zoom of a trained run under other settings, over at most so many test views; kept beside it."""
     path = folder / f"zoom_{name}.json"
     if not path.is_file():
         run, settings = open_run(folder, plugins(), overrides)
-        run.scene = replace(run.scene, test=run.scene.test[:: -(-len(run.scene.test) // most)])
         write_json(path, Evaluator(run, settings.evaluation).evaluate()["zoom"])
     return read_json(path)
 
@@ -230,15 +240,14 @@ def afar(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
         for name, words in COMPOSITIONS.items():
             folder = trained(scene, seed, given, words, name)
             for way, more in WAYS.items():
-                kept = "_".join(["afar", *re.findall(r"\w+", way)])
-                out[name, way] = looked_at(folder, kept, [f"eval.zoom=[{AFAR}]", *more], FEW)[AFAR]
+                out[name, way] = seen_from_afar(folder, way, more)
         return out
 
     found, rows = over_seeds(look, scenes, given), []
     for scene in scenes:
         for name in COMPOSITIONS:
             for way in WAYS:
-                shown = [one[name, way]["psnr"] for one in found[scene]]
+                shown = [one[name, way] for one in found[scene]]
                 rows.append({"scene": scene, "name": name, "way": way, "seeds": len(shown), "psnr": told(shown, ".2f")})
     columns = [["scene", "scene"], ["name", "composition"], ["way", "looked at by"], ["seeds", "seeds"]]
     note = (
