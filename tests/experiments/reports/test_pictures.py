@@ -292,9 +292,9 @@ def test_nothing_is_rendered_or_traced_twice(tmp_path: Path, monkeypatch: pytest
     rendered: Counter[tuple[int, int]] = Counter()
     traced: Counter[tuple[int, int]] = Counter()
 
-    def counted(run: Run, camera: Camera, pixels: int) -> TiledRendering:
+    def counted(run: Run, camera: Camera, pixels: int, supersample: int) -> TiledRendering:
         rendered[camera.size] += 1
-        return render(run, camera, pixels)
+        return render(run, camera, pixels, supersample)
 
     def image(self: Stripes, camera: Camera) -> Tensor:
         traced[camera.size] += 1
