@@ -109,7 +109,7 @@ def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:
 
 
 def looked_at(folder: Path, name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Figures by zoom of a trained run under other settings, over at most so many test views; kept beside it."""
+    """Figures by zoom of a trained run under other settings; kept beside it."""
     path = folder / f"zoom_{name}.json"
     if not path.is_file():
         run, settings = open_run(folder, plugins(), overrides)

@@ -25,7 +25,7 @@ from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.density import densification_statistics
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.core.training.supersampling import reduced, times_as_fine, with_rim
+from gsx.core.training.supersampling import finer_raster, times_as_fine
 from gsx.core.training.trainer import rendered
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.execute import execute
@@ -79,8 +79,8 @@ def test_a_window_of_the_reduced_picture_is_that_of_its_window(filter_: str) -> 
     reduction, rules = Reduction(filter=filter_), RasterSettings(cull="tight")
 
     def picture(camera: Camera) -> Tensor:
-        wide, window = with_rim(camera, reduction, 3)
-        return reduced(rasterize(splats, wide.zoom(3), rules).image, window, reduction, 3)
+        raster = finer_raster(camera, reduction, 3)
+        return raster.reduced(rasterize(splats, raster.camera, rules).image)
 
     whole = picture(camera)
     for window in (Window(0, 0, 10, 9), Window(11, 7, 12, 8), Window(20, 14, 12, 10), Window(1, 2, 5, 21)):
@@ -94,8 +94,8 @@ def test_gradients_of_the_loss_are_finite_differences(window: Window | None) -> 
     target = torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(1)).double()
 
     def loss(of: Any) -> Tensor:
-        wide, part = with_rim(camera, BICUBIC, 2)
-        return photometric(reduced(rasterize(of, wide.zoom(2), SMOOTH).image, part, BICUBIC, 2), target, 0.2)
+        raster = finer_raster(camera, BICUBIC, 2)
+        return photometric(raster.reduced(rasterize(of, raster.camera, SMOOTH).image), target, 0.2)
 
     live = leaves(splats)
     loss(live).backward()
@@ -133,9 +133,9 @@ def test_statistics_of_density_control_are_comparable() -> None:
     found = []
     for times in (1, 2, 3):
         live = leaves(splats)
-        rendering = rasterize(live, camera.zoom(times), SMOOTH)
-        whole = Window(0, 0, *camera.size)
-        photometric(reduced(rendering.image, whole, BICUBIC, times), target, 0.2).backward()
+        raster = finer_raster(camera, BICUBIC, times)
+        rendering = rasterize(live, raster.camera, SMOOTH)
+        photometric(raster.reduced(rendering.image), target, 0.2).backward()
         found.append(densification_statistics(rendering.screen)["gradient"])
     for finer in found[1:]:
         assert (finer / found[0] - 1).abs().max() < 0.2

@@ -5,8 +5,7 @@ Here each splat takes its integral over the window, and the window becomes the r
 variances along the axes as what the splat has left. The integral is the pixel's filter: there is no dilation.
 
 State of a pixel: `light` left (1 at first), `x`, `y` the window's middle and `wide`, `high` its sides, px. Tiles walk
-their lists splat by splat, because each window comes from the one before; formulas are numbered as in the derivations
-of docs/numerics.md.
+their lists splat by splat, because each window comes from the one before. Formulas: docs/numerics.md.
 """
 
 import functools
@@ -98,18 +97,21 @@ def is_narrow(u: Axis, v: Axis) -> Tensor:
     return (u.side < NARROW * u.sigma) | (v.side < NARROW * v.sigma)
 
 
-def alpha_of(u: Axis, v: Axis, opacity: Tensor) -> tuple[Tensor, Tensor]:
-    """(mean alpha of the splat over the window, whether it is that of the middle), neither clamped nor cut."""
+def alpha_of(u: Axis, v: Axis, integral: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor]:
+    """(mean alpha of the splat over the window, whether it is that of the middle), neither clamped nor cut; `integral`:
+    of its Gaussian."""
     narrow = is_narrow(u, v)
     middle = torch.exp(-0.5 * ((u.offset / u.sigma) ** 2 + (v.offset / v.sigma) ** 2))
-    area = u.moments[0] * v.moments[0] / (u.side * v.side)
+    area = integral / (u.side * v.side)
     return opacity * torch.where(narrow, middle, area), narrow
 
 
-def remainder(axis: Axis, other: Axis, taken: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
-    """(middle, side) along an axis of the light that a splat leaves; `taken`: its opacity over the window's area."""
-    _, first, second = axis.moments
-    across = other.moments[0]
+def remainder(
+    axis: Axis, moments: tuple[Tensor, Tensor, Tensor], across: Tensor, taken: Tensor, left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(middle, side) along an axis of the light that a splat leaves; `moments`: the axis' own, `across`: the integral
+    along the other; `taken`: the splat's opacity over the window's area."""
+    _, first, second = moments
     mean = (axis.offset - taken * first * across) / left
     square = (axis.offset**2 + axis.side**2 / 12 - taken * second * across) / left
     return mean, (12 * (square - mean**2).clamp_min(LEAST_WINDOW_VARIANCE)).sqrt()
@@ -130,10 +132,12 @@ def behind_splat(
     window, columns = (light, x, y, wide, high), tuple(row.unsqueeze(2).unbind(1))
     u, v, kept = along_axes(window, columns)
     mean_x, mean_y, cos, sin, _, _, opacity = columns
-    exact, narrow = alpha_of(u, v, opacity)
+    of_u, of_v = u.moments, v.moments
+    exact, narrow = alpha_of(u, v, of_u[0] * of_v[0], opacity)
     alpha = torch.where((exact >= alpha_min) & (light >= stop), exact.clamp(max=alpha_max), 0.0)
     taken = opacity * (alpha / exact.clamp_min(1e-30)) / (u.side * v.side)  # of a splat that is clamped: what it takes
-    (mean_u, side_u), (mean_v, side_v) = remainder(u, v, taken, 1 - alpha), remainder(v, u, taken, 1 - alpha)
+    mean_u, side_u = remainder(u, of_u, of_v[0], taken, 1 - alpha)
+    mean_v, side_v = remainder(v, of_v, of_u[0], taken, 1 - alpha)
     moved = (alpha > 0) & ~narrow
     new_wide, new_high = torch.where(kept, side_u, side_v), torch.where(kept, side_v, side_u)
     return (
@@ -340,14 +344,15 @@ def composite_windows(
     settings: RasterSettings,
     *,
     absgrad: Float[Tensor, "M 2"] | None = None,
-    max_weights: Float[Tensor, "E"] | None = None,
-) -> Float[Tensor, "C_plus_1 H W"]:
-    """Blended channels, then coverage, as `composite` has them; `max_weights` by intersection.
+    max_weight: bool = False,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+    """Blended channels, then coverage, as `composite` has them; and largest weights where they are asked for.
 
     The gradient is the published one: that a splat moves the windows of those behind it is left out, which the paper's
     training does as well.
     """
-    return WindowComposite.apply(
+    most = means.new_zeros(len(intersections.splats)) if max_weight else None
+    blended = WindowComposite.apply(
         means,
         screen.covariances,
         screen.log_opacities,
@@ -357,5 +362,8 @@ def composite_windows(
         intersections,
         grid,
         settings,
-        max_weights,
+        most,
     )
+    if most is None:
+        return blended, None
+    return blended, means.new_zeros(len(means)).scatter_reduce_(0, intersections.splats, most, "amax")

@@ -77,7 +77,9 @@ def blend(
     inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, channels)
     grid = TileGrid.of(camera, settings.tile_size)
     if settings.pixel == "window":
-        return blend_in_windows(screen, means2d_offset, channels, intersections, grid, settings, absgrad, max_weight)
+        return composite_windows(
+            screen, inputs[0], channels, intersections, grid, settings, absgrad=absgrad, max_weight=max_weight
+        )
     if takes(settings, channels.shape[1], len(intersections.splats), max_weight, means2d_offset.device.type):
         return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
@@ -87,27 +89,6 @@ def blend(
         return blended, None
     zeros = by_entry.new_zeros(len(screen.ids) + 1)
     return blended, zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
-
-
-def blend_in_windows(
-    screen: ScreenSplats,
-    means2d_offset: Float[Tensor, "M 2"],
-    channels: Float[Tensor, "M C"],
-    intersections: TileIntersections,
-    grid: TileGrid,
-    settings: RasterSettings,
-    absgrad: Float[Tensor, "M 2"] | None,
-    max_weight: bool,
-) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-    """The same by Gaussian Blending."""
-    means, splats = screen.means + means2d_offset, intersections.splats
-    most = means.new_zeros(len(splats)) if max_weight else None
-    blended = composite_windows(
-        screen, means, channels, intersections, grid, settings, absgrad=absgrad, max_weights=most
-    )
-    if most is None:
-        return blended, None
-    return blended, means.new_zeros(len(screen.ids)).scatter_reduce_(0, splats, most, "amax")
 
 
 def rasterize(

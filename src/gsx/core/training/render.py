@@ -8,7 +8,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.training.run import Run
-from gsx.core.training.supersampling import reduced, times_as_fine, with_rim
+from gsx.core.training.supersampling import finer_raster, times_as_fine
 
 
 @torch.no_grad()
@@ -27,9 +27,8 @@ def render(
     `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
     """
     times = supersample or times_as_fine(camera, run.scene.train, run.supersample_at(run.model_step))
-    wide, window = with_rim(camera, run.scene.reduction, times)
-    finer = wide if times == 1 else wide.zoom(times)
-    drawn = splats_for(run, wide) if splats is None else splats
-    tiled = rasterize_tiled(drawn, finer, run.raster, background=run.background, pixels=pixels)
-    image, alpha = (reduced(part, window, run.scene.reduction, times) for part in (tiled.image, tiled.alpha[None]))
+    raster = finer_raster(camera, run.scene.reduction, times)
+    drawn = splats_for(run, raster.drawn_for) if splats is None else splats
+    tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, pixels=pixels)
+    image, alpha = (raster.reduced(part) for part in (tiled.image, tiled.alpha[None]))
     return replace(tiled, image=image.clamp_(0, 1), alpha=alpha[0])

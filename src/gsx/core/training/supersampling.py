@@ -6,6 +6,7 @@ renders lets them (NeRF-SR, Wang et al. 2022; SRGS, Feng et al. 2024).
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -41,6 +42,26 @@ def with_rim(camera: Camera, reduction: Reduction, times: int) -> tuple[Camera, 
     return wide, Window(left, top, *camera.size)
 
 
-def reduced(image: Float[Tensor, "C H W"], window: Window, reduction: Reduction, times: int) -> Float[Tensor, "C h w"]:
-    """The part in the window of a picture `times` as coarse, differentiable and not clamped."""
-    return image if times == 1 else window.cut(reduction.formed(image, times))
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FinerRaster:
+    """Where a camera's picture is rendered, and how it comes from there."""
+
+    drawn_for: Camera
+    """Whose splats are drawn: the camera, with its rim."""
+    camera: Camera
+    """The same, as fine as it is rendered."""
+    window: Window
+    """Where the picture lies in the reduced one."""
+    reduction: Reduction
+    times: int
+
+    def reduced(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        """The picture from its finer render, differentiable and not clamped."""
+        return image if self.times == 1 else self.window.cut(self.reduction.formed(image, self.times))
+
+
+def finer_raster(camera: Camera, reduction: Reduction, times: int) -> FinerRaster:
+    """Of a camera that is rendered `times` as fine as its raster."""
+    wide, window = with_rim(camera, reduction, times)
+    finer = wide if times == 1 else wide.zoom(times)
+    return FinerRaster(drawn_for=wide, camera=finer, window=window, reduction=reduction, times=times)

@@ -20,7 +20,7 @@ from gsx.core.training.minibatch import gradients_added, merge_gradients, next_v
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
-from gsx.core.training.supersampling import reduced, times_as_fine, with_rim
+from gsx.core.training.supersampling import finer_raster, times_as_fine
 
 logger = logging.getLogger(__name__)
 
@@ -133,11 +133,10 @@ def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) 
     """(what the backbone draws at this step, its render), to be learnt from; screen statistics are of the raster that
     was drawn, the picture is reduced from it (`training.supersample`)."""
     times, absolute = times_as_fine(camera, run.scene.train, run.supersample_at(number)), run.backbone.absolute_gradient
-    wide, window = with_rim(camera, run.scene.reduction, times)
-    drawn = run.backbone.draw(wide, number)
-    finer = wide if times == 1 else wide.zoom(times)
-    rendering = rasterize(drawn.splats, finer, run.raster, background=colour, absolute_gradient=absolute)
-    image, alpha = (reduced(p, window, run.scene.reduction, times) for p in (rendering.image, rendering.alpha[None]))
+    raster = finer_raster(camera, run.scene.reduction, times)
+    drawn = run.backbone.draw(raster.drawn_for, number)
+    rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
+    image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))
     return drawn, replace(rendering, image=image, alpha=alpha[0])
 
 
