@@ -20,7 +20,7 @@ from measuring.runs import evaluate_seconds, in_shell, shown, train, wall_second
 
 RESULTS = Path(__file__).parent / "results"
 COMMANDS = {
-    "demo": ("preset=zoom", "eval.zoom=[1,2,4]"),
+    "demo": ("eval.zoom=[1,2,4]",),
     "pseudo_details": ("backbone=octree_scaffold", "augmenter=[upscale,bootstrap]", "eval.zoom=[1,2,4]"),
     "octree_ub": ("variant=octree_ub", "dataset=demo", "budget=quick"),
 }

@@ -37,15 +37,15 @@ TINY = (
     "eval.zoom=[1,2]",
 )
 RUNS: Mapping[str, tuple[str, ...]] = {
-    "gs3d": (),
+    "gs3d": ("backbone=gs3d",),
     "mip_splatting": ("backbone=mip_splatting",),
     "scaffold": ("backbone=scaffold",),
     "octree_scaffold": ("backbone=octree_scaffold",),
     "octree_gs3d": ("backbone=octree_gs3d",),
     "octree_gs3d_clone_split": ("backbone=octree_gs3d", "backbone.densification=clone_split"),
-    "gs3d_upscale": ("augmenter=[upscale]", "regenerator/upscale=scene_sr_brief"),
-    "gs3d_upscale_paper": ("augmenter=[upscale_paper]", "regenerator/upscale=lanczos"),
-    "mipmap": ("augmenter=[mipmap]", "regenerator/upscale=lanczos"),
+    "gs3d_upscale": ("backbone=gs3d", "augmenter=[upscale]", "regenerator/upscale=scene_sr_brief"),
+    "gs3d_upscale_paper": ("backbone=gs3d", "augmenter=[upscale_paper]", "regenerator/upscale=lanczos"),
+    "mipmap": ("backbone=gs3d", "augmenter=[mipmap]", "regenerator/upscale=lanczos"),
     "octree_scaffold_both": (
         "backbone=octree_scaffold",
         "augmenter=[upscale,bootstrap]",

@@ -22,7 +22,7 @@ RESULTS = Path(__file__).parent / "results"
 RUNS = 12
 SWEEP = [f"seed={','.join(map(str, range(RUNS)))}", "scene.width=160", "scene.height=120", "scene.train_views=16",
          "scene.test_views=4", "scene.samples=2", "scene.points=4000", "iterations=120", "rasterizer=eager",
-         "device=cpu"]  # fmt: skip
+         "backbone=gs3d", "device=cpu"]  # fmt: skip
 WAYS = {"one after the other": [], "processes": ["hydra/launcher=processes"]}
 
 

@@ -1,12 +1,13 @@
 """Looking closer, and from afar, on held-out true pixels: the tables of docs/zoom.md.
 
-    python benchmarks/zoom.py [--what compositions,afar] --scenes FOLDER [--only fox,lego] [--seeds 3] [--jobs 2]
+    python benchmarks/zoom.py [--what compositions,afar] --scenes FOLDER [--only fox,lego] [--seeds 0,1,2] [--jobs 2]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and drawn
 by every rule for zoomed cameras. `compositions`: each is trained by mip_splatting and by its preset for zooming in.
-`parts`: by parts of the preset. `pictures`: by the preset with pseudo details, enlarged or true. `afar`: what
-compositions draw from four times as far as photographs were taken, by each way of looking. Finished runs below --runs
+`parts`: by parts of the preset. `levels`: by anchors with levels, and by their preset for zooming in. `pictures`: by
+the preset with pseudo details, enlarged or true, in half of the run. `afar`: what compositions draw from four times as
+far as photographs were taken, by each way of looking. Finished runs below --runs
 are not trained again. Some hours on two cores.
 """
 
@@ -48,14 +49,22 @@ COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 PARTS = {
     "mip_splatting": MIP,
-    "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
+    "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.8"),
     "rates alone": (*ZOOM, "training.supersample=1"),
     "preset=zoom": ZOOM,
 }
+OCTREE = ("backbone=octree_scaffold",)
+LEVELS = {"octree_scaffold": OCTREE, "preset=octree_zoom": (*OCTREE, "preset=octree_zoom")}
+STRONG = (
+    *("training.supersample_from=0.5", "augmenter=upscale", "augmenter.upscale.timing.start=20000"),
+    *("augmenter.upscale.mode=direct", "augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
+    "augmenter.upscale.scales=[2]",
+)
+"""Pictures twice as fine count as much as photographs, for half of the run; the rest is the augmenter's default."""
 PICTURES = {
     "preset=zoom": ZOOM,
-    "augmenter=upscale, lanczos": (*ZOOM, "augmenter=upscale", "regenerator/upscale=lanczos"),
-    "augmenter=upscale, oracle": (*ZOOM, "augmenter=upscale", "regenerator/upscale=oracle"),
+    "with enlarged pictures": (*ZOOM, *STRONG, "regenerator/upscale=lanczos"),
+    "with true pictures": (*ZOOM, *STRONG, "regenerator/upscale=oracle"),
 }
 WAYS = {
     "samples of its pixels": ("eval.supersample=1",),
@@ -71,9 +80,9 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
-    parser.add_argument("--what", default="rules,compositions,parts,pictures,afar", help="tables, by commas")
+    parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=lambda text: [int(seed) for seed in text.split(",")], default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/zoom"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
@@ -196,6 +205,11 @@ def parts(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Parts of preset=zoom", *compared(PARTS, scenes, given)
 
 
+def levels(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Anchors with levels, and their preset for zooming in."""
+    return "Anchors with levels for zooming in", *compared(LEVELS, scenes, given)
+
+
 def pictures(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """With pseudo details, enlarged by a filter or true."""
     return "Pseudo details on a composition for zooming in", *compared(PICTURES, scenes, given)
@@ -262,14 +276,15 @@ def over_seeds(
 ) -> dict[str, list[dict[Any, Any]]]:
     """What was found with every seed, by scene."""
     with ThreadPoolExecutor(given.jobs) as pool:
-        tasks = {(scene, seed): pool.submit(look, scene, seed) for seed in range(given.seeds) for scene in scenes}
-        return {scene: [tasks[scene, seed].result() for seed in range(given.seeds)] for scene in scenes}
+        tasks = {(scene, seed): pool.submit(look, scene, seed) for seed in given.seeds for scene in scenes}
+        return {scene: [tasks[scene, seed].result() for seed in given.seeds] for scene in scenes}
 
 
 WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
     "rules": rules,
     "compositions": compositions,
     "parts": parts,
+    "levels": levels,
     "pictures": pictures,
     "afar": afar,
 }

@@ -403,10 +403,10 @@ def test_whole_commands_are_run_once_and_told_by_their_files(tmp_path: Path, mon
     words = ["--only", "demo", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path), *TINY]
     commands.main(words)
     commands.main(words)
-    assert [words[:2] for words in asked] == [["preset=zoom", "eval.zoom=[1,2,4]"]]
+    assert [words[:2] for words in asked] == [["eval.zoom=[1,2,4]", "scene.width=32"]]
     [row] = read_sections(tmp_path / "commands_cpu.json")["commands"]["rows"]
     evaluation = json.loads((tmp_path / "runs" / "demo" / "evaluation.json").read_text())
-    assert row["command"].startswith("`gsx preset=zoom 'eval.zoom=[1,2,4]' scene.width=32")
+    assert row["command"].startswith("`gsx 'eval.zoom=[1,2,4]' scene.width=32")
     assert (row["state"], row["steps"], row["primitives"]) == ("ok", 2, evaluation["primitives"])
     assert row["x1"] == f"{evaluation['psnr']:.2f}"
     finest = evaluation["zoom"]["4"]

@@ -55,14 +55,14 @@ def test_real_captures_load(name: str, train: int, test: int) -> None:
 
 @pytest.mark.slow
 def test_demo_reaches_what_was_measured(tmp_path: Path) -> None:
-    evaluation = result(tmp_path / "run", "scene=demo", "iterations=600")
+    evaluation = result(tmp_path / "run", "backbone=gs3d", "scene=demo", "iterations=600")
     assert evaluation["psnr"] >= measured("augmenters_cpu", "demo_600", "x1") - MARGIN
 
 
 @pytest.mark.slow
 def test_fox_reaches_what_was_measured_within_3_gb(tmp_path: Path) -> None:
     scene = ("scene=colmap", f"scene.path={real('fox')}", "scene.downscale=4")
-    evaluation = result(tmp_path / "run", *scene, "iterations=3000", "eval.zoom=[1,2,4]")
+    evaluation = result(tmp_path / "run", "backbone=gs3d", *scene, "iterations=3000", "eval.zoom=[1,2,4]")
     assert evaluation["psnr"] >= measured("backbones_cpu", "fox_3000", "psnr") - MARGIN
     assert evaluation["peak_memory_mb"] < 3000
 
@@ -70,7 +70,7 @@ def test_fox_reaches_what_was_measured_within_3_gb(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_lego_reaches_what_was_measured_on_white(tmp_path: Path) -> None:
     scene = ("scene=blender", f"scene.path={real('lego')}", "scene.downscale=4")
-    evaluation = result(tmp_path / "run", *scene, "iterations=3000")
+    evaluation = result(tmp_path / "run", "backbone=gs3d", *scene, "iterations=3000")
     assert evaluation["psnr"] >= measured("backbones_cpu", "lego_3000", "psnr") - MARGIN
 
 

@@ -24,7 +24,7 @@ def test_a_demo_installs_what_a_run_needs_and_tests_the_rest(tmp_path: Path) -> 
     demo = steps("demo", tmp_path / "a")
     assert "--editable ." in demo
     assert "[dev]" not in demo
-    assert "gsx preset=zoom 'eval.zoom=[1,2,4]'" in demo
+    assert "gsx -m backbone=gs3d,gs3d_zoom 'eval.zoom=[1,2,4]'" in demo
     test = steps("test", tmp_path / "b")
     assert test.index("--editable .") < test.index("--editable '.[dev]'") < test.index("-m pytest")
     more = steps("test", tmp_path / "c", ".ready")

@@ -12,6 +12,7 @@ from gsx.experiments.runs.open import start
 from gsx.experiments.runs.settings import Settings
 
 OVERRIDES = (
+    "backbone=gs3d",
     "scene.width=48",
     "scene.height=36",
     "scene.train_views=6",

@@ -20,7 +20,14 @@ from measuring.watches import Job, Patience, Timing, Watch, take_turns
 
 VIEWS = 10
 """Training views that the steps walk through."""
-SYNTHETIC = ("scene=demo", "scene.points=60000", f"scene.train_views={VIEWS}", "scene.test_views=1", "iterations=30000")
+SYNTHETIC = (
+    "backbone=gs3d",
+    "scene=demo",
+    "scene.points=60000",
+    f"scene.train_views={VIEWS}",
+    "scene.test_views=1",
+    "iterations=30000",
+)
 TINY = ("scene.width=48", "scene.height=36", "scene.points=300", "scene.train_views=2", "scene.samples=1")
 STEPS, QUICK_STEPS = 40, 2
 """Steps of each path."""

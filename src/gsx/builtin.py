@@ -35,6 +35,7 @@ def add_backbones(registry: Registry) -> None:
 
     registry.add("backbone", "gs3d", gs3d, GS3DOptions)
     registry.add("backbone", "mip_splatting", gs3d, GS3DOptions)
+    registry.add("backbone", "gs3d_zoom", gs3d, GS3DOptions)
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)

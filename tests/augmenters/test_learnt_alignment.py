@@ -23,6 +23,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import start
 
 CONTROL = (
+    "backbone=gs3d",
     "scene.width=64",
     "scene.height=48",
     "scene.train_views=10",

@@ -6,18 +6,18 @@ import torch
 from gsx.augmenters.pixel_weights import (
     agreeing,
     best_densities,
-    blended,
     densities,
     in_bytes,
     sampled_better,
-    sampling_ratios,
-    seen_alike,
+    sampling_scores,
+    splatsure,
+    stretched,
 )
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterSettings, undilated_radii
 
 
 def at(distance: float, width: int = 40, target: float = 0.0) -> Camera:
@@ -53,14 +53,14 @@ def middle(picture: torch.Tensor) -> float:
 @pytest.mark.parametrize(("zoom", "counts"), [(1, False), (2, True), (4, True)])
 def test_a_zoomed_view_counts_unless_a_photograph_came_as_near(zoom: int, counts: bool) -> None:
     raster, own = RasterSettings(), at(4.0)
-    assert (middle(sampled_better(wall(), own.zoom(zoom), [own], raster)) > 0.9) == counts
-    assert middle(sampled_better(wall(), own.zoom(zoom), [own, at(0.8)], raster)) < 0.1
+    assert (middle(sampled_better(wall(), own.zoom(zoom), [own], 0, raster)) > 0.9) == counts
+    assert middle(sampled_better(wall(), own.zoom(zoom), [own, at(0.8)], 0, raster)) < 0.1
 
 
 def test_only_the_part_that_the_nearer_photograph_shows_does_not_count() -> None:
     """A photograph from 1 unit away sees about a unit of the wall, on the left."""
     own = at(4.0)
-    trust = sampled_better(wall(), own.zoom(2), [own, at(1.0, target=-0.6)], RasterSettings())
+    trust = sampled_better(wall(), own.zoom(2), [own, at(1.0, target=-0.6)], 0, RasterSettings())
     assert float(trust[36:44, 22:30].mean()) < 0.1
     assert float(trust[36:44, 50:58].mean()) > 0.9
 
@@ -76,36 +76,68 @@ def dots(*places: tuple[float, float, float], scale: float = 0.2) -> Splats:
     )
 
 
-@pytest.mark.parametrize("scale", [0.2, 0.002])
-@pytest.mark.parametrize(("distances", "ratio"), [((1.0, 4.0), 4.0), ((4.0, 4.2), 1.05), ((2.0, 3.0, 4.0), 2.0)])
-def test_splats_are_sampled_as_finely_as_their_nearest_camera_over_their_farthest(
-    scale: float, distances: tuple[float, ...], ratio: float
-) -> None:
-    """On the axis a sphere is fx s / z wide, whatever the dilation, which at 0.002 is all there is to be seen."""
-    splats, cameras = dots((0.0, 0.0, 0.0), scale=scale), [at(distance) for distance in distances]
-    assert float(sampling_ratios(splats, cameras, RasterSettings())) == pytest.approx(ratio, rel=1e-2)
+@pytest.mark.parametrize(("distances", "score"), [
+    ((1.0, 4.0, 4.0), 1.0),
+    ((4.0, 4.0, 4.0), 0.1192),  # ratio 1: sigmoid(-2)
+    ((4.0, 4.4, 4.4), 0.5),  # ratio 1.1
+    ((4.0, 4.0, 5.0), 0.9526),  # 1.25: sigmoid(3)
+    ((4.0, 5.0), 0.0),  # seen twice: nothing is sure
+])  # fmt: skip
+def test_how_sure_a_splats_detail_is_by_hand(distances: tuple[float, ...], score: float) -> None:
+    """On the axis a small sphere is fx s / z wide; at 400 px the floor under the root is out of sight."""
+    splats, cameras = dots((0.0, 0.0, 0.0), scale=0.02), [at(distance, width=2000) for distance in distances]
+    found, finest = sampling_scores(splats, cameras, RasterSettings())
+    assert float(found) == pytest.approx(score, abs=0.01)
+    assert int(finest) == distances.index(min(distances))
+
+
+def test_splats_far_below_a_pixel_are_alike_by_the_published_floor_and_dilation_does_not_count() -> None:
+    cameras = [at(1.0), at(4.0), at(4.0)]
+    tiny, small = (
+        sampling_scores(dots((0.0, 0.0, 0.0), scale=scale), cameras, RasterSettings()) for scale in (1e-5, 0.2)
+    )
+    assert float(tiny[0]) == pytest.approx(0.1192, abs=1e-3)
+    assert float(small[0]) == pytest.approx(1.0, abs=1e-3)
+    radii = undilated_radii(*geometry(dots((0.0, 0.0, 0.0), scale=0.2)), at(1.0), RasterSettings())
+    variance = (at(1.0).fx * 0.2) ** 2
+    assert float(radii) == pytest.approx(3 * (variance + 0.1**0.5) ** 0.5, rel=1e-3)
+
+
+def geometry(splats: Splats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return splats.means, splats.scales, splats.quats
 
 
 def test_only_training_views_that_see_a_splat_count() -> None:
-    """Beside the near camera's field of view only the far one sees; behind both, and far off, none."""
+    """Beside the near camera's field of view only the far ones see; behind all, and far off, none."""
     splats = dots((0.0, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, -9.0, 0.0), (500.0, 0.0, 0.0), scale=0.05)
-    ratios = sampling_ratios(splats, [at(1.0), at(4.0)], RasterSettings())
-    assert ratios.tolist() == pytest.approx([4.0, 1.0, 1.0, 1.0], rel=1e-2)
+    score, finest = sampling_scores(splats, [at(4.0), at(1.0), at(4.0), at(4.0)], RasterSettings())
+    assert score.tolist() == pytest.approx([1.0, 0.1192, 0.0, 0.0], abs=1e-3)
+    assert finest.tolist() == [1, 0, -1, -1]
 
 
 @pytest.mark.parametrize(("distances", "published", "ours"), [
-    ((1.0, 4.0), 0.0, 0.0),  # the near photograph has the detail
-    ((4.0, 4.0), 0.8808, 1.0),  # ratio 1: 1 - sigmoid(-2)
-    ((4.0, 4.2), 0.7311, 1.0),  # 1 - sigmoid(-1)
-    ((4.0, 8.0), 0.0, 1.0),  # the nearest photograph itself, zoomed in: only its own distance counts for ours
+    ((4.0, 1.0, 4.0), 0.0, 0.0),  # the near photograph has the detail
+    ((1.0, 4.0, 4.0), 1.0, 0.0),  # and is the one that was zoomed in
+    ((4.2, 4.0, 4.2), 1 - 0.2096, 1.0),  # of 0.6859 and 0.6221 px^2, each + sqrt(0.1): ratio 1.0336
+    ((8.0, 4.0, 8.0), 0.0, 1.0),  # only the pseudo view's own distance counts for ours
+    ((8.0, 4.0), 1.0, 1.0),  # seen twice
 ])  # fmt: skip
 def test_the_published_weights_by_hand(distances: tuple[float, ...], published: float, ours: float) -> None:
-    """A wall seen from 4 units through twice the focal length, beside photographs at these distances."""
+    """A wall seen from 4 units through twice the focal length, made from the first of these photographs."""
     raster, own, photographs = RasterSettings(), at(4.0).zoom(2), [at(distance) for distance in distances]
-    assert (WEIGHT_MAPS["splatsure"], WEIGHT_MAPS["finer"]) == (seen_alike, sampled_better)
-    drawn = seen_alike(wall(), own, photographs, raster) / blended(torch.ones(441), wall(), own, raster)
-    assert middle(drawn) == pytest.approx(published, abs=0.03)
-    assert middle(sampled_better(wall(), own, photographs, raster)) == pytest.approx(ours, abs=0.1)
+    assert (WEIGHT_MAPS["splatsure"], WEIGHT_MAPS["finer"]) == (splatsure, sampled_better)
+    assert middle(splatsure(wall(), own, photographs, 0, raster)) == pytest.approx(published, abs=0.03)
+    assert middle(sampled_better(wall(), own, photographs, 0, raster)) == pytest.approx(ours, abs=0.1)
+
+
+def test_where_nothing_is_drawn_the_published_weight_is_1_and_low_maps_are_stretched() -> None:
+    near, far = at(1.0), at(4.0)
+    weights = splatsure(dots((0.0, 0.0, 0.0), scale=0.05), far.zoom(2), [far, near, far], 0, RasterSettings())
+    assert float(weights[0, 0]) == 1.0
+    low = torch.tensor([[0.1, 0.3], [0.5, 0.2]])
+    assert stretched(low, 0.1, 0.5).tolist() == [[0.0, pytest.approx(0.5)], [1.0, pytest.approx(0.25)]]
+    assert stretched(low, 0.1, 0.95).tolist() == low.tolist()
+    assert stretched(torch.tensor([[-0.1, 1.7]]), -0.1, 1.7).tolist() == [[0.0, 1.0]]
 
 
 def test_blocks_that_contradict_the_photograph_do_not_count() -> None:

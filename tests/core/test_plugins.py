@@ -56,7 +56,8 @@ def test_builtins_come_in_through_the_same_hook() -> None:
     from gsx import builtin
 
     registry = load_plugins([("gsx", builtin)], points=[]).registry
-    assert registry.names("backbone") == ["gs3d", "mip_splatting", "octree_gs3d", "octree_scaffold", "scaffold"]
+    gaussians, anchors = ["gs3d", "gs3d_zoom", "mip_splatting"], ["octree_gs3d", "octree_scaffold", "scaffold"]
+    assert registry.names("backbone") == [*gaussians, *anchors]
     assert {"demo", "colmap", "photos", "blender", "transforms", "bungee"} <= set(registry.names("scene"))
     assert registry.find("backbone", "gs3d").provider == "gsx"
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from gsx.augmenters.cameras import KEPT, NOISES, WINDOWS
-from gsx.augmenters.pixel_weights import WeightMap, sampled_better, seen_alike
+from gsx.augmenters.pixel_weights import WeightMap, sampled_better, splatsure
 from gsx.augmenters.timing import SPLITS, Timing, events_of
 from gsx.core.training.checked_regenerator import Checks
 from gsx.core.training.schedule import Schedule
@@ -16,7 +16,7 @@ REDUCTIONS = ("all", "per_scale")
 FROZEN = ("none", "half", "active")
 SEEDS = ("fixed", "per_view")
 PROJECTIONS = ("none", "exact")
-WEIGHT_MAPS: dict[str, WeightMap | None] = {"none": None, "splatsure": seen_alike, "finer": sampled_better}
+WEIGHT_MAPS: dict[str, WeightMap | None] = {"none": None, "splatsure": splatsure, "finer": sampled_better}
 CHOICES = {
     "window": WINDOWS,
     "noise": NOISES,
@@ -110,7 +110,7 @@ class PseudoOptions:
     """exact: the nearest picture that reduces to its input as the scene's pictures do, of photographs in 8 bits: every
     pixel where they are box averages, else nearly every one; the share is logged."""
     weight_map: str
-    """none; splatsure: surfaces count that no photograph shows more finely than another; finer, ours: those
+    """none; splatsure: surfaces count that no other photograph shows more finely; finer, ours: those
     that no photograph shows as finely as the pseudo view does."""
     gate: float
     """Blocks do not count that reduce to what is further than this from the known photograph, in 8-bit levels; 0: all

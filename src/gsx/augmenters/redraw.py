@@ -154,7 +154,8 @@ class Redrawer:
         if weights is not None:
             photographs = [view.camera for view in run.scene.train]
             pixel_weight = (
-                pixel_weight * weights(splats_for(run, spec.camera), spec.camera, photographs, run.raster).cpu()
+                pixel_weight
+                * weights(splats_for(run, spec.camera), spec.camera, photographs, spec.parent, run.raster).cpu()
             )
         if options.gate > 0 and request.photo and spec.scale > 1:
             agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)

@@ -92,10 +92,21 @@ def test_published_values_of_gs3d() -> None:
 def test_the_preset_for_zooming_in_holds_for_both_forms_of_gaussians(backbone: str) -> None:
     plain, zoom = (compose([f"backbone={backbone}", *words], plugins()) for words in ([], ["preset=zoom"]))
     assert (plain.training.supersample, plain.backbone.options.rates.shortened) == (1, 0.0)
-    assert (zoom.training.supersample, zoom.training.supersample_from) == (2, 0.5)
+    assert (zoom.training.supersample, zoom.training.supersample_from) == (2, 0.8)
     assert (zoom.backbone.options.filter, zoom.backbone.options.rates.shortened) == ("mip", 0.4)
     published = compose([f"backbone={backbone}", "preset=zoom", "iterations=30000"], plugins()).backbone.options
     assert published.rates == replace(plain.backbone.options.rates, shortened=0.4)  # the same where nothing is shorter
+
+
+def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
+    default, spelt, plain = (
+        compose(words, plugins()) for words in ([], ["backbone=gs3d", "preset=zoom"], ["backbone=gs3d"])
+    )
+    assert default.backbone.component.name == "gs3d_zoom"
+    assert replace(default.backbone.options, name="gs3d") == spelt.backbone.options
+    assert default.training == spelt.training
+    assert (plain.backbone.options.filter, plain.training.supersample) == ("none", 1)
+    assert plain.backbone.options.rates.shortened == 0
 
 
 def test_common_scene_defaults_agree_with_the_schema() -> None:

@@ -82,14 +82,14 @@ def test_evaluation_has_the_published_layout(finished: Path) -> None:
 
 def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> None:
     run, settings = open_run(finished, plugins())
-    assert settings.evaluation.remedy == "backbone=mip_splatting"  # whose runs are compensated, and get no such advice
+    assert settings.evaluation.remedy == "backbone=gs3d_zoom"  # whose runs are compensated, and get no such advice
 
-    def told(remedy: str = "backbone=mip_splatting", **beats: bool | None) -> list[str]:
+    def told(remedy: str = "backbone=gs3d_zoom", **beats: bool | None) -> list[str]:
         zoom = {factor.strip("x"): {"beats_enlarged": won} for factor, won in beats.items()}
         return remedies(run, {"zoom": zoom | {"8": {"unavailable": "no truth"}}}, remedy)
 
     (line,) = told(x1=None, x2=True, x4=False)
-    assert line.endswith("the same command with backbone=mip_splatting")
+    assert line.endswith("the same command with backbone=gs3d_zoom")
     assert told(x1=None, x2=True, x4=True) == told(**{"x0.5": False}) == told("", x4=False) == []
     run.raster = replace(run.raster, compensate=True)
     assert told(x4=False) == []

@@ -131,7 +131,7 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
         settings = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"])
     config, idle = settings.resolved, settings.idle
-    assert place_of(config, "s", idle) == Path("o/my_scene/gs3d") / composition_key(config, "s", idle)
+    assert place_of(config, "s", idle) == Path("o/my_scene/gs3d_zoom") / composition_key(config, "s", idle)
     assert place_of(config, "s", idle) != place_of(config, "t", idle)
 
 

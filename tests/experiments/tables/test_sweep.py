@@ -130,7 +130,7 @@ def test_a_multirun_over_processes_reports_its_failure_and_divides_the_threads(
 def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["reuse=true", "iterations=6", *SMALL, "training.checkpoint_every=2"]
+    words = ["reuse=true", "backbone=gs3d", "iterations=6", *SMALL, "training.checkpoint_every=2"]
     assert main(words) == 0
     (run,) = tmp_path.glob("outputs/demo/gs3d/*/")
     state, stamp = last_state(run), (run / "checkpoints" / "step_0000006.safetensors").stat().st_mtime_ns

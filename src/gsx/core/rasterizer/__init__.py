@@ -5,7 +5,7 @@ from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
-from gsx.core.rasterizer.visibility import screen_radii, touches
+from gsx.core.rasterizer.visibility import touches, undilated_radii
 
 __all__ = [
     "TILE_PIXELS",
@@ -17,7 +17,7 @@ __all__ = [
     "rasterize",
     "rasterize_batch",
     "rasterize_tiled",
-    "screen_radii",
     "take_rows",
     "touches",
+    "undilated_radii",
 ]

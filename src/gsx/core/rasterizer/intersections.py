@@ -48,10 +48,15 @@ class TileIntersections:
 
 
 def published_radii(covariances: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
-    """ceil(3 sqrt(lambda_max)) with the published floor of 0.1 under the inner root (3D-GS, forward.cu)."""
+    """Those of 3D-GS: rounded up (3D-GS, forward.cu)."""
+    return three_sigma(covariances).ceil()
+
+
+def three_sigma(covariances: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
+    """3 sqrt(lambda_max) with the published floor of 0.1 under the inner root (3D-GS, forward.cu)."""
     xx, xy, yy = covariances.unbind(1)
     spread = ((xx - yy) / 2).square() + xy.square()
-    return (3 * ((xx + yy) / 2 + spread.clamp_min(0.1).sqrt()).sqrt()).ceil()
+    return 3 * ((xx + yy) / 2 + spread.clamp_min(0.1).sqrt()).sqrt()
 
 
 def published_windows(

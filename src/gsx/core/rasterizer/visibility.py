@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.intersections import on_raster, published_radii, published_windows
+from gsx.core.rasterizer.intersections import on_raster, published_radii, published_windows, three_sigma
 from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float
@@ -45,16 +45,18 @@ def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple
 
 
 @torch.no_grad()
-def screen_radii(
+def undilated_radii(
     means: Float[Tensor, "N 3"],
     scales: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     camera: Camera,
     settings: RasterSettings,
 ) -> Float[Tensor, "N"]:
-    """Largest standard deviation on the screen before dilation, px; -1 for Gaussians that do not touch the raster."""
+    """Three standard deviations on the screen before dilation, px; -1 for Gaussians that do not touch the raster.
+
+    3D-GS's formula (forward.cu), whose floor makes those much thinner than a pixel alike; not rounded up.
+    """
     screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
     dilation, _ = settings.dilation_at(camera.focal)
-    xx, xy, yy = (screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])).unbind(1)
-    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
-    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], largest.clamp_min(0).sqrt())
+    undilated = screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])
+    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(undilated))
