@@ -57,14 +57,20 @@ OCTREE = ("backbone=octree_scaffold",)
 LEVELS = {"octree_scaffold": OCTREE, "preset=octree_zoom": (*OCTREE, "preset=octree_zoom")}
 STRONG = (
     *("training.supersample_from=0.5", "augmenter=upscale", "augmenter.upscale.timing.start=20000"),
-    *("augmenter.upscale.mode=direct", "augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
-    "augmenter.upscale.scales=[2]",
+    *("augmenter.upscale.scales=[2]", "augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
 )
-"""Pictures twice as fine count as much as photographs, for half of the run; the rest is the augmenter's default."""
+"""Pictures twice as fine count for half of the run, by absolute values; the rest is the augmenter's default."""
+ENLARGED, TRUE = (("regenerator/upscale=lanczos",), ("regenerator/upscale=oracle",))
+INSTEAD = (*STRONG, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,0.6]")
+"""Of 0.6 of the photographs' loss."""
+BESIDE = (*STRONG, "augmenter.upscale.mode=direct")
+"""The photographs' loss, as heavy."""
 PICTURES = {
     "preset=zoom": ZOOM,
-    "with enlarged pictures": (*ZOOM, *STRONG, "regenerator/upscale=lanczos"),
-    "with true pictures": (*ZOOM, *STRONG, "regenerator/upscale=oracle"),
+    "enlarged pictures instead": (*ZOOM, *INSTEAD, *ENLARGED),
+    "true pictures instead": (*ZOOM, *INSTEAD, *TRUE),
+    "enlarged pictures beside": (*ZOOM, *BESIDE, *ENLARGED),
+    "true pictures beside": (*ZOOM, *BESIDE, *TRUE),
 }
 WAYS = {
     "samples of its pixels": ("eval.supersample=1",),

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from gsx.builtin import plugins
 from gsx.cli.arguments import run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
+from gsx.core.processes import speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
 
 logger = logging.getLogger("gsx.cli")
@@ -134,14 +136,18 @@ def verb_resume(arguments: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...]"""
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
     folder, overrides = run_arguments("resume", arguments, told)
-    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.run_folder.claims import claimed
+    from gsx.experiments.runs.open import open_run, refuse_other
     from gsx.experiments.runs.settings import write_config
 
     loaded = plugins()
-    run, settings = open_run(folder, loaded, overrides, training=True)
-    if run.complete and (folder / "evaluation.json").is_file():
-        raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with N above that to lengthen it")
-    if run.ranks.first:
-        write_config(folder / "config.yaml", settings.resolved)
-    logger.info("resuming %s at step %d", folder, run.step)
-    return carry_out(run, settings, loaded)
+    refuse_other(folder)
+    with claimed(folder) if speaks() else nullcontext():
+        run, settings = open_run(folder, loaded, overrides, training=True)
+        if run.complete and (folder / "evaluation.json").is_file():
+            remedy = "give iterations=N with N above that to lengthen it"
+            raise InputError(f"{folder} is complete at step {run.step}: {remedy}")
+        if run.ranks.first:
+            write_config(folder / "config.yaml", settings.resolved)
+        logger.info("resuming %s at step %d", folder, run.step)
+        return carry_out(run, settings, loaded)

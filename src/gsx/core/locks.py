@@ -34,8 +34,8 @@ def locked(stream: IO[str]) -> bool:
             return False
         return True
     raise InputError(
-        f"{stream.name} cannot be locked, since this Python has neither fcntl nor msvcrt: use the one of python.org or "
-        "of your system, or do without reuse=true and tracker=mlflow"
+        f"{stream.name} cannot be locked, since this Python has neither fcntl nor msvcrt, by which processes keep out "
+        "of each other's way: use the one of python.org or of your system"
     )
 
 

@@ -10,7 +10,6 @@ import pytest
 from gsx.builtin import plugins
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import (
-    claimed,
     composition_key,
     evaluation_settings,
     finished,
@@ -182,13 +181,6 @@ def test_a_run_is_compared_with_what_it_was_trained_on(tmp_path: Path) -> None:
     (cell.folder / "environment.json").write_text(json.dumps({"scene": {"stamp": "earlier"}}))
     assert not finished(read_run(cell.folder), cell.config, "", idle)
     assert finished(read_run(cell.folder), cell.config, "earlier", idle)
-
-
-def test_a_folder_is_claimed_by_one_at_a_time(tmp_path: Path) -> None:
-    with claimed(tmp_path / "run") as first, claimed(tmp_path / "run") as second:
-        assert (first, second) == (True, False)
-    with claimed(tmp_path / "run") as again:
-        assert again
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,11 @@
 """Which run a composition is: one name for one training, wherever and however it is carried out."""
 
 import re
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from gsx.core.cache import content_key
-from gsx.core.errors import InputError
-from gsx.core.locks import lock
 from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions
@@ -130,29 +127,6 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
         and evaluated_as(files, config) == evaluation_settings(config)
         and composition_key(files.config, trained_on(files), idle) == composition_key(config, stamp, idle)
     )
-
-
-@contextmanager
-def claimed(folder: Path) -> Iterator[bool]:
-    """Whether this process alone works on a folder, as long as the context lasts; the claim of a killed one is void."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (folder.parent / f".{folder.name}.lock").open("w") as stream:
-        yield locked(stream, folder)
-
-
-def locked(stream: IO[str], folder: Path) -> bool:
-    """Whether this process has got the lock of an open file.
-
-    Raises:
-        InputError: the file system knows no locks.
-    """
-    try:
-        return lock(stream)
-    except OSError as error:
-        raise InputError(
-            f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
-            "training the same run: choose another place, output=FOLDER"
-        ) from error
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:

@@ -4,11 +4,11 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.errors import ConfigError
 from gsx.core.processes import processes, say, speaks
 
 if TYPE_CHECKING:
@@ -88,15 +88,17 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
     if settings.general.reuse:
         return reused(settings, loaded, [] if folders is None else folders)
-    run = start(settings, loaded)
-    if folders is not None:
-        folders.append(run.folder)
-    return carry_out(run, settings, loaded)
+    with ExitStack() as claims:
+        run = start(settings, loaded, claims)
+        if folders is not None:
+            folders.append(run.folder)
+        return carry_out(run, settings, loaded)
 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.experiments.run_folder.run_key import claimed, place_of, scene_stamp
+    from gsx.experiments.run_folder.claims import claimed_name
+    from gsx.experiments.run_folder.run_key import place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
 
     if processes() > 1:
@@ -104,10 +106,8 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     stamp = scene_stamp(settings.resolved)
     folder = place_of(settings.resolved, stamp, settings.idle)
     folders.append(folder)
-    with claimed(folder) as alone:
-        if not alone:
-            raise InputError(f"{folder} is being trained by another process: wait for it, and give the command again")
-        _, run = resume_or_start(settings, loaded, stamp)
+    with claimed_name(folder), ExitStack() as claims:
+        _, run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0

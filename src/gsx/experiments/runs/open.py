@@ -3,6 +3,7 @@
 import logging
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.run_folder.files import RunFiles, is_number, read_run
 from gsx.experiments.run_folder.run_key import (
     composition_key,
@@ -39,7 +41,8 @@ logger = logging.getLogger(__name__)
 
 def refuse_used(folder: str) -> None:
     """Raise InputError if the run folder asked for exists and holds something."""
-    if folder and Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
+    path = Path(folder)
+    if folder and path.exists() and (not path.is_dir() or any(one.name != LOCK for one in path.iterdir())):
         raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
 
 
@@ -64,10 +67,10 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
     raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
-def start(settings: Settings, plugins: Plugins) -> Run:
+def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
 
-    Of several processes the first does what concerns the folder.
+    Of several processes the first does what concerns the folder, which is claimed as long as `claims` lasts.
 
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
@@ -81,15 +84,18 @@ def start(settings: Settings, plugins: Plugins) -> Run:
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
     run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
-    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins))
+    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run, training=True)
     return run
 
 
-def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
+def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None) -> Path:
     """The folder of a new run, with what is known before its first step; `init=warm_start`: at the state of another."""
     run.folder = new_folder(settings, run.scene)
+    if claims is not None:
+        claims.enter_context(claimed(run.folder))
+        refuse_used(settings.general.folder)  # by another process that was faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
         write_json(run.folder / "environment.json", environment(run, plugins))
@@ -103,6 +109,12 @@ def begun(run: Run, settings: Settings, plugins: Plugins) -> Path:
     return run.folder
 
 
+def refuse_other(folder: Path) -> None:
+    """Raise InputError for a folder that is no run."""
+    if not (folder / "config.yaml").is_file():
+        raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
+
+
 def open_run(
     folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False
 ) -> tuple[Run, Settings]:
@@ -112,8 +124,7 @@ def open_run(
         InputError: the folder is no run.
         CheckpointError: there is no usable checkpoint.
     """
-    if not (folder / "config.yaml").is_file():
-        raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
+    refuse_other(folder)
     settings = read_config(folder / "config.yaml", plugins, overrides)
     return restored(settings, folder, training), settings
 
@@ -131,13 +142,13 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     return run
 
 
-def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[Path, Run | None]:
+def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> tuple[Path, Run | None]:
     """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
 
     `stamp`: of its scene.
 
     What was finished is not done again, what was interrupted goes on where it stopped, and what was judged otherwise is
-    judged anew. To be called with the folder `claimed`.
+    judged anew. To be called with the folder's name claimed (`claimed_name`); the folder is, as long as `claims` lasts.
 
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
@@ -149,19 +160,32 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str) -> tuple[P
         return folder, None
     at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:
-        if not checkpoint.sidecars(folder / "checkpoints"):
-            raise CheckpointError(f"{folder} holds no checkpoint")
-        if composition_key(files.config, trained_on(files), settings.idle) != folder.name:
-            raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
-        run = restored(settings, folder, training=True)
+        with ExitStack() as claim:
+            if folder.is_dir():
+                claim.enter_context(claimed(folder))
+            run = gone_on_with(folder, files, settings)
+            claims.push(claim.pop_all())
     except CheckpointError as error:
         set_aside(folder, str(error))
-        return folder, start(at_hand, plugins)
+        return folder, start(at_hand, plugins, claims)
     logger.info("going on with %s at step %d", folder, run.step)
     write_config(folder / "config.yaml", settings.resolved)
     if settings.general.init == "warm_start":
         run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
     return folder, run
+
+
+def gone_on_with(folder: Path, files: RunFiles, settings: Settings) -> Run:
+    """The run of a folder that is named by its composition.
+
+    Raises:
+        CheckpointError: there is nothing in it to go on with.
+    """
+    if not checkpoint.sidecars(folder / "checkpoints"):
+        raise CheckpointError(f"{folder} holds no checkpoint")
+    if composition_key(files.config, trained_on(files), settings.idle) != folder.name:
+        raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
+    return restored(settings, folder, training=True)
 
 
 def by_another(files: RunFiles) -> str:

@@ -1,0 +1,125 @@
+"""One process at a time trains in a run folder: a lock in it, which says who holds it."""
+
+import json
+import logging
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import IO
+
+from gsx.core.errors import InputError
+from gsx.core.locks import lock
+
+logger = logging.getLogger(__name__)
+
+LOCK = ".lock"
+"""Of a run folder that is being trained in."""
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """This process alone trains in a folder as long as the context lasts; the claim of a killed one is void.
+
+    On a file system without locks nobody can know, which is told.
+
+    Raises:
+        InputError: another process does, which is named.
+    """
+    with held(folder / LOCK, folder):
+        yield
+
+
+@contextmanager
+def claimed_name(folder: Path) -> Iterator[None]:
+    """The same of a folder that others find by its name and that may have to be made or moved away: a lock beside it.
+
+    Raises:
+        InputError: another process does, which is named; or nobody can know.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with held(folder.parent / f".{folder.name}{LOCK}", folder, needed=True):
+        yield
+
+
+@contextmanager
+def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
+    """A lock file that says who works in the folder."""
+    with taken(path, folder, needed) as stream:
+        stream.truncate(0)
+        json.dump({"host": platform.node(), "process": os.getpid(), "since": now()}, stream)
+        stream.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows keeps what is open
+                path.unlink()
+
+
+def now() -> str:
+    """Local time to the second."""
+    return datetime.now().isoformat(sep=" ", timespec="seconds")
+
+
+def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
+    """The lock file, open and locked. One that its last holder removed meanwhile is opened again.
+
+    Raises:
+        InputError: another process has it, it cannot be opened, or its file system knows no locks and they are needed.
+    """
+    while True:
+        stream = opened(path, folder)
+        try:
+            if not lock(stream):
+                raise InputError(f"{folder} is being trained by {holder(stream)}: wait for it, or stop it")
+            if same_file(stream, path):
+                return stream
+        except OSError as error:
+            if not needed:
+                logger.warning("%s lies on a file system without locks: see that no other process trains in it", folder)
+                return stream
+            stream.close()
+            raise InputError(
+                f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
+                "training the same run: choose another place, output=FOLDER"
+            ) from error
+        except BaseException:
+            stream.close()
+            raise
+        stream.close()
+
+
+def opened(path: Path, folder: Path) -> IO[str]:
+    """The lock file, made where there is none; what it holds stays, and a link is not followed.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    try:
+        return os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"{path}, by which processes know of each other, cannot be opened ({error.strerror}): if it is a link or "
+            f"another user's, see who trains in {folder}, and remove it"
+        ) from error
+
+
+def same_file(stream: IO[str], path: Path) -> bool:
+    """Whether an open file is the one that its path still names."""
+    try:
+        return os.path.samestat(os.fstat(stream.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def holder(stream: IO[str]) -> str:
+    """Who has a lock file, in words."""
+    try:
+        stream.seek(0)
+        told = json.load(stream)
+        return f"process {told['process']} on {told['host']} since {told['since']}"
+    except (OSError, ValueError, TypeError, KeyError):  # Windows does not let others read it
+        return "another process"
