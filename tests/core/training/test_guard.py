@@ -17,7 +17,7 @@ from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
-from gsx.core.training.parameter_table import gradients, table_tensors
+from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
 from gsx.core.training.run import Run, Sampler, Step, TrainingOptions
 from gsx.core.training.trainer import train, train_step
 
@@ -41,8 +41,8 @@ class Poisoned(GS3D):
         return self.table["means"].sum() * 0 + float(kind)
 
 
-def run_with(poison: dict[int, str], folder: Path, iterations: int = 8) -> Run:
-    scene = small_scene(spread(5))
+def run_with(poison: dict[int, str], folder: Path, iterations: int = 8, points: int = 5) -> Run:
+    scene = small_scene(spread(points))
     backbone = small_gs3d(scene, iterations=iterations, options=replace(published_options(), published_iterations=9))
     backbone.__class__ = Poisoned
     backbone.poison = poison
@@ -161,3 +161,26 @@ def test_primitives_that_are_not_finite_are_removed_and_the_run_goes_on(
     assert after.rendering.dropped == 0
     assert len(run.backbone.table) == len(run.backbone.table.statistics["count"]) == before - 1
     assert "removed 1 primitives with values that are not finite" in caplog.text
+
+
+def test_a_run_that_loses_a_part_of_its_model_at_once_ends(tmp_path: Path) -> None:
+    """Of 2,000 primitives 20 may go, 21 may not; of few any ten."""
+    for count, lost, ends in ((2000, 20, False), (2000, 21, True), (12, 10, False), (12, 11, True)):
+        run, plugins = run_with({}, tmp_path, points=count), load_plugins([], points=[])
+        with torch.no_grad():
+            run.backbone.table["log_scales"][:lost] = torch.nan
+        if not ends:
+            assert train_step(run, plugins).skipped == f"removed {lost} primitives"
+            continue
+        with pytest.raises(
+            TrainingError, match=rf"step 1: {lost} of {count:,} primitives have values .* learning rates"
+        ):
+            train_step(run, plugins)
+
+
+def test_a_run_without_a_primitive_ends(tmp_path: Path) -> None:
+    run = run_with({}, tmp_path)
+    keep_rows(run.backbone.table, torch.zeros(len(run.backbone.table), dtype=torch.bool))
+    plugins = load_plugins([], points=[])
+    with plugins.listening([Guard()]), pytest.raises(TrainingError, match="no primitive is left after step 1"):
+        train(run, plugins)

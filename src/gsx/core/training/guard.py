@@ -45,6 +45,19 @@ class Guard:
             )
         return reason
 
+    @hookimpl
+    def gsx_step_finished(self, run: Run, step: Step) -> None:
+        """See that there is still a model.
+
+        Raises:
+            TrainingError: its last primitive is gone.
+        """
+        if len(run.backbone.table) == 0:
+            raise TrainingError(
+                f"no primitive is left after step {step.number}: lower the learning rates (backbone.rates), or the "
+                "thresholds below which density control removes"
+            )
+
 
 def culprit(run: Run, step: Step) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
