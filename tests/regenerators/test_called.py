@@ -1,18 +1,21 @@
 """A function as a regenerator."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from tiny import tiny_run, tiny_settings
+from tiny import StopAfter, tiny_run, tiny_settings
 from torch import Tensor
 
+from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.reduction import as_blocks
 from gsx.core.errors import ConfigError, TrainingError
+from gsx.experiments.runs.job import train
 from gsx.regenerators.called import Called, CalledOptions
 
 PROMPTS: list[str] = []
@@ -63,6 +66,47 @@ def test_a_finished_run_is_looked_at_without_its_regenerator(tmp_path: Path) -> 
     config.write_text(config.read_text().replace("test_called:blocks", "no_longer:there"))
     assert main(["eval", str(run.folder)]) == 0
     assert main(["resume", str(run.folder), "iterations=14"]) == 2
+
+
+def test_code_that_a_folder_names_runs_only_where_it_is_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command that an interrupted run ends with says so; a word on the command line is trust enough."""
+    (tmp_path / "theirs.py").write_text(
+        "from pathlib import Path\nPath('was_here').touch()\nfrom test_called import blocks\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    words_ = ["augmenter=upscale", "iterations=12", "regenerator/upscale=callable"]
+    named = "regenerator.upscale.function=theirs:blocks"
+    loaded, settings = plugins(), tiny_settings(tmp_path / "run", *words_, named)
+    with loaded.listening([StopAfter(3)]):
+        train(settings, loaded)
+    assert f"gsx resume {tmp_path / 'run'} --trust" in capsys.readouterr().err
+    for name in ("once", "twice"):
+        shutil.copytree(tmp_path / "run", tmp_path / name)
+    sys.modules.pop("theirs")
+    (tmp_path / "was_here").unlink()
+    assert main(["resume", str(tmp_path / "run")]) == 2
+    assert "runs code, regenerator.upscale: 'theirs:blocks'" in capsys.readouterr().err
+    assert main(["resume", str(tmp_path / "run"), "regenerator.upscale.function=other:f"]) == 2
+    assert not (tmp_path / "was_here").exists()
+    assert main(["resume", str(tmp_path / "once"), "--trust"]) == 0
+    assert main(["resume", str(tmp_path / "twice"), named]) == 0
+    assert (tmp_path / "was_here").exists()
+
+
+def test_no_module_of_the_working_directory_takes_the_place_of_an_installed_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """colorsys is of the standard library, and imported by nobody here."""
+    (tmp_path / "colorsys.py").write_text("raise AssertionError('run')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry])
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    before = list(sys.path)
+    options = CalledOptions(name="callable", function="colorsys:rgb_to_hsv", arguments={})
+    assert callable(Called(options).function())
+    assert sys.path == before
 
 
 @pytest.mark.parametrize("function", ["", "os", "os:no_such", "no_such_module:f", "os:name"])

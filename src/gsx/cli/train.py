@@ -133,9 +133,9 @@ def sweep_job(config: Any) -> int:
 
 
 def verb_resume(arguments: list[str]) -> int:
-    """gsx resume RUN [KEY=VALUE ...]"""
-    told = "Go on where a run stopped, bit for bit; iterations=N lengthens it."
-    folder, overrides = run_arguments("resume", arguments, told)
+    """gsx resume RUN [KEY=VALUE ...] [--trust]"""
+    told = "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names."
+    folder, overrides = run_arguments("resume", [word for word in arguments if word != "--trust"], told)
     from gsx.experiments.run_folder.claims import claimed
     from gsx.experiments.runs.open import open_run, refuse_other
     from gsx.experiments.runs.settings import write_config
@@ -143,7 +143,7 @@ def verb_resume(arguments: list[str]) -> int:
     loaded = plugins()
     refuse_other(folder)
     with claimed(folder) if speaks() else nullcontext():
-        run, settings = open_run(folder, loaded, overrides, training=True)
+        run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
         if run.complete and (folder / "evaluation.json").is_file():
             remedy = "give iterations=N with N above that to lengthen it"
             raise InputError(f"{folder} is complete at step {run.step}: {remedy}")

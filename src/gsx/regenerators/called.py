@@ -18,12 +18,13 @@ from gsx.core.training.regenerator import RegeneratorContext, Request
 
 @contextmanager
 def beside_the_user() -> Iterator[None]:
-    """Modules of the working directory can be imported, as with `python -m`."""
-    sys.path.insert(0, os.getcwd())
+    """Modules of the working directory can be imported, as with `python -m`, but none in place of an installed one."""
+    here = os.getcwd()
+    sys.path.append(here)
     try:
         yield
     finally:
-        sys.path.remove(os.getcwd())
+        del sys.path[len(sys.path) - 1 - sys.path[::-1].index(here)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,10 @@ class CalledOptions:
     """package.module:function, called as f(image, scale=, prompt=, seed=, strength=, **arguments) with image [3, h, w]
     in [0, 1]; it returns [3, scale h, scale w]."""
     arguments: dict[str, Any]
+
+    def named_code(self) -> str:
+        """The function."""
+        return self.function
 
 
 class Called:

@@ -109,6 +109,21 @@ def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
     assert plain.backbone.options.rates.shortened == 0
 
 
+def test_a_run_folders_configuration_looks_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Written by somebody else it could ask for a secret of the machine that it is opened on."""
+    monkeypatch.setenv("GSX_SECRET", "hush")
+    resolved = compose(["tracker=mlflow"], plugins()).resolved
+    write_config(tmp_path / "config.yaml", resolved)
+    assert read_config(tmp_path / "config.yaml", plugins()).resolved == resolved
+    for key, value in (("output", "${oc.env:GSX_SECRET}"), ("tracker.mlflow.uri", "http://x/${oc.env:GSX_SECRET}")):
+        config = OmegaConf.create(resolved)
+        OmegaConf.update(config, key, value)
+        write_config(tmp_path / "config.yaml", config)
+        with pytest.raises(ConfigError, match=rf"{key} is '.*oc.env:GSX_SECRET.*'; .* plain values") as caught:
+            read_config(tmp_path / "config.yaml", plugins())
+        assert "hush" not in str(caught.value)
+
+
 def test_common_scene_defaults_agree_with_the_schema() -> None:
     values = OmegaConf.to_container(OmegaConf.load(CONF / "images.yaml"))
     built = SceneOptions(name="x", background=[0, 0, 0], **values)

@@ -80,6 +80,16 @@ class Regenerator(Protocol):
 
 
 @runtime_checkable
+class NamesCode(Protocol):
+    """Options of a regenerator that runs code which is part of no installed package."""
+
+    def named_code(self) -> str:
+        """Module or file that it runs; empty: none. A run folder that names some is gone on with only where it is
+        trusted."""
+        ...
+
+
+@runtime_checkable
 class Refusing(Protocol):
     """A regenerator that can say before training that it will not do."""
 

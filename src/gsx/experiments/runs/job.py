@@ -118,19 +118,23 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     """Train to the end or to Ctrl-C, and say where things are."""
     from gsx.experiments.runs.execute import execute
 
+    onwards = way_on(run, settings)
     try:
         with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
-        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards(run)}\n", as_error=True)
+        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
         return INTERRUPTED
     if not run.complete:
-        say(f"gsx: stopped at step {run.step}; go on with: {onwards(run)}\n", as_error=True)
+        say(f"gsx: stopped at step {run.step}; go on with: {onwards}\n", as_error=True)
         return INTERRUPTED
     say(f"{run.folder / 'report.html'}\n")
     return 0
 
 
-def onwards(run: "Run") -> str:
+def way_on(run: "Run", settings: "Settings") -> str:
     """The command that goes on with a run; one that is named by its composition is found again by it."""
-    return "the same command" if run.config.get("reuse") else f"gsx resume {run.folder}"
+    from gsx.experiments.runs.settings import named_code
+
+    trust = " --trust" if named_code(settings) else ""
+    return "the same command" if settings.general.reuse else f"gsx resume {run.folder}{trust}"

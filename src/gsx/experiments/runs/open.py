@@ -33,7 +33,7 @@ from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
-from gsx.experiments.runs.settings import Settings, read_config, write_config
+from gsx.experiments.runs.settings import Settings, named_code, read_config, write_config
 from gsx.experiments.runs.tracking import build_trackers
 
 logger = logging.getLogger(__name__)
@@ -115,17 +115,29 @@ def refuse_other(folder: Path) -> None:
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
 
 
+def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
+    """Raise InputError for a folder that names code to be run, unless the command line names the same."""
+    for key, code in named_code(settings).items():
+        if not any(word.startswith(f"{key}.") and word.endswith(f"={code}") for word in overrides):
+            raise InputError(
+                f"{folder / 'config.yaml'} runs code, {key}: '{code}', which would have all your rights: look at it "
+                f"first, then `gsx resume {folder} --trust`"
+            )
+
+
 def open_run(
-    folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False
+    folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False, trusted: bool = False
 ) -> tuple[Run, Settings]:
-    """A run as its newest checkpoint left it; `training`: it is about to go on.
+    """A run as its newest checkpoint left it; `training`: it is about to go on; `trusted`: with code that it names.
 
     Raises:
-        InputError: the folder is no run.
+        InputError: the folder is no run, or names code and is not trusted.
         CheckpointError: there is no usable checkpoint.
     """
     refuse_other(folder)
     settings = read_config(folder / "config.yaml", plugins, overrides)
+    if training and not trusted:
+        refuse_code(folder, settings, overrides)
     return restored(settings, folder, training), settings
 
 

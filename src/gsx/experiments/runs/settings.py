@@ -17,6 +17,7 @@ from gsx.core.plugins import Component, Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.checked_regenerator import Checks, WithChecks
+from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
@@ -281,6 +282,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
     if isinstance(config, DictConfig):
         config = OmegaConf.create(renamed(OmegaConf.to_container(config)))  # type: ignore[arg-type]
+        refuse_interpolation(path, config)
     add_newer_settings(config)
     known = list(dotted(OmegaConf.to_container(config)))
     for override in overrides:
@@ -292,6 +294,24 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)  # type: ignore[arg-type]
+
+
+def refuse_interpolation(path: Path, config: DictConfig) -> None:
+    """Raise ConfigError for a value that is looked up when it is read: somebody else's file would learn of this
+    machine's environment. gsx writes none."""
+    for key in dotted(OmegaConf.to_container(config, resolve=False)):
+        parent, _, name = key.rpartition(".")
+        node = OmegaConf.select(config, parent) if parent else config
+        if isinstance(node, DictConfig) and OmegaConf.is_interpolation(node, name):
+            value = OmegaConf.to_container(node, resolve=False)[name]  # type: ignore[index,call-overload]
+            raise ConfigError(f"{path}: {key} is '{value}'; a run's configuration holds plain values: write what it is")
+
+
+def named_code(settings: Settings) -> dict[str, str]:
+    """Modules and files that a composition runs and that are part of no installed package, by dotted role."""
+    options = {f"regenerator.{role}": one.options for role, one in settings.regenerators.items()}
+    found = {key: one.named_code() for key, one in options.items() if isinstance(one, NamesCode)}
+    return {key: code for key, code in found.items() if code}
 
 
 def add_newer_settings(config: Any) -> None:

@@ -97,6 +97,10 @@ class PipelineOptions(DiffusionOptions):
                 f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives it"
             )
 
+    def named_code(self) -> str:
+        """The file of the pipeline."""
+        return self.custom
+
 
 @dataclass(frozen=True, kw_only=True)
 class TuningOptions:
