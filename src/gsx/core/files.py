@@ -1,9 +1,12 @@
-"""Files that are either wholly there or not at all, and JSON."""
+"""Files that are either wholly there or not at all, JSON and CSV."""
 
+import csv
+import io
 import json
 import math
 import os
-from collections.abc import Iterator
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,8 +14,11 @@ from typing import Any
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, same suffix; it becomes `path` when the block ends, or vanishes on an error."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    """A temporary path beside `path`, same suffix; it becomes `path` when the block ends, or vanishes on an error.
+
+    Its name is drawn: processes of several machines and containers share numbers.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
@@ -26,6 +32,25 @@ def replace_file(path: Path, content: bytes) -> None:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
+
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""How texts begin that spreadsheets carry out."""
+
+
+def csv_text(fields: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """A table of CSV with a head; what is missing is empty, and a text that is a formula to a spreadsheet is quoted."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, fields, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({key: as_text(value) for key, value in row.items()})
+    return stream.getvalue()
+
+
+def as_text(value: Any) -> Any:
+    """A cell; a text that begins like a formula with the sign by which spreadsheets know texts."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
 
 
 def finite(content: Any) -> Any:

@@ -3,8 +3,6 @@
 Pictures are not copied: the page refers to those in the runs' folders.
 """
 
-import csv
-import io
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +12,7 @@ from urllib.parse import quote
 
 from gsx import __version__
 from gsx.core.errors import InputError
-from gsx.core.files import replace_file
+from gsx.core.files import csv_text, replace_file
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
@@ -51,7 +49,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
     rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
-    replace_file(folder / "report.csv", csv_of(rows).encode())
+    replace_file(folder / "report.csv", csv_text(FIELDS, rows).encode())
     context = {
         "title": title_of(folder, runs),
         "version": __version__,
@@ -204,12 +202,3 @@ def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]
             by_hash = counts.setdefault(row["scene"], {})
             by_hash[row["protocol"]] = by_hash.get(row["protocol"], 0) + 1
     return {scene: by_hash for scene, by_hash in counts.items() if len(by_hash) > 1}
-
-
-def csv_of(rows: Sequence[dict[str, Any]]) -> str:
-    """report.csv: missing figures are empty."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, FIELDS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()

@@ -1,9 +1,8 @@
 """A table as text: for the terminal, as CSV, Markdown and LaTeX."""
 
-import csv
-import io
 from collections.abc import Sequence
 
+from gsx.core.files import csv_text
 from gsx.experiments.tables.published import METRICS
 from gsx.experiments.tables.table import Figure, Scope, Table, rows_of
 
@@ -132,13 +131,9 @@ def aligned(grid: Sequence[Sequence[str]]) -> list[str]:
 
 def as_csv(table: Table) -> str:
     """One line for each figure; missing ones are empty."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
-    writer.writeheader()
-    for f in table.figures:
-        line = {key: getattr(f, key) for key in FIELDS} | {"remarks": "; ".join(f.remarks)}
-        writer.writerow({key: "" if value is None else value for key, value in line.items()})
-    return stream.getvalue()
+    return csv_text(
+        FIELDS, ({key: getattr(f, key) for key in FIELDS} | {"remarks": "; ".join(f.remarks)} for f in table.figures)
+    )
 
 
 def as_markdown(table: Table) -> str:

@@ -1,0 +1,42 @@
+"""Files that are wholly there or not at all; tables that a spreadsheet reads as text."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from gsx.core.files import csv_text, replace_file, replacing
+
+
+def test_two_writers_of_one_file_do_not_share_a_temporary_one(tmp_path: Path) -> None:
+    """Also where both have the same process number, as in two containers."""
+    path = tmp_path / "state.json"
+    with replacing(path) as first:
+        first.write_text("first")
+        with replacing(path) as second:
+            assert first != second
+            second.write_text("second")
+        assert path.read_text() == "second"
+    assert path.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_fails_half_way_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    replace_file(tmp_path / "a.txt", b"whole")
+    with pytest.raises(TypeError), replacing(tmp_path / "a.txt") as path, path.open("wb") as stream:
+        stream.writelines([b"ha", None])  # type: ignore[list-item]
+    assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("a.txt", b"whole")]
+
+
+def test_no_cell_is_a_formula_and_numbers_stay_numbers() -> None:
+    rows = [
+        {"run": "=cmd|' /C calc'!A1", "psnr": -1.5, "more": "left out"},
+        {"run": "+1", "psnr": None},
+        {"run": "a=b"},
+    ]
+    read = list(csv.DictReader(csv_text(("run", "psnr"), rows).splitlines()))
+    assert read == [
+        {"run": "'=cmd|' /C calc'!A1", "psnr": "-1.5"},
+        {"run": "'+1", "psnr": ""},
+        {"run": "a=b", "psnr": ""},
+    ]
