@@ -49,10 +49,11 @@ COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 PARTS = {
     "mip_splatting": MIP,
-    "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.8"),
+    "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
     "rates alone": (*ZOOM, "training.supersample=1"),
-    "preset=zoom": ZOOM,
+    "finer pixels and rates": (*ZOOM, "training.supersample_from=0.5"),
 }
+"""Finer pixels in the second half of the steps."""
 OCTREE = ("backbone=octree_scaffold",)
 LEVELS = {"octree_scaffold": OCTREE, "preset=octree_zoom": (*OCTREE, "preset=octree_zoom")}
 STRONG = (
