@@ -147,14 +147,16 @@ def test_validation_views_stand_in_for_test_views(folder: Path) -> None:
 def test_missing_images_are_named_and_skipped(folder: Path) -> None:
     write(folder, "train", [FRONT, SIDE, FRONT])
     (folder / "train" / "r_1.png").unlink()
-    scene = load(options(folder))
+    with pytest.raises(InputError, match=r"1 of the 3 images of .*train/r_1.*scene\.missing=0\.33"):
+        load(options(folder))
+    scene = load(options(folder, missing=0.5))
     assert [view.name for view in scene.train] == ["train/r_0", "train/r_2"]
     assert any(
         "Skipped 1 of the 3 images of transforms_train.json" in note and "train/r_1" in note for note in scene.notes
     )
     (folder / "test" / "r_0.png").unlink()
     with pytest.raises(InputError, match=r"None of the 1 images of .*transforms_test\.json"):
-        load(options(folder))
+        load(options(folder, missing=0.5))
 
 
 def test_names_with_suffix_are_found(folder: Path) -> None:

@@ -208,7 +208,9 @@ def test_missing_photos_are_counted_named_and_skipped(tmp_path: Path) -> None:
     write_scene(synthesize(frames=9), tmp_path)
     for number in (0, 2, 3, 5, 6, 8):
         (tmp_path / "images" / f"camera000001_frame00000{number}.png").unlink()
-    scene = load(colmap_options(tmp_path))
+    with pytest.raises(InputError, match=r"6 of the 9 images of .*frame000000\.png.* and 1 more\).*missing=0\.67"):
+        load(colmap_options(tmp_path))
+    scene = load(colmap_options(tmp_path, missing=0.67))
     assert [view.name[-5] for view in views(scene)] == ["1", "4", "7"]
     note = next(note for note in scene.notes if "missing" in note)
     assert "Skipped 6 images" in note

@@ -170,6 +170,7 @@ def test_centred_principal_point(tmp_path: Path) -> None:
         ({"cx": "middle"}, "cx 'middle'"),
         ({"w": 0}, "size 0 x 90"),
         ({"frames": frame_changes(transform_matrix=None)}, "pose that is no matrix"),
+        ({"frames": frame_changes(transform_matrix=[*POSES[0][:3], [0, 0, 4, 1]])}, "fourth row .*transposed"),
         ({"frames": frame_changes(transform_matrix=[[math.inf] * 4] * 4)}, "finite numbers"),
     ],
 )
@@ -179,15 +180,45 @@ def test_cameras_that_cannot_be_used_are_refused_by_name(tmp_path: Path, content
         load(options(tmp_path))
 
 
+@pytest.mark.parametrize("name", ["images/0.png", "./images/0.png", "images\\0.png"])
+def test_a_photo_that_is_listed_twice_is_refused(tmp_path: Path, name: str) -> None:
+    """One of them could be trained on and the other tested on."""
+    write(tmp_path, frames=frame_changes(file_path=name))
+    with pytest.raises(InputError, match=r"has 'images/0\.png' twice"):
+        load(options(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["/", ".", "..", ""])
+def test_a_name_that_is_no_photo_is_a_missing_photo(tmp_path: Path, name: str) -> None:
+    write(tmp_path, frames=frame_changes(file_path=name))
+    with pytest.raises(InputError, match=r"1 of the 3 images of .* are not on disk"):
+        load(options(tmp_path))
+
+
+def test_a_camera_that_is_nowhere_near_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, frames=frame_changes(transform_matrix=[[1, 0, 0, 1e300], *POSES[0][1:]]))
+    with pytest.raises(InputError, match=r"images/1\.png' is more than 1e\+09 units away"):
+        load(options(tmp_path))
+
+
+def test_a_file_of_brackets_alone_is_one_sentence(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "transforms.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match=r"no valid JSON \(its brackets are nested too deeply\)"):
+        load(options(tmp_path))
+
+
 def test_missing_photos_are_named_and_skipped(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "images" / "1.png").unlink()
-    scene = load(options(tmp_path, split="none"))
+    with pytest.raises(InputError, match=r"1 of the 3 images of .*not on disk \(images/1\.png\).*scene\.missing=0\.33"):
+        load(options(tmp_path, split="none", missing=0.32))
+    scene = load(options(tmp_path, split="none", missing=0.34))
     assert [view.name for view in scene.train] == ["images/0.png", "images/2.png"]
     assert any("Skipped 1 of the 3 images" in note and "images/1.png" in note for note in scene.notes)
     (tmp_path / "images" / "0.png").unlink()
     with pytest.raises(InputError, match="at least 2 images"):
-        load(options(tmp_path, split="none"))
+        load(options(tmp_path, split="none", missing=1.0))
     (tmp_path / "images" / "2.png").unlink()
     with pytest.raises(InputError, match=r"None of the 3 images .*images/0\.png, images/1\.png, images/2\.png"):
         load(options(tmp_path))

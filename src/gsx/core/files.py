@@ -73,4 +73,7 @@ def read_json(path: Path) -> Any:
     Raises:
         OSError, ValueError: it cannot be read or parsed.
     """
-    return json.loads(path.read_text(encoding="utf-8"))
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("its brackets are nested too deeply") from error

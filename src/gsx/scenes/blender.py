@@ -70,8 +70,8 @@ def load(options: BlenderOptions) -> Scene:
         raise ConfigError(f"scene.split is '{options.split}', but transforms_*.json hold the split: use json.")
     folder = Path(options.path).expanduser()
     train_file, test_file = folder / "transforms_train.json", _test_file(folder)
-    train_shots, train_notes = read_shots(train_file)
-    test_shots, test_notes = read_shots(test_file)
+    train_shots, train_notes = read_shots(train_file, options.missing)
+    test_shots, test_notes = read_shots(test_file, options.missing)
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
     train, test = views[: len(train_shots)], views[len(train_shots) :]
     refuse_too_few(train, train_file)
@@ -144,11 +144,11 @@ def _scales_named(options: BlenderOptions) -> dict[str, Any]:
     return {} if scales == {"scales": [1], "test_scales": [1]} else scales
 
 
-def read_shots(file: Path) -> tuple[list[Shot], list[str]]:
+def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
     """The shots of one transforms file, in its order, and a note where photos are missing.
 
     Raises:
-        InputError: the file is missing or damaged, or none of its photos is there.
+        InputError: the file is missing or damaged, or too few of its photos are there.
     """
     content, frames = read_frames(file)
     angle = content.get("camera_angle_x")
@@ -156,7 +156,7 @@ def read_shots(file: Path) -> tuple[list[Shot], list[str]]:
         raise InputError(
             f"'{file}' has camera_angle_x {angle}, which is no angle below pi: with fl_x use scene=transforms."
         )
-    present, notes = present_frames(file.parent, frames, file)
+    present, notes = present_frames(file.parent, frames, file, missing)
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes
 
 

@@ -24,6 +24,7 @@ from gsx.scenes.posed import (
     named,
     provenance,
     reduction_of,
+    refuse_partial,
     refuse_too_few,
     shot_through,
     views_of,
@@ -62,7 +63,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
         InputError: as `load`.
     """
     path = Path(options.path).expanduser()
-    present = present_images(model, photos)
+    present = present_images(model, photos, options.missing)
     shots = [shot_of(model, image, photos) for image in present]
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
@@ -81,11 +82,11 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
     )
 
 
-def present_images(model: Model, photos: Path) -> list[ModelImage]:
+def present_images(model: Model, photos: Path, missing: float) -> list[ModelImage]:
     """The images of the model whose photo exists.
 
     Raises:
-        InputError: none or only one exists.
+        InputError: none or only one exists, or more than the share `missing` does not.
     """
     present = [image for image in model.images if (photos / image.name).is_file()]
     if not present and model.images:
@@ -98,6 +99,8 @@ def present_images(model: Model, photos: Path) -> list[ModelImage]:
             f"{model.folder} has {len(model.images)} registered images, {len(present)} of them in {photos}, but "
             f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
         )
+    there = {image.name for image in present}
+    refuse_partial(sorted({image.name for image in model.images} - there), len(model.images), model.folder, missing)
     return present
 
 

@@ -33,5 +33,11 @@ class SceneOptions:
     0.2, least distances, limits of scales) expect scenes of a few units."""
     cache_gb: float = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
+    missing: float = without_effect(default=0.1)
+    """Share of the images named by a file of poses that may be absent from the disk; more are refused."""
     split: str = "every:8"
     """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.missing <= 1:
+            raise ValueError(f"scene.missing is {self.missing}; give a share from 0 to 1")

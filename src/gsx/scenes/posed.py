@@ -1,6 +1,5 @@
 """What the loaders of photographs with poses share: reading, axes, lenses, views, provenance."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,6 +14,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
@@ -23,8 +23,11 @@ IMAGES = "images"
 """Folder of the photos, unless a scene says otherwise."""
 MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
+FARTHEST = 1e9
+"""A camera at a larger coordinate is a mistake: single precision could not tell it from its neighbours."""
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
 PRINCIPAL_POINTS = ("exact", "centred")
+LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,6 +51,8 @@ def shot_through(
     Raises:
         InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
     """
+    if translation.abs().max() > FARTHEST:
+        raise InputError(f"The camera of '{photo}' is more than {FARTHEST:g} units away: correct or remove its pose.")
     pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
     size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))
     return Shot(
@@ -77,8 +82,8 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: scene.path must be the folder that holds it.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as problem:
+        content = parsed(path)
+    except (OSError, ValueError) as problem:
         raise InputError(f"'{path}' is no valid JSON ({problem}), copy or export it anew.") from None
     if not isinstance(content, dict):
         raise InputError(f"'{path}' holds no JSON object, copy or export it anew.")
@@ -97,6 +102,10 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise InputError(f"'{path}' lists no frames, export it anew.")
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
+    names = [plain_name(frame["file_path"]) for frame in frames]
+    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
+    if twice is not None:
+        raise InputError(f"'{path}' has '{twice}' twice, perhaps to train on and to test on: remove one.")
     return content, frames
 
 
@@ -108,17 +117,28 @@ def plain_name(file_path: str) -> str:
 def find_photo(folder: Path, file_path: str) -> Path | None:
     """The photo of a frame, whose name may lack `.png` (as in NeRF-synthetic); None if it is not there."""
     photo = folder / plain_name(file_path)
+    if not photo.name:
+        return None
     candidates = (photo, photo.with_name(f"{photo.name}.png"))
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
+def refuse_partial(missing: Sequence[str], count: int, place: Path, allowed: float) -> None:
+    """Raise InputError if more than the share `allowed` of the `count` images of a file of poses is absent."""
+    if len(missing) > allowed * count:
+        raise InputError(
+            f"{len(missing)} of the {count} images of '{place}' are not on disk ({named(missing)}): complete them, or "
+            f"train on what is there with scene.missing={len(missing) / count:.2g} or more."
+        )
+
+
 def present_frames(
-    folder: Path, frames: list[dict[str, Any]], file: Path
+    folder: Path, frames: list[dict[str, Any]], file: Path, allowed: float
 ) -> tuple[list[tuple[dict[str, Any], Path]], list[str]]:
     """The frames whose photo is on disk with its path, and a note that names the others.
 
     Raises:
-        InputError: no photo is there.
+        InputError: no photo is there, or more than the share `allowed` is not.
     """
     photos = [find_photo(folder, frame["file_path"]) for frame in frames]
     present = [(frame, photo) for frame, photo in zip(frames, photos, strict=True) if photo is not None]
@@ -128,6 +148,7 @@ def present_frames(
             f"None of the {len(frames)} images of '{file}' is in '{folder}' (looked for {named(missing)}): put them"
             " there or correct the names in the file."
         )
+    refuse_partial(missing, len(frames), file, allowed)
     note = f"Skipped {len(missing)} of the {len(frames)} images of {file.name}, not on disk: {named(missing)}."
     return present, [note] if missing else []
 
@@ -147,6 +168,8 @@ def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Flo
         raise InputError(f"{place} has a pose that is no matrix of numbers, export it anew.") from None
     if world_from_camera.shape not in ((3, 4), (4, 4)) or not world_from_camera.isfinite().all():
         raise InputError(f"{place} has a pose that is not 3 x 4 or 4 x 4 finite numbers, remove or repair it.")
+    if len(world_from_camera) == 4 and (world_from_camera[3] - LAST_ROW).abs().max() > ROTATION_TOLERANCE:
+        raise InputError(f"{place} has a pose whose fourth row is not 0 0 0 1: is the matrix transposed?")
     u, stretch, vh = torch.linalg.svd(world_from_camera[:3, :3])
     if (stretch - 1).abs().max() > ROTATION_TOLERANCE or torch.linalg.det(u @ vh) < 0:
         raise InputError(f"{place} has a pose that scales or mirrors, export cameras without scale.")

@@ -67,7 +67,7 @@ def load(options: TransformsOptions) -> Scene:
     """
     file = _file(Path(options.path).expanduser())
     content, frames = read_frames(file)
-    present, notes = present_frames(file.parent, frames, file)
+    present, notes = present_frames(file.parent, frames, file, options.missing)
     shots = [_shot({**content, **frame}, photo, file) for frame, photo in present]
     views = views_of(shots, options)
     (train, test), split_notes = _split(content, views, options.split, file)

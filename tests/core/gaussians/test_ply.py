@@ -62,6 +62,9 @@ def test_no_vertices(tmp_path: Path) -> None:
     [
         (b"", "no complete PLY header"),
         (b"solid cube\nend_header\n", "no complete PLY header"),
+        (b"ply\nformat ascii 1.0\nelement\nend_header\n", "does not begin with vertices"),
+        (b"ply\nformat ascii 1.0\nelement vertex\nend_header\n", "does not begin with vertices"),
+        (b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n", "does not begin with vertices"),
         (HEADER[:40], "no complete PLY header"),
         (HEADER + b"\0" * 9, "ends after 1 of 2 vertices"),
         (HEADER.replace(b"little", b"big"), "binary_big_endian"),

@@ -17,6 +17,10 @@ TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
 """numpy's names of PLY's types, under both generations of names; the first name of each is written."""
 
 
+MOST_DIGITS = 15
+"""Of a number of vertices: a file with more does not exist."""
+
+
 def read_ply(path: str | Path) -> dict[str, np.ndarray]:
     """The vertex properties by name, each an array [vertices] of the type stored.
 
@@ -68,7 +72,8 @@ def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:
     if layout not in ("ascii", "binary_little_endian"):
         raise InputError(f"'{path}' has format {layout}, save it as binary_little_endian.")
     elements = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
-    if not elements or lines[elements[0]][1] != "vertex" or not lines[elements[0]][2].isdecimal():
+    first = lines[elements[0]] if elements else []
+    if first[1:2] != ["vertex"] or len(first) != 3 or not first[2].isdecimal() or len(first[2]) > MOST_DIGITS:
         raise InputError(f"'{path}' does not begin with vertices, save it as a plain point cloud.")
     stop = elements[1] if len(elements) > 1 else len(lines)
     properties = [words for words in lines[elements[0] : stop] if words[:1] == ["property"]]
@@ -77,7 +82,7 @@ def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:
         raise InputError(f"'{path}' has '{' '.join(unknown)}', only scalar vertex properties can be read.")
     if not properties or len({name for _, _, name in properties}) < len(properties):
         raise InputError(f"'{path}' names no vertex property or one twice, export it anew.")
-    return layout, int(lines[elements[0]][2]), np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
+    return layout, int(first[2]), np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
 
 
 def _binary(data: bytes, body: int, count: int, table: np.dtype, path: Path) -> np.ndarray:

@@ -97,6 +97,8 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         meta, data = read_json(sidecar), path.read_bytes()
     except (OSError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+    if not isinstance(meta, dict):
+        raise CheckpointError(f"checkpoint {sidecar} holds no JSON object: remove it to use an older one")
     if meta.get("schema") != SCHEMA:
         raise CheckpointError(
             f"checkpoint {path} has schema {meta.get('schema')}, this gsx reads schema {SCHEMA}: "

@@ -10,6 +10,7 @@ from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run, Step
 from gsx.experiments.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
+from gsx.experiments.run_folder.files import read_lines
 
 METRICS = "metrics.jsonl"
 LIVE_SECONDS, PLAIN_SECONDS = 0.2, 5.0
@@ -122,9 +123,7 @@ class Progress:
 
 def read_curves(folder: Path) -> list[dict[str, Any]]:
     """Lines of a run's metrics.jsonl; one that a crash cut off is left out."""
-    path = folder / METRICS
-    written = path.read_text().splitlines() if path.exists() else []
-    return [json.loads(line) for line in written if line.endswith("}")]
+    return read_lines(folder / METRICS, {})
 
 
 class MetricsLog:

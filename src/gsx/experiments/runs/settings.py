@@ -317,14 +317,16 @@ def named_code(settings: Settings) -> dict[str, str]:
 def add_newer_settings(config: Any) -> None:
     """Give the configuration of an older gsx what it does not know, as older runs had it.
 
-    Settings of the rasterizer at their defaults; checks of redrawn pictures, which were the strict ones; the gate of
-    `clone_split`, which was a yes or no beside its numbers.
+    Settings of the rasterizer at their defaults; any number of absent images; checks of redrawn pictures, which were
+    the strict ones; the gate of `clone_split`, which was a yes or no beside its numbers.
     """
     if not isinstance(config, DictConfig):
         return
     if isinstance(config.get("rasterizer"), DictConfig):
         options = {key: v for key, v in dataclasses.asdict(RasterSettings()).items() if key not in OF_BACKBONES}
         config.rasterizer = OmegaConf.merge(options, config.rasterizer)
+    if "downscale" in (config.get("scene") or {}) and "missing" not in config.scene:
+        config.scene.missing = 1.0
     augmenters = config.get("augmenter")
     for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
         if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
