@@ -24,7 +24,7 @@ COMMANDS = {
     "pseudo_details": ("backbone=octree_scaffold", "augmenter=[upscale,bootstrap]", "eval.zoom=[1,2,4]"),
     "octree_ub": ("variant=octree_ub", "dataset=demo", "budget=quick"),
 }
-"""By the name of the run's folder; `demo` is what `make demo` runs."""
+"""By the name of the run's folder; `demo` is the second run of `make demo`."""
 ZOOMED = ("2", "4")
 COLUMNS = [
     ["command", "command"],

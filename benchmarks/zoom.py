@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import torch
@@ -27,6 +28,9 @@ from gsx.builtin import plugins
 from gsx.core.files import read_json, write_json
 from gsx.core.quality.metrics import psnr
 from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.run_folder.files import read_run
+from gsx.experiments.run_folder.run_key import comparable
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
@@ -56,22 +60,23 @@ PARTS = {
 """Finer pixels in the second half of the steps."""
 OCTREE = ("backbone=octree_scaffold",)
 LEVELS = {"octree_scaffold": OCTREE, "preset=octree_zoom": (*OCTREE, "preset=octree_zoom")}
+EARLY = (*ZOOM, "training.supersample_from=0.5")
 STRONG = (
-    *("training.supersample_from=0.5", "augmenter=upscale", "augmenter.upscale.timing.start=20000"),
-    *("augmenter.upscale.scales=[2]", "augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
+    *(*EARLY, "augmenter=upscale", "augmenter.upscale.timing.start=20000", "augmenter.upscale.scales=[2]"),
+    *("augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
 )
-"""Pictures twice as fine count for half of the run, by absolute values; the rest is the augmenter's default."""
-ENLARGED, TRUE = (("regenerator/upscale=lanczos",), ("regenerator/upscale=oracle",))
-INSTEAD = (*STRONG, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,0.6]")
-"""Of 0.6 of the photographs' loss."""
-BESIDE = (*STRONG, "augmenter.upscale.mode=direct")
-"""The photographs' loss, as heavy."""
+"""Pseudo views twice as fine count for half of the run, by absolute values; the rest is the augmenter's default."""
+LANCZOS, ORACLE = (("regenerator/upscale=lanczos",), ("regenerator/upscale=oracle",))
+REPLACING = (*STRONG, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,0.6]")
+"""0.6 of the photographs' loss."""
+ADDED = (*STRONG, "augmenter.upscale.mode=direct")
+"""To the photographs' loss, at weight 1."""
 PICTURES = {
-    "preset=zoom": ZOOM,
-    "enlarged pictures instead": (*ZOOM, *INSTEAD, *ENLARGED),
-    "true pictures instead": (*ZOOM, *INSTEAD, *TRUE),
-    "enlarged pictures beside": (*ZOOM, *BESIDE, *ENLARGED),
-    "true pictures beside": (*ZOOM, *BESIDE, *TRUE),
+    "no pseudo views": EARLY,
+    "lanczos replacing 0.6": (*REPLACING, *LANCZOS),
+    "oracle replacing 0.6": (*REPLACING, *ORACLE),
+    "lanczos added": (*ADDED, *LANCZOS),
+    "oracle added": (*ADDED, *ORACLE),
 }
 WAYS = {
     "samples of its pixels": ("eval.supersample=1",),
@@ -79,8 +84,17 @@ WAYS = {
     "as trained": (),
 }
 """Of looking from afar: overrides by the name of a row."""
+COMPOSING = Lock()
+"""Hydra has one session at a time."""
+COMPARED = ("backbone", "training", "augmenter", "regenerator", "scene", "seed", "iterations")
+"""Keys in which runs of one row may not differ."""
 AFAR, FEW = 0.25, 25
 """The zoom, and of how many test views."""
+
+
+def numbers(text: str) -> list[int]:
+    """Numbers by commas."""
+    return [int(word) for word in text.split(",")]
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
@@ -89,7 +103,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
     parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
-    parser.add_argument("--seeds", type=lambda text: [int(seed) for seed in text.split(",")], default=[0, 1, 2])
+    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/zoom"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
@@ -108,8 +122,22 @@ def trained(scene: str, seed: int, given: argparse.Namespace, overrides: Sequenc
     folder = folder_of(scene, seed, given, name)
     print(time.strftime("%H:%M"), folder.name, flush=True)
     words = [*overrides, *SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    refuse_another(folder, words)
     train(folder, words, threads, folder.with_name(f"{folder.name}.log"))
     return folder
+
+
+def refuse_another(folder: Path, words: Sequence[str]) -> None:
+    """End with a message where a folder holds a finished run of another composition, perhaps of an earlier preset."""
+    if not (folder / "evaluation.json").is_file():
+        return
+    with COMPOSING:
+        asked = compose(words, plugins())
+    there = read_run(folder).config
+    own, others = (comparable({key: config.get(key) for key in COMPARED}) for config in (asked.resolved, there))
+    differing = [key for key in own.keys() & others.keys() - asked.idle if own[key] != others[key]]
+    if differing:
+        sys.exit(f"{folder} was trained by another {', '.join(sorted(differing))}: remove it, or give other --runs")
 
 
 def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:

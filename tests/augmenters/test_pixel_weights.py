@@ -1,5 +1,7 @@
 """Which pixels count: sampling by hand, and agreement with the photograph."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,10 +10,11 @@ from gsx.augmenters.pixel_weights import (
     best_densities,
     densities,
     in_bytes,
+    normalised,
     sampled_better,
     sampling_scores,
     splatsure,
-    stretched,
+    unscaled_weights,
 )
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
@@ -53,14 +56,14 @@ def middle(picture: torch.Tensor) -> float:
 @pytest.mark.parametrize(("zoom", "counts"), [(1, False), (2, True), (4, True)])
 def test_a_zoomed_view_counts_unless_a_photograph_came_as_near(zoom: int, counts: bool) -> None:
     raster, own = RasterSettings(), at(4.0)
-    assert (middle(sampled_better(wall(), own.zoom(zoom), [own], 0, raster)) > 0.9) == counts
-    assert middle(sampled_better(wall(), own.zoom(zoom), [own, at(0.8)], 0, raster)) < 0.1
+    assert (middle(sampled_better(lambda _: wall(), own.zoom(zoom), [own], 0, raster)) > 0.9) == counts
+    assert middle(sampled_better(lambda _: wall(), own.zoom(zoom), [own, at(0.8)], 0, raster)) < 0.1
 
 
 def test_only_the_part_that_the_nearer_photograph_shows_does_not_count() -> None:
     """A photograph from 1 unit away sees about a unit of the wall, on the left."""
     own = at(4.0)
-    trust = sampled_better(wall(), own.zoom(2), [own, at(1.0, target=-0.6)], 0, RasterSettings())
+    trust = sampled_better(lambda _: wall(), own.zoom(2), [own, at(1.0, target=-0.6)], 0, RasterSettings())
     assert float(trust[36:44, 22:30].mean()) < 0.1
     assert float(trust[36:44, 50:58].mean()) > 0.9
 
@@ -126,18 +129,37 @@ def test_the_published_weights_by_hand(distances: tuple[float, ...], published: 
     """A wall seen from 4 units through twice the focal length, made from the first of these photographs."""
     raster, own, photographs = RasterSettings(), at(4.0).zoom(2), [at(distance) for distance in distances]
     assert (WEIGHT_MAPS["splatsure"], WEIGHT_MAPS["finer"]) == (splatsure, sampled_better)
-    assert middle(splatsure(wall(), own, photographs, 0, raster)) == pytest.approx(published, abs=0.03)
-    assert middle(sampled_better(wall(), own, photographs, 0, raster)) == pytest.approx(ours, abs=0.1)
+    assert middle(splatsure(lambda _: wall(), own, photographs, 0, raster)) == pytest.approx(published, abs=0.03)
+    assert middle(sampled_better(lambda _: wall(), own, photographs, 0, raster)) == pytest.approx(ours, abs=0.1)
 
 
-def test_where_nothing_is_drawn_the_published_weight_is_1_and_low_maps_are_stretched() -> None:
+def test_where_nothing_is_drawn_the_published_weight_is_1_and_low_maps_are_normalised() -> None:
     near, far = at(1.0), at(4.0)
-    weights = splatsure(dots((0.0, 0.0, 0.0), scale=0.05), far.zoom(2), [far, near, far], 0, RasterSettings())
+    dot = dots((0.0, 0.0, 0.0), scale=0.05)
+    weights = splatsure(lambda _: dot, far.zoom(2), [far, near, far], 0, RasterSettings())
     assert float(weights[0, 0]) == 1.0
     low = torch.tensor([[0.1, 0.3], [0.5, 0.2]])
-    assert stretched(low, 0.1, 0.5).tolist() == [[0.0, pytest.approx(0.5)], [1.0, pytest.approx(0.25)]]
-    assert stretched(low, 0.1, 0.95).tolist() == low.tolist()
-    assert stretched(torch.tensor([[-0.1, 1.7]]), -0.1, 1.7).tolist() == [[0.0, 1.0]]
+    assert normalised(low, 0.1, 0.5).tolist() == [[0.0, pytest.approx(0.5)], [1.0, pytest.approx(0.25)]]
+    assert normalised(low, 0.1, 0.95).tolist() == low.tolist()
+    assert normalised(torch.tensor([[-0.1, 1.7]]), -0.1, 1.7).tolist() == [[0.0, 1.0]]
+
+
+def test_low_maps_are_normalised_by_the_whole_photograph_not_by_the_window() -> None:
+    """Everything in the photograph is seen three times as finely by another, by one part less than by the rest."""
+    raster, own = RasterSettings(), at(4.0)
+    photographs, asked = [own, at(4.0 / 1.14), own], list[Camera]()
+
+    def drawn(camera: Camera) -> Splats:
+        asked.append(camera)
+        return broad
+
+    broad = replace(wall(), scales=torch.full((441, 3), 4.0))
+    low = unscaled_weights(broad, own, photographs, 0, raster)
+    assert 0 < float(low.max()) < 0.9
+    window = own.crop(10, 10, 8, 8)
+    wanted = (unscaled_weights(broad, window, photographs, 0, raster) - low.min()) / (low.max() - low.min())
+    assert torch.allclose(splatsure(drawn, window, photographs, 0, raster), wanted.clamp(0, 1))
+    assert asked == [window, own]
 
 
 def test_blocks_that_contradict_the_photograph_do_not_count() -> None:

@@ -88,10 +88,11 @@ def test_code_that_a_folder_names_runs_only_where_it_is_trusted(
     (tmp_path / "was_here").unlink()
     assert main(["resume", str(tmp_path / "run")]) == 2
     assert "runs code, regenerator.upscale: 'theirs:blocks'" in capsys.readouterr().err
-    assert main(["resume", str(tmp_path / "run"), "regenerator.upscale.function=other:f"]) == 2
+    assert main(["resume", str(tmp_path / "run"), "regenerator.upscale.arguments={a: 'theirs:blocks2'}"]) == 2
+    assert "runs code" in capsys.readouterr().err
     assert not (tmp_path / "was_here").exists()
     assert main(["resume", str(tmp_path / "once"), "--trust"]) == 0
-    assert main(["resume", str(tmp_path / "twice"), named]) == 0
+    assert main(["resume", str(tmp_path / "twice"), "regenerator.upscale.function='theirs:blocks'"]) == 0
     assert (tmp_path / "was_here").exists()
 
 

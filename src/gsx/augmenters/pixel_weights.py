@@ -13,37 +13,54 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, undilated_radii
 from gsx.core.shapes import Float, Int, UInt8
 
-WeightMap: TypeAlias = Callable[[Splats, Camera, Sequence[Camera], int, RasterSettings], Tensor]
-"""(splats, camera of the pseudo view, cameras of the photographs, which of them it was made from, rules to draw by) ->
-weights of pixels, [h, w]."""
+Draw: TypeAlias = Callable[[Camera], Splats]
+"""The splats of a camera."""
+WeightMap: TypeAlias = Callable[[Draw, Camera, Sequence[Camera], int, RasterSettings], Tensor]
+"""(the model, camera of the pseudo view, cameras of the photographs, which of them it was made from, rules to draw by)
+-> weights of pixels, [h, w]."""
 BETTER, SOFTNESS = 1.1, 0.05
 """SplatSuRe (2512.02172): sampled 1.1 times as finely is finer, over a soft edge."""
 LEAST_VIEWS = 3
 """SplatSuRe: of splats that fewer photographs see nothing is sure."""
 LEAST_PEAK = 0.9
-"""SplatSuRe: weights that reach less high anywhere in a photograph are stretched to [0, 1]."""
+"""SplatSuRe: weights that stay below it in a whole photograph are min-max normalised."""
 
 
 @torch.no_grad()
 def splatsure(
-    splats: Splats, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+    drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
     """SplatSuRe's weights (2512.02172): low where another photograph than this one shows a surface more finely, since
     it gives the detail; high in the one that shows it most finely, and where all show it alike or nothing is seen.
 
     Ours: drawn for the pseudo view itself instead of drawn for the photograph and enlarged.
     """
+    own, whole = (
+        unscaled_weights(drawn(one), one, photographs, number, raster) for one in (camera, photographs[number])
+    )
+    return normalised(own, float(whole.min()), float(whole.max()))
+
+
+def unscaled_weights(
+    splats: Splats, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+) -> Float[Tensor, "h w"]:
+    """1 - the drawn score, + 1 where splats are drawn that photograph `number` shows most finely."""
     score, finest = sampling_scores(splats, photographs, raster)
-    own = (finest == number).to(score)
-    whole = uncertain(score, own, splats, photographs[number], raster)
-    return stretched(uncertain(score, own, splats, camera, raster), float(whole.min()), float(whole.max()))
+    return 1 + blended((finest == number).to(score) - score, splats, camera, raster)
+
+
+def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Float[Tensor, "h w"]:
+    """Weights in [0, 1]; from `least` to `most` of the whole photograph where its `most` is below LEAST_PEAK."""
+    if least < most < LEAST_PEAK:
+        weights = (weights - least) / (most - least)
+    return weights.clamp(0, 1)
 
 
 def sampling_scores(
     splats: Splats, photographs: Sequence[Camera], raster: RasterSettings
 ) -> tuple[Float[Tensor, "N"], Int[Tensor, "N"]]:
-    """(how sure it is that a photograph shows a splat's detail, which of them does so most finely) from its largest
-    over its smallest radius on their screens; 0 for splats that fewer than three see, whose finest may be -1."""
+    """(score of each splat: near 1 where some photograph shows it more finely than another, 0 below three that see it;
+    number of the photograph that shows it most finely, -1 for none) from largest and smallest radius on the screens."""
     largest, smallest = torch.zeros_like(splats.scales[:, 0]), torch.full_like(splats.scales[:, 0], torch.inf)
     finest, views = torch.full_like(largest, -1, dtype=torch.long), torch.zeros_like(largest)
     for number, camera in enumerate(photographs):
@@ -54,20 +71,6 @@ def sampling_scores(
         views += seen
     score = torch.sigmoid((largest / smallest - BETTER) / SOFTNESS)
     return torch.where(views < LEAST_VIEWS, 0.0, score), finest
-
-
-def uncertain(
-    score: Float[Tensor, "N"], own: Float[Tensor, "N"], splats: Splats, camera: Camera, raster: RasterSettings
-) -> Float[Tensor, "h w"]:
-    """1 - the drawn score, + where splats are drawn that this photograph shows most finely."""
-    return 1 + blended(own - score, splats, camera, raster)
-
-
-def stretched(weights: Float[Tensor, "h w"], least: float, most: float) -> Float[Tensor, "h w"]:
-    """In [0, 1]; from `least` to `most` of the whole picture where that does not reach high enough."""
-    if least < most < LEAST_PEAK:
-        weights = (weights - least) / (most - least)
-    return weights.clamp(0, 1)
 
 
 def blended(values: Float[Tensor, "N"], splats: Splats, camera: Camera, raster: RasterSettings) -> Float[Tensor, "h w"]:
@@ -94,13 +97,14 @@ def best_densities(points: Float[Tensor, "N 3"], cameras: Sequence[Camera]) -> F
 
 @torch.no_grad()
 def sampled_better(
-    splats: Splats, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+    drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
     """Ours: 1 where a camera sees surfaces more finely than every photograph does, 0 where it does not; blended like
     colour.
 
     Occlusion is left aside: a photograph counts for what lies in its field of view. Unseen by all counts as 1.
     """
+    splats = drawn(camera)
     means = splats.means.detach()
     own, best = camera.fx / camera.project(means)[1].clamp_min(camera.near), best_densities(means, photographs)
     ratio = torch.where(best > 0, own / best.clamp_min(1e-30), torch.inf)

@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -153,10 +154,8 @@ class Redrawer:
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
             photographs = [view.camera for view in run.scene.train]
-            pixel_weight = (
-                pixel_weight
-                * weights(splats_for(run, spec.camera), spec.camera, photographs, spec.parent, run.raster).cpu()
-            )
+            drawn = partial(splats_for, run)
+            pixel_weight = pixel_weight * weights(drawn, spec.camera, photographs, spec.parent, run.raster).cpu()
         if options.gate > 0 and request.photo and spec.scale > 1:
             agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)
             pixel_weight = pixel_weight * window.cut(agreed[None])[0]

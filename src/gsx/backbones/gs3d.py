@@ -42,7 +42,7 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
 
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
-    """The backbones gs3d and mip_splatting."""
+    """The backbones gs3d, gs3d_zoom and mip_splatting."""
     return GS3D(options, context, AllVisible(), CloneSplit())
 
 

@@ -53,7 +53,7 @@ class Density:
 
 @dataclass(frozen=True, kw_only=True)
 class GS3DOptions:
-    """Options of the backbone; values in conf/backbone/gs3d.yaml and mip_splatting.yaml."""
+    """Options of the backbone; values in conf/backbone/gs3d.yaml, gs3d_zoom.yaml and mip_splatting.yaml."""
 
     name: str
     filter: str

@@ -8,9 +8,9 @@ from typing import Any, NoReturn
 from gsx.core.errors import ConfigError, InputError
 
 
-def run_arguments(verb: str, arguments: list[str], description: str) -> tuple[Path, list[str]]:
-    """The run folder and the overrides after it."""
-    parser = Parser(prog=f"gsx {verb}", usage="%(prog)s RUN [KEY=VALUE ...]", description=description)
+def run_arguments(verb: str, arguments: list[str], description: str, flags: str = "") -> tuple[Path, list[str]]:
+    """The run folder and the overrides after it; `flags`: others that the verb has, for its help."""
+    parser = Parser(prog=f"gsx {verb}", usage=f"%(prog)s RUN [KEY=VALUE ...]{flags}", description=description)
     parser.add_argument("run", metavar="RUN", help="run folder")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
     given = parser.parse_args(arguments)

@@ -60,7 +60,8 @@ def dispatch_together(arguments: list[str]) -> int:
     Raises:
         ConfigError: anything else is asked for.
     """
-    if any(word.startswith("-") for word in arguments) or (
+    flags = {word for word in arguments if word.startswith("-")}
+    if flags - ({"--trust"} if arguments[:1] == ["resume"] else set()) or (
         arguments[:1] and arguments[0] in VERBS and arguments[0] != "resume"
     ):
         asked = " ".join(arguments[:2])

@@ -135,7 +135,7 @@ def sweep_job(config: Any) -> int:
 def verb_resume(arguments: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...] [--trust]"""
     told = "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names."
-    folder, overrides = run_arguments("resume", [word for word in arguments if word != "--trust"], told)
+    folder, overrides = run_arguments("resume", [word for word in arguments if word != "--trust"], told, " [--trust]")
     from gsx.experiments.run_folder.claims import claimed
     from gsx.experiments.runs.open import open_run, refuse_other
     from gsx.experiments.runs.settings import write_config

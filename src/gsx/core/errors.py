@@ -28,8 +28,12 @@ class TrainingError(GsxError):
     """Training cannot go on, for example after three non-finite steps in a row."""
 
 
-class Disagreement(TrainingError):
-    """The processes of one run hold different models, of which none may become a checkpoint."""
+class LostModel(TrainingError):
+    """What is left of a model is another one, which may not become a checkpoint."""
+
+
+class Disagreement(LostModel):
+    """The processes of one run hold different models."""
 
 
 def nearest(word: str, options: Iterable[str]) -> str:

@@ -18,7 +18,7 @@ from gsx.core.training.regenerator import RegeneratorContext, Request
 
 @contextmanager
 def beside_the_user() -> Iterator[None]:
-    """Modules of the working directory can be imported, as with `python -m`, but none in place of an installed one."""
+    """Modules of the working directory can be imported, those that are installed come first."""
     here = os.getcwd()
     sys.path.append(here)
     try:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 import pytest
 from tiny import tiny_settings, words
@@ -67,6 +68,25 @@ def test_a_lock_file_that_its_holder_removed_meanwhile_is_no_claim(tmp_path: Pat
         assert not same_file(early, path)
         with claimed(tmp_path):
             assert not same_file(early, path)
+
+
+def test_the_new_lock_file_is_taken_where_the_old_one_was_removed_before_it_was_locked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its holder lets go and removes it between our opening and our locking, and another process makes a new one."""
+    locked = list[str]()
+
+    def lock(stream: IO[str]) -> bool:
+        if not locked:
+            (tmp_path / LOCK).unlink()
+            (tmp_path / LOCK).write_text("")
+        locked.append(stream.name)
+        return True
+
+    monkeypatch.setattr(claims, "lock", lock)
+    with claims.taken(tmp_path / LOCK, tmp_path, needed=True) as stream:
+        assert len(locked) == 2
+        assert same_file(stream, tmp_path / LOCK)
 
 
 def test_a_link_in_place_of_a_lock_is_neither_followed_nor_emptied(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def compose_length(words: list[str]) -> int:
 
 
 def test_published_values_of_gs3d() -> None:
-    options = compose([], plugins()).backbone.options
+    options = compose(["backbone=gs3d"], plugins()).backbone.options
     assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)
     assert options.rates.sh_rest == pytest.approx(options.rates.sh_dc / 20)
     density = options.density
@@ -115,10 +115,14 @@ def test_a_run_folders_configuration_looks_nothing_up(tmp_path: Path, monkeypatc
     resolved = compose(["tracker=mlflow"], plugins()).resolved
     write_config(tmp_path / "config.yaml", resolved)
     assert read_config(tmp_path / "config.yaml", plugins()).resolved == resolved
-    for key, value in (("output", "${oc.env:GSX_SECRET}"), ("tracker.mlflow.uri", "http://x/${oc.env:GSX_SECRET}")):
-        config = OmegaConf.create(resolved)
-        OmegaConf.update(config, key, value)
-        write_config(tmp_path / "config.yaml", config)
+    secret = "http://x/${oc.env:GSX_SECRET}"
+    for key, more in (
+        ("output", {"output": secret}),
+        ("tracker.mlflow.uri", {"tracker": {"mlflow": {"uri": secret}}}),
+        ("eval.zoom.1", {"eval": {"zoom": [1, secret]}}),
+        ("backbone.a.b.0", {"backbone": {"a.b": [secret]}}),
+    ):
+        (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.merge(resolved, more)))
         with pytest.raises(ConfigError, match=rf"{key} is '.*oc.env:GSX_SECRET.*'; .* plain values") as caught:
             read_config(tmp_path / "config.yaml", plugins())
         assert "hush" not in str(caught.value)

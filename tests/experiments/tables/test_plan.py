@@ -234,6 +234,13 @@ def test_a_row_may_be_overrides_instead_of_a_variant(tmp_path: Path) -> None:
     assert "weight_split=run" not in baseline
 
 
+def test_every_row_of_overrides_composes(tmp_path: Path) -> None:
+    words = ["+experiment=zoom_truth", "dataset=demo", f"output={tmp_path}", "experiment.dry=true", "budget=smoke"]
+    commands, code = run_table([*words, "experiment.seeds=[0]"], plugins(), lambda config: None)
+    assert code == 0
+    assert len(set(commands.splitlines())) == 17
+
+
 def test_a_changed_experiment_is_another_table_and_says_so(tmp_path: Path) -> None:
     words = ["+experiment=table_frameworks", "dataset=own", "+dataset.scenes.yard=Yard", f"output={tmp_path}",
              f"data_root={tmp_path}", "experiment.only=[3D-GS]"]  # fmt: skip

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.errors import InputError
+from gsx.core.errors import InputError, LostModel
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
@@ -166,14 +166,22 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
     """Remove rows with values that are not finite, or that one of the cameras cannot draw; returns how many.
 
     Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
-    gradients included; nor where nothing would be left.
+    gradients included.
+
+    Raises:
+        LostModel: nothing would be left.
     """
     rows = [parameter.detach().reshape(len(parameter), -1) for parameter in backbone.table.parameters.values()]
     kept = torch.stack([torch.isfinite(values).all(1) for values in rows]).all(0)
     for camera in cameras:
         kept &= drawable_rows(backbone, camera, step)
-    if bool(kept.all()) or not bool(kept.any()):
+    if bool(kept.all()):
         return 0
+    if not bool(kept.any()):
+        raise LostModel(
+            f"step {step}: none of {len(kept):,} primitives has values that are finite and can be drawn: lower the "
+            "learning rates (backbone.rates), and see in what units the scene is"
+        )
     keep_rows(backbone.table, kept)
     return int((~kept).sum())
 

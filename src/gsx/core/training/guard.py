@@ -8,7 +8,7 @@ import logging
 
 import torch
 
-from gsx.core.errors import Disagreement, TrainingError
+from gsx.core.errors import Disagreement, LostModel, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
 from gsx.core.training.run import Run, Step
@@ -50,10 +50,10 @@ class Guard:
         """See that there is still a model.
 
         Raises:
-            TrainingError: its last primitive is gone.
+            LostModel: its last primitive is gone.
         """
         if len(run.backbone.table) == 0:
-            raise TrainingError(
+            raise LostModel(
                 f"no primitive is left after step {step.number}: lower the learning rates (backbone.rates), or the "
                 "thresholds below which density control removes"
             )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.errors import TrainingError
+from gsx.core.errors import LostModel
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
@@ -69,13 +69,13 @@ def remove_lost(run: Run, step: Step) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any.
 
     Raises:
-        TrainingError: there were so many that what is left is another model.
+        LostModel: there were so many that what is left is another model.
     """
     cameras = [run.scene.train[number].camera for number in run.sampler.taken]
     count = len(run.backbone.table)
     removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed > max(FEW, MOST_LOST * count):
-        raise TrainingError(
+        raise LostModel(
             f"step {step.number}: {removed:,} of {count:,} primitives have values that are not finite or cannot be "
             "drawn: lower the learning rates (backbone.rates), and see in what units the scene is"
         )

@@ -17,6 +17,8 @@ logger = logging.getLogger(__name__)
 
 LOCK = ".lock"
 """Of a run folder that is being trained in."""
+TRIES = 20
+"""Times that a lock file is opened which its holder removes meanwhile."""
 
 
 @contextmanager
@@ -69,26 +71,27 @@ def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
     Raises:
         InputError: another process has it, it cannot be opened, or its file system knows no locks and they are needed.
     """
-    while True:
+    for _ in range(TRIES):
         stream = opened(path, folder)
         try:
             if not lock(stream):
                 raise InputError(f"{folder} is being trained by {holder(stream)}: wait for it, or stop it")
             if same_file(stream, path):
                 return stream
+            problem = "its lock files do not stay"
         except OSError as error:
-            if not needed:
-                logger.warning("%s lies on a file system without locks: see that no other process trains in it", folder)
-                return stream
-            stream.close()
-            raise InputError(
-                f"{folder.parent} lies on a file system without locks ({error.strerror}), which keep processes from "
-                "training the same run: choose another place, output=FOLDER"
-            ) from error
+            problem = error.strerror or str(error)
         except BaseException:
             stream.close()
             raise
         stream.close()
+    if needed:
+        raise InputError(
+            f"{folder.parent} lies on a file system without locks ({problem}), which keep processes from training the "
+            "same run: choose another place, output=FOLDER"
+        )
+    logger.warning("%s lies on a file system without locks: see that no other process trains in it", folder)
+    return opened(path, folder)
 
 
 def opened(path: Path, folder: Path) -> IO[str]:
@@ -102,8 +105,8 @@ def opened(path: Path, folder: Path) -> IO[str]:
         return os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{path}, by which processes know of each other, cannot be opened ({error.strerror}): if it is a link or "
-            f"another user's, see who trains in {folder}, and remove it"
+            f"{path}, by which processes know of each other, cannot be opened ({error.strerror}): it must be writable "
+            f"and no link; see who trains in {folder} before you remove it"
         ) from error
 
 

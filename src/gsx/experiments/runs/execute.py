@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gsx.core.errors import Disagreement, TrainingError
+from gsx.core.errors import LostModel, TrainingError
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
@@ -77,7 +77,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
             if run.complete:
                 finish(run, settings, plugins)
     except TrainingError as error:
-        if not isinstance(error, Disagreement):
+        if not isinstance(error, LostModel):
             checkpoint.save(run)
         status(run, "failed", str(error))
         raise

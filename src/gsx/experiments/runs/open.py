@@ -33,7 +33,7 @@ from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
-from gsx.experiments.runs.settings import Settings, named_code, read_config, write_config
+from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
 from gsx.experiments.runs.tracking import build_trackers
 
 logger = logging.getLogger(__name__)
@@ -117,8 +117,9 @@ def refuse_other(folder: Path) -> None:
 
 def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
     """Raise InputError for a folder that names code to be run, unless the command line names the same."""
+    words = [word.partition("=") for word in overrides]
     for key, code in named_code(settings).items():
-        if not any(word.startswith(f"{key}.") and word.endswith(f"={code}") for word in overrides):
+        if code not in [str(value_of(value)) for name, _, value in words if name.startswith(f"{key}.")]:
             raise InputError(
                 f"{folder / 'config.yaml'} runs code, {key}: '{code}', which would have all your rights: look at it "
                 f"first, then `gsx resume {folder} --trust`"

@@ -290,7 +290,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         if not equals or key not in known:
             raise ConfigError(f"'{key}' is no key of {path}.{right_key(key, known)}")
         try:
-            OmegaConf.update(config, key, OmegaConf.select(OmegaConf.create(f"value: {value}"), "value"))
+            OmegaConf.update(config, key, value_of(value))
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)  # type: ignore[arg-type]
@@ -299,12 +299,23 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 def refuse_interpolation(path: Path, config: DictConfig) -> None:
     """Raise ConfigError for a value that is looked up when it is read: somebody else's file would learn of this
     machine's environment. gsx writes none."""
-    for key in dotted(OmegaConf.to_container(config, resolve=False)):
-        parent, _, name = key.rpartition(".")
-        node = OmegaConf.select(config, parent) if parent else config
-        if isinstance(node, DictConfig) and OmegaConf.is_interpolation(node, name):
-            value = OmegaConf.to_container(node, resolve=False)[name]  # type: ignore[index,call-overload]
-            raise ConfigError(f"{path}: {key} is '{value}'; a run's configuration holds plain values: write what it is")
+    for key, text in texts(OmegaConf.to_container(config, resolve=False)):
+        if "${" in text:
+            raise ConfigError(f"{path}: {key} is '{text}'; a run's configuration holds plain values: write what it is")
+
+
+def value_of(word: str) -> Any:
+    """What a word of the command line stands for, as YAML."""
+    return OmegaConf.select(OmegaConf.create(f"value: {word}"), "value")
+
+
+def texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All texts inside nested mappings and lists, with their keys."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, one in inner:
+        yield from texts(one, f"{key}.{name}".lstrip("."))
+    if isinstance(value, str):
+        yield key, value
 
 
 def named_code(settings: Settings) -> dict[str, str]:
