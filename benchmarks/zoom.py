@@ -5,7 +5,7 @@
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and drawn
 by every rule for zoomed cameras. `compositions`: each is trained by mip_splatting and by its preset for zooming in.
-`parts`: by parts of the preset. `levels`: by anchors with levels, and by their preset for zooming in. `pictures`: by
+`parts`: by parts of the preset. `levels`: by Octree-GS with its preset for zooming in. `pictures`: by
 the preset with pseudo details, enlarged or true, in half of the run. `afar`: what compositions draw from four times as
 far as photographs were taken, by each way of looking. Finished runs below --runs
 are not trained again. Some hours on two cores.
@@ -49,18 +49,17 @@ RULES = ("none", "magnified", "resampled")
 ZOOMS = ("1", "2", "4")
 MIP = ("backbone=mip_splatting",)
 ZOOM = (*MIP, "preset=zoom")
+EARLY = (*ZOOM, "training.supersample_from=0.5")
 COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 PARTS = {
     "mip_splatting": MIP,
     "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
-    "rates alone": (*ZOOM, "training.supersample=1"),
-    "finer pixels and rates": (*ZOOM, "training.supersample_from=0.5"),
+    "rates alone": (*EARLY, "training.supersample=1"),
+    "finer pixels and rates": EARLY,
 }
 """Finer pixels in the second half of the steps."""
-OCTREE = ("backbone=octree_scaffold",)
-LEVELS = {"octree_scaffold": OCTREE, "preset=octree_zoom": (*OCTREE, "preset=octree_zoom")}
-EARLY = (*ZOOM, "training.supersample_from=0.5")
+LEVELS = {"preset=octree_zoom": ("backbone=octree_scaffold", "preset=octree_zoom")}
 STRONG = (
     *(*EARLY, "augmenter=upscale", "augmenter.upscale.timing.start=20000", "augmenter.upscale.scales=[2]"),
     *("augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
@@ -72,7 +71,6 @@ REPLACING = (*STRONG, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weight
 ADDED = (*STRONG, "augmenter.upscale.mode=direct")
 """To the photographs' loss, at weight 1."""
 PICTURES = {
-    "no pseudo views": EARLY,
     "lanczos replacing 0.6": (*REPLACING, *LANCZOS),
     "oracle replacing 0.6": (*REPLACING, *ORACLE),
     "lanczos added": (*ADDED, *LANCZOS),
@@ -104,6 +102,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
     parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
+    parser.add_argument("--label", default="", help="of tables over other scenes or seeds: added to their names")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/zoom"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
@@ -241,8 +240,8 @@ def parts(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 
 def levels(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
-    """Anchors with levels, and their preset for zooming in."""
-    return "Anchors with levels for zooming in", *compared(LEVELS, scenes, given)
+    """Octree-GS with its preset for zooming in."""
+    return "Octree-GS for zooming in", *compared(LEVELS, scenes, given)
 
 
 def pictures(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
@@ -340,7 +339,7 @@ def main(words: Sequence[str]) -> None:
     for name in given.what.split(","):
         title, columns, rows, note = WHAT[name](scenes, given)
         table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/zoom.py"))
-        write_results(given.to, "zoom_cpu", machine, {name: table})
+        write_results(given.to, "zoom_cpu", machine, {name + given.label: table})
         print(text_table(table))
 
 
