@@ -14,7 +14,7 @@ from torch import Tensor
 from gsx.backbones.anchors import Anchors
 from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import look_at
-from gsx.core.errors import TrainingError
+from gsx.core.errors import LostModel, TrainingError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import RasterSettings, rasterize, touches
@@ -159,12 +159,13 @@ def test_where_nothing_is_removed_nothing_is_touched(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", BACKBONES)
-def test_a_model_that_is_lost_as_a_whole_is_left_as_it_is(name: str, tmp_path: Path) -> None:
+def test_a_model_that_is_lost_as_a_whole_ends_the_run_and_is_left_as_it_is(name: str, tmp_path: Path) -> None:
     run = run_of(name, tmp_path)
     with torch.no_grad():
         backbone_of(run).table["log_scales"].fill_(torch.nan)
     count = len(backbone_of(run).table)
-    assert remove_nonfinite(run.backbone, [run.scene.train[0].camera], 1) == 0
+    with pytest.raises(LostModel, match=f"step 1: none of {count} primitives .* learning rates"):
+        remove_nonfinite(run.backbone, [run.scene.train[0].camera], 1)
     assert len(backbone_of(run).table) == count
 
 

@@ -39,14 +39,14 @@ def write_transforms(folder: Path, name: str, photos: int, absent: int = 0) -> N
 
 def test_colmap_scene(tmp_path: Path) -> None:
     folder = tmp_path / "my scene"
-    write_scene(synthesize("SIMPLE_RADIAL", [80.0, 32.0, 24.0, 0.05], frames=9), folder)
+    write_scene(synthesize("SIMPLE_RADIAL", [80.0, 32.0, 24.0, 0.05], frames=11), folder)
     (folder / "images" / "camera000001_frame000004.png").unlink()
     lines = describe(folder, plugins())
     assert labelled(lines, "format") == ["colmap: COLMAP model with photos"]
     assert labelled(lines, "also") == ["readable as scene=photos"]
-    assert labelled(lines, "camera") == ["SIMPLE_RADIAL 64x48, 9 images"]
-    assert labelled(lines, "images") == ["8 of 9 in images, absent: camera000001_frame000004.png"]
-    assert labelled(lines, "split") == ["7 to train on, 1 to test on"]
+    assert labelled(lines, "camera") == ["SIMPLE_RADIAL 64x48, 11 images"]
+    assert labelled(lines, "images") == ["10 of 11 in images, absent: camera000001_frame000004.png"]
+    assert labelled(lines, "split") == ["8 to train on, 2 to test on"]
     assert labelled(lines, "points") == ["50"]
     assert labelled(lines, "extent")
     assert any("undistorted" in note for note in labelled(lines, "note"))
@@ -95,8 +95,9 @@ def test_blender_scene_with_absent_photos(tmp_path: Path) -> None:
         "3 of 4 of transforms_test.json, absent: ./3",
         "3 of 3 of transforms_train.json",
     ]
-    assert labelled(lines, "views") == ["6 of 16x12"]
-    assert labelled(lines, "train") == [f"gsx scene=blender scene.path={tmp_path}"]
+    (problem,) = labelled(lines, "problem")
+    assert problem.endswith("train on what is there with scene.missing=0.25 or more.")
+    assert labelled(lines, "then") == [f"gsx scene=blender scene.path={tmp_path}"]
 
 
 def test_transforms_file_and_its_folder(tmp_path: Path) -> None:
