@@ -13,9 +13,11 @@ from tiny import tiny_run, tiny_settings
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
-from gsx.core.errors import CheckpointError, ConfigError, InputError
+from gsx.core.errors import CheckpointError, ConfigError, InputError, LostModel
 from gsx.core.gaussians.splat_files import read_gaussians
+from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint
+from gsx.core.training.run import Run
 from gsx.experiments.runs.evaluate import remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
@@ -255,3 +257,23 @@ def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(tmp_path: Path) -
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == before
     resume(folder)
     assert [path.name for path in (folder / "checkpoints").glob("*.json")] == ["step_0000006.json"]
+
+
+class Ruining:
+    """Listener: spoils most of the model after a checkpoint."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.step == 8:
+            with torch.no_grad():
+                run.backbone.table["log_scales"][: len(run.backbone.table) // 2] = torch.nan
+
+
+def test_what_is_left_of_a_ruined_model_is_never_a_checkpoint(tmp_path: Path) -> None:
+    settings, loaded = tiny_settings(tmp_path / "run", "iterations=12", "training.checkpoint_every=4"), plugins()
+    run = start(settings, loaded)
+    with loaded.listening([Ruining()]), pytest.raises(LostModel, match=r"step 9: 150 of 300 primitives"):
+        execute(run, settings, loaded)
+    assert json.loads((run.folder / "status.json").read_text())["state"] == "failed"
+    again, _ = open_run(run.folder, loaded)
+    assert (again.step, len(again.backbone.table)) == (8, 300)
