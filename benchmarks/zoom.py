@@ -16,7 +16,7 @@ import re
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
@@ -250,7 +250,7 @@ def pictures(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 
 def compared(
-    named: dict[str, tuple[str, ...]], scenes: Sequence[str], given: argparse.Namespace
+    named: Mapping[str, tuple[str, ...]], scenes: Sequence[str], given: argparse.Namespace
 ) -> tuple[list[list[str]], list[dict[str, Any]], str]:
     """(columns, rows, a note) of compositions by name, each against the first with the same seed."""
     base = next(iter(named))
