@@ -344,3 +344,9 @@ def test_figures_by_scale_are_in_the_evaluation(folder: Path, tmp_path: Path) ->
     assert "<td>x1/2</td>" in (tmp_path / "run" / "report.html").read_text()
     again, judging = open_run(tmp_path / "run", plugins(), ["scene.cache_gb=0"])  # nothing is shared
     assert Evaluator(again, judging.evaluation).evaluate()["zoom"]["0.5"] == evaluation["zoom"]["0.5"]
+
+
+def test_a_camera_that_is_nowhere_near_is_refused(folder: Path) -> None:
+    write(folder, "train", [FRONT, [[0, 0, 1, 1e300], *SIDE[1:]]])
+    with pytest.raises(InputError, match=r"r_1\.png' is more than 1e\+09 units away"):
+        load(options(folder))

@@ -99,8 +99,7 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
             f"{model.folder} has {len(model.images)} registered images, {len(present)} of them in {photos}, but "
             f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
         )
-    there = {image.name for image in present}
-    refuse_partial(sorted({image.name for image in model.images} - there), len(model.images), model.folder, missing)
+    refuse_partial(_missing(model, present), len(model.images), model.folder, missing)
     return present
 
 
@@ -167,8 +166,13 @@ def _in_view(camera: Camera, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
     return inside.all(dim=1) & (depth > 0)
 
 
+def _missing(model: Model, present: Sequence[ModelImage]) -> list[str]:
+    """Names of the images that are not among those present."""
+    return sorted({image.name for image in model.images} - {image.name for image in present})
+
+
 def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
-    missing = sorted({image.name for image in model.images} - {image.name for image in present})
+    missing = _missing(model, present)
     return [f"Skipped {len(missing)} images whose photos are missing: {named(missing)}."] if missing else []
 
 

@@ -1,5 +1,6 @@
 """What the loaders of photographs with poses share: reading, axes, lenses, views, provenance."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -42,6 +43,12 @@ class Shot:
     """(width, height) that the poses file states for the photo."""
     remap: StoredUndistortion | None = None
 
+    def __post_init__(self) -> None:
+        if self.whole.translation.abs().max() > FARTHEST:
+            raise InputError(
+                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away: correct or remove its pose."
+            )
+
 
 def shot_through(
     intrinsics: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
@@ -51,8 +58,6 @@ def shot_through(
     Raises:
         InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
     """
-    if translation.abs().max() > FARTHEST:
-        raise InputError(f"The camera of '{photo}' is more than {FARTHEST:g} units away: correct or remove its pose.")
     pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
     size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))
     return Shot(
@@ -102,10 +107,10 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise InputError(f"'{path}' lists no frames, export it anew.")
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
-    names = [plain_name(frame["file_path"]) for frame in frames]
-    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
-    if twice is not None:
-        raise InputError(f"'{path}' has '{twice}' twice, perhaps to train on and to test on: remove one.")
+    counts = Counter(plain_name(frame["file_path"]) for frame in frames)
+    for name, count in counts.items():
+        if count > 1:
+            raise InputError(f"'{path}' has '{name}' twice, perhaps to train on and to test on: remove one.")
     return content, frames
 
 

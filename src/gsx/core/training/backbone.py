@@ -16,6 +16,8 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.schedule import Schedule
 
+MOST_LOST, FEW = 0.01, 10
+"""Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
 Observation: TypeAlias = dict[str, Tensor]
 """What density control learns from one render, as tensors by name, none of them 0-dimensional; empty: nothing."""
 
@@ -169,21 +171,23 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
     gradients included.
 
     Raises:
-        LostModel: nothing would be left.
+        LostModel: so much would be lost that what is left is another model. Nothing is removed.
     """
     rows = [parameter.detach().reshape(len(parameter), -1) for parameter in backbone.table.parameters.values()]
     kept = torch.stack([torch.isfinite(values).all(1) for values in rows]).all(0)
     for camera in cameras:
         kept &= drawable_rows(backbone, camera, step)
-    if bool(kept.all()):
-        return 0
-    if not bool(kept.any()):
+    lost, count = int((~kept).sum()), len(kept)
+    if lost and (lost == count or lost > max(FEW, MOST_LOST * count)):
+        share = f"none of {count:,} primitives has values that are finite and can be drawn"
+        if lost < count:
+            share = f"{lost:,} of {count:,} primitives have values that are not finite or cannot be drawn"
         raise LostModel(
-            f"step {step}: none of {len(kept):,} primitives has values that are finite and can be drawn: lower the "
-            "learning rates (backbone.rates), and see in what units the scene is"
+            f"step {step}: {share}: lower the learning rates (backbone.rates), and see in what units the scene is"
         )
-    keep_rows(backbone.table, kept)
-    return int((~kept).sum())
+    if lost:
+        keep_rows(backbone.table, kept)
+    return lost
 
 
 def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Tensor, "N"]:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.errors import LostModel
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
@@ -24,9 +23,6 @@ from gsx.core.training.run import Run, Step
 from gsx.core.training.supersampling import finer_raster, times_as_fine
 
 logger = logging.getLogger(__name__)
-
-MOST_LOST, FEW = 0.01, 10
-"""Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
 
 
 def train(run: Run, plugins: Plugins) -> None:
@@ -66,19 +62,9 @@ def veto(run: Run, step: Step, plugins: Plugins) -> str:
 
 
 def remove_lost(run: Run, step: Step) -> str:
-    """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any.
-
-    Raises:
-        LostModel: there were so many that what is left is another model.
-    """
+    """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
     cameras = [run.scene.train[number].camera for number in run.sampler.taken]
-    count = len(run.backbone.table)
     removed = remove_nonfinite(run.backbone, cameras, step.number)
-    if removed > max(FEW, MOST_LOST * count):
-        raise LostModel(
-            f"step {step.number}: {removed:,} of {count:,} primitives have values that are not finite or cannot be "
-            "drawn: lower the learning rates (backbone.rates), and see in what units the scene is"
-        )
     if removed:
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from gsx.core.files import read_json
 from gsx.experiments.run_folder.renamed import renamed
 
 DETAIL_OF = ("render", "enlarged", "photograph")
@@ -181,10 +182,10 @@ def read_mapping(
 ) -> dict[str, Any]:
     """A JSON object; empty where the file is missing, damaged, or not `sound`."""
     try:
-        content = json.loads((folder / name).read_text(encoding="utf-8"))
+        content = read_json(folder / name)
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         problems[name] = f"{name} cannot be read ({first_line(error)})"
         return {}
     if not isinstance(content, dict):
