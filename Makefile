@@ -14,7 +14,7 @@ ANSWERS := $(BIN)/python -c 'from urllib.request import urlopen; urlopen("$(CPU_
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow lint wheel clean
+.PHONY: demo test test-slow test-faults test-times lint wheel clean
 
 demo: $(READY)
 	$(BIN)/gsx -m backbone=gs3d,gs3d_zoom 'eval.zoom=[1,2,4]'
@@ -25,6 +25,15 @@ test: $(READY_DEV)
 
 test-slow: $(READY_DEV)
 	$(PYTEST) -m slow
+
+# Kills, full disks and signals; docs/reliability.md tells what was counted.
+test-faults: $(READY_DEV)
+	rm -rf build/faults
+	$(PYTEST) -m faults --dist load
+	$(BIN)/python tests/faults/record.py
+
+test-times: $(READY_DEV)
+	$(PYTEST) --file-times
 
 lint: $(READY_DEV)
 	$(BIN)/ruff check .

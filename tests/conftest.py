@@ -1,6 +1,7 @@
 """Shape annotations are checked on every call in the tests (jaxtyping and beartype); single-threaded torch."""
 
 import os
+from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -8,6 +9,24 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """make test-times."""
+    parser.addoption("--file-times", action="store_true", help="say how long the tests of each file took")
+
+
+def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
+    """Seconds by file, the longest first."""
+    if not config.getoption("--file-times"):
+        return
+    seconds: Counter[str] = Counter()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        seconds[getattr(report, "nodeid", "").split("::")[0]] += getattr(report, "duration", 0.0)
+    terminalreporter.section("seconds by file")
+    for file, spent in seconds.most_common():
+        terminalreporter.write_line(f"{spent:8.1f}  {file}")
+
 
 COMPILED = {f"gsx.core.rasterizer.{name}" for name in ("kernels", "geometry", "pixel_windows")}
 """torch.compile must see these functions themselves, not the checks around them."""
@@ -23,15 +42,24 @@ def checked_modules() -> list[str]:
 
 
 try:
-    from jaxtyping import install_import_hook
+    import jaxtyping
+    import shape_checks
 except ImportError:  # tests of an installed wheel may run without the development extras
-    pass
+    shape_checks = None
 else:
-    install_import_hook(checked_modules(), "shape_checks.check")
+    jaxtyping.jaxtyped = shape_checks.sometimes
+    jaxtyping.install_import_hook(checked_modules(), "shape_checks.check")
 
 
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")  # the same cases on every run
+
+
+@pytest.fixture(autouse=True)
+def shapes_of_every_test():
+    """Each test has its functions' first calls checked."""
+    if shape_checks:
+        shape_checks.calls.clear()
 
 
 @pytest.fixture(autouse=True)

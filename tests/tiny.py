@@ -1,9 +1,12 @@
 """The smallest experiment that exercises everything: the built-in scene as thumbnails, a dozen steps."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from gsx.builtin import plugins
+from gsx.core.data.scene import Scene
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
 from gsx.experiments.runs.compose import compose
@@ -29,9 +32,24 @@ def words(folder: Path, *more: str) -> list[str]:
     return [*OVERRIDES, f"folder={folder}", *more]
 
 
+loaded: dict[str, Scene] = {}
+"""Built-in scenes by their options: their points take longer to find than some runs to train."""
+
+
 def tiny_settings(folder: Path, *more: str) -> Settings:
-    """The composed tiny experiment."""
-    return compose(words(folder, *more), plugins())
+    """The composed tiny experiment; the built-in scene is made once by each process."""
+    settings = compose(words(folder, *more), plugins())
+    chosen = settings.scene
+    if chosen.component.name != "demo":
+        return settings
+
+    def load(options: Any) -> Scene:
+        key = repr(options)
+        if key not in loaded:
+            loaded[key] = chosen.component.factory(options)
+        return loaded[key]
+
+    return replace(settings, scene=replace(chosen, component=replace(chosen.component, factory=load)))
 
 
 def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = None) -> Run:

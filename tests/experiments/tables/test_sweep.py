@@ -92,8 +92,8 @@ def test_a_table_shares_beginnings_survives_a_failure_and_redoes_nothing(
 
 
 def test_killed_and_started_again_a_table_goes_on_where_it_was(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "gsx", *TABLE, "experiment.only=[3D-GS,3D-GS-UP]", "training.checkpoint_every=5",
-               "iterations=120"]  # fmt: skip
+    command = [sys.executable, "-m", "gsx", *TABLE, "experiment.only=[3D-GS,3D-GS-UP]", "training.checkpoint_every=3",
+               "iterations=60"]  # fmt: skip
     begun = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     second = "outputs/demo/gs3d/*/branch.json"  # of the run that branched: the first one is finished
     until = time.monotonic() + 120

@@ -1,5 +1,6 @@
 """What the HTML pages share: templates of this package, and numbers as words."""
 
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -40,6 +41,7 @@ def time_unit(seconds: float) -> tuple[str, int]:
     return ("hours", 3600) if seconds > 7200 else ("minutes", 60) if seconds > 180 else ("seconds", 1)
 
 
+@cache
 def template(name: str) -> jinja2.Template:
     """A template below `experiments`: what is not marked as safe is escaped, missing figures show as n/a."""
     source = files("gsx.experiments")

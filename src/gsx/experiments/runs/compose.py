@@ -88,9 +88,7 @@ class Compositions:
 
     def choices(self, group: str) -> list[str]:
         """Options of a group."""
-        from hydra.core.global_hydra import GlobalHydra
-
-        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+        return listed(group)
 
     def launch(
         self,
@@ -158,16 +156,13 @@ def parse_overrides(overrides: Sequence[str]) -> list[Any]:
 
 def check_groups(overrides: Sequence[str]) -> None:
     """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    loader = GlobalHydra.instance().config_loader()
     groups = known_groups()
     for override in parse_overrides(overrides):
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
         if override.key_or_group not in groups or override.is_sweep_override():
             continue
-        options = loader.get_group_options(override.key_or_group)
+        options = listed(override.key_or_group)
         if not options:
             inner = ", ".join(group for group in groups if group.startswith(f"{override.key_or_group}/"))
             raise ConfigError(f"{override.key_or_group} is chosen by role: {inner}")
@@ -194,11 +189,18 @@ def refuse_absent_launcher(name: str) -> None:
 
 def known_groups() -> list[str]:
     """Configuration groups, nested ones included: `regenerator/upscale`."""
-    from hydra.core.global_hydra import GlobalHydra
+    outer = [group for group in listed("", groups=True) if not group.startswith("hydra")]
+    return outer + [f"{group}/{inner}" for group in outer for inner in listed(group, groups=True)]
 
-    loader = GlobalHydra.instance().config_loader()
-    outer = [group for group in loader.list_groups("") if not group.startswith("hydra")]
-    return outer + [f"{group}/{inner}" for group in outer for inner in loader.list_groups(group)]
+
+def listed(group: str, groups: bool = False) -> list[str]:
+    """Options of a group, or the groups in it. Hydra's own list composes its configuration for each answer."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.object_type import ObjectType
+
+    kind = ObjectType.GROUP if groups else ObjectType.CONFIG
+    sources = GlobalHydra.instance().config_loader().get_sources()
+    return sorted({name for source in sources if source.is_group(group) for name in source.list(group, kind)})
 
 
 def explain(error: Exception, overrides: Sequence[str]) -> str:
