@@ -58,6 +58,7 @@ class Redrawer:
         """The pseudo views of some plans; pictures of the training views `shown` are kept to be looked at."""
         options, views = self.options, []
         requests = [self.request(run, event, spec) for spec in specs]
+        run.refuse_if_stopping()
         redrawn = self.regenerator.redraw(requests, samples=options.samples, project=options.project == "exact")
         for spec, request, one in zip(specs, requests, redrawn, strict=True):
             if one.image is not None:
@@ -69,6 +70,7 @@ class Redrawer:
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
+        run.refuse_if_stopping()
         view = run.scene.train[spec.parent]
         image = render(run, spec.seen).image if spec.outer is None else spec.outer.cut(view.image())
         return Request(
@@ -124,6 +126,7 @@ class Redrawer:
 
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
         """The training camera at a fraction of its size, without what fills no block at the right and below."""
+        run.refuse_if_stopping()
         view = run.scene.train[parent]
         width, height = view.camera.size
         whole = Window(left=0, top=0, width=width, height=height)

@@ -7,6 +7,9 @@ from typing import Any, NoReturn
 
 from gsx.core.errors import ConfigError, InputError
 
+RESUME_FLAGS = ("--trust", "--changed")
+"""Of gsx resume."""
+
 
 def run_arguments(verb: str, arguments: list[str], description: str, flags: str = "") -> tuple[Path, list[str]]:
     """The run folder and the overrides after it; `flags`: others that the verb has, for its help."""

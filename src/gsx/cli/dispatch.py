@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from gsx import __version__
+from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging
 from gsx.cli.runs import verb_eval, verb_export, verb_render
@@ -61,7 +62,7 @@ def dispatch_together(arguments: list[str]) -> int:
         ConfigError: anything else is asked for.
     """
     flags = {word for word in arguments if word.startswith("-")}
-    if flags - ({"--trust"} if arguments[:1] == ["resume"] else set()) or (
+    if flags - (set(RESUME_FLAGS) if arguments[:1] == ["resume"] else set()) or (
         arguments[:1] and arguments[0] in VERBS and arguments[0] != "resume"
     ):
         asked = " ".join(arguments[:2])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import run_arguments
+from gsx.cli.arguments import RESUME_FLAGS, run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.core.processes import speaks
@@ -133,10 +133,16 @@ def sweep_job(config: Any) -> int:
 
 
 def verb_resume(arguments: list[str]) -> int:
-    """gsx resume RUN [KEY=VALUE ...] [--trust]"""
-    told = "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names."
-    folder, overrides = run_arguments("resume", [word for word in arguments if word != "--trust"], told, " [--trust]")
+    """gsx resume RUN [KEY=VALUE ...] [--trust] [--changed]"""
+    told = (
+        "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names. "
+        "--changed: also where cameras or config.yaml are no longer what it began with."
+    )
+    words = [word for word in arguments if word not in RESUME_FLAGS]
+    folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
     from gsx.experiments.run_folder.claims import claimed
+    from gsx.experiments.run_folder.files import read_run, state_of
+    from gsx.experiments.runs.history import go_on
     from gsx.experiments.runs.open import open_run, refuse_other
     from gsx.experiments.runs.settings import write_config
 
@@ -144,10 +150,11 @@ def verb_resume(arguments: list[str]) -> int:
     refuse_other(folder)
     with claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
-        if run.complete and (folder / "evaluation.json").is_file():
+        if run.complete and (folder / "report.html").is_file() and state_of(read_run(folder))[0] == "ok":
             remedy = "give iterations=N with N above that to lengthen it"
             raise InputError(f"{folder} is complete at step {run.step}: {remedy}")
         if run.ranks.first:
+            go_on(run, loaded, changed="--changed" in arguments)
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
         return carry_out(run, settings, loaded)

@@ -28,6 +28,10 @@ class TrainingError(GsxError):
     """Training cannot go on, for example after three non-finite steps in a row."""
 
 
+class Stopped(GsxError):
+    """A step was given up because its run was asked to stop; the run stands where the step began."""
+
+
 class LostModel(TrainingError):
     """What is left of a model is another one, which may not become a checkpoint."""
 

@@ -5,9 +5,12 @@ import io
 import json
 import math
 import os
+import platform
+import re
 import secrets
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +19,9 @@ from typing import Any
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path`, same suffix; it becomes `path` when the block ends, or vanishes on an error.
 
-    Its name is drawn: processes of several machines and containers share numbers.
+    Its name says who writes it, and is drawn besides: containers share names of machines and numbers of processes.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{own_mark()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
@@ -27,11 +30,56 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write a file at once, and onto the disk before it takes the place of an older one."""
+    """Write a file at once, and onto the disk before it takes the place of an older one; then its name, too."""
     with replacing(path) as temporary, temporary.open("wb") as stream:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
+    keep_names(path.parent)
+
+
+def keep_names(folder: Path) -> None:
+    """Have the disk keep what a folder's files are called now, where a system lets folders be written through."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    with suppress(OSError):  # file systems that know no such thing
+        number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+ABANDONED = 600.0
+"""Seconds after which nobody is still writing a temporary file."""
+
+
+def own_mark() -> str:
+    """This machine and process, in letters of file names."""
+    return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node())}-{os.getpid()}"
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what killed processes left half-written in a folder and below."""
+    for path in folder.rglob(".*.partial*"):
+        with suppress(OSError):
+            if gone(path.name) or time.time() - path.stat().st_mtime > ABANDONED:
+                path.unlink()
+
+
+def gone(name: str) -> bool:
+    """Whether a temporary file is of a process of this machine that is no more."""
+    host, _, process = own_mark().rpartition("-")
+    found = re.search(rf"\.{host}-(\d+)-[0-9a-f]{{8}}\.partial", name)
+    if found is None or found[1] == process or os.name != "posix":
+        return False
+    try:
+        os.kill(int(found[1]), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")

@@ -132,7 +132,7 @@ class SceneRestorer:
             others = [pair for number, pair in enumerate(pairs) if number % FOLDS != fold]
             renders, before = mean_square(others), mean_error(network, others)
             former = {name: value.clone() for name, value in network.state_dict().items()}
-            learn(network, own, self.options, steps, derived_seed("crops", context.seed, context.step, fold))
+            learn(network, own, self.options, steps, fold, context)
             after = mean_error(network, others)
             if after > before:
                 network.load_state_dict(former)
@@ -203,13 +203,21 @@ def event_of(path: Path) -> int:
     return int(path.stem.rpartition("_")[2])
 
 
-def learn(network: Residual, pairs: Sequence[Pair], options: RestorerOptions, steps: int, seed: int) -> None:
+def learn(
+    network: Residual,
+    pairs: Sequence[Pair],
+    options: RestorerOptions,
+    steps: int,
+    fold: int,
+    context: RegeneratorContext,
+) -> None:
     """Adam on crops, L1 and a tenth of the L1 of differences of neighbours."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(derived_seed("crops", context.seed, context.step, fold))
     device = next(network.parameters()).device
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=options.rate / 100)
     for _ in range(steps):
+        context.refuse_if_stopping()
         render, photo = (part.to(device) for part in batch(pairs, options, generator))
         out = render + network(render)
         loss = (out - photo).abs().mean() + 0.1 * sum(

@@ -114,7 +114,7 @@ class SceneSR:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
-        loss, whole = train(self.network, photos, context.reduction, self.options, context.seed)
+        loss, whole = train(self.network, photos, context, self.options)
         seconds = time.perf_counter() - begun
         logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
         if whole:
@@ -144,18 +144,18 @@ def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
 def train(
     network: Enlarger,
     photos: Sequence[Float[Tensor, "3 H W"]],
-    reduction: Reduction,
+    context: RegeneratorContext,
     options: SceneSROptions,
-    seed: int,
 ) -> tuple[float, bool]:
     """(mean loss of the last tenth, whether all steps were taken)."""
-    generator = torch.Generator().manual_seed(seed)
+    generator, reduction = torch.Generator().manual_seed(context.seed), context.reduction
     device = next(network.parameters()).device
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
     losses: list[float] = []
     begun = time.perf_counter()
     for _ in range(options.steps):
+        context.refuse_if_stopping()
         if options.seconds and time.perf_counter() - begun > options.seconds:
             logger.warning(
                 "scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps

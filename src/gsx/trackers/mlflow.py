@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
@@ -54,6 +55,11 @@ class MLflowOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.seconds < math.inf:
             raise ValueError(f"tracker.mlflow.seconds is {self.seconds}; give a number from 0")
+        if "@" in urlsplit(self.uri).netloc:  # config.yaml, the report and logs would tell it
+            raise ValueError(
+                "tracker.mlflow.uri holds a name or a password; leave them out and set MLFLOW_TRACKING_USERNAME and "
+                "MLFLOW_TRACKING_PASSWORD"
+            )
 
 
 class MLflow:

@@ -38,6 +38,7 @@ def make_run(folder: Path, config: dict[str, Any] | None = None, **figures: Any)
     (folder / "status.json").write_text('{"state": "ok", "step": 100}')
     write_lines(folder, [(10.0, None), (20.0, 25.0), (50.0, 30.0)])
     make_pictures(folder / "renders")
+    (folder / "point_cloud.ply").write_bytes(b"ply")
     return folder
 
 

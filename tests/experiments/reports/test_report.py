@@ -106,6 +106,7 @@ def make_run(folder: Path, config: str = CONFIG, result: dict[str, Any] | None =
     (folder / "evaluation.json").write_text(json.dumps(result or evaluation()))
     (folder / "status.json").write_text(json.dumps({"state": "ok", "reason": "", "step": 1000}))
     make_pictures(folder / "renders")
+    (folder / "point_cloud.ply").write_bytes(b"ply")
     return folder
 
 

@@ -75,6 +75,9 @@ def test_figures_by_another_filter_are_not_those_of_the_composition(tmp_path: Pa
     write_config(tmp_path / "config.yaml", made.resolved)
     (tmp_path / "status.json").write_text('{"state": "ok", "step": 1}')
     (tmp_path / "environment.json").write_text('{"scene": {"stamp": ""}}')
+    (tmp_path / "renders").mkdir()
+    for name in ("metrics.jsonl", "renders/index.json", "point_cloud.ply"):
+        (tmp_path / name).write_text("{}")
     own = evaluation_settings(made.resolved)
     cases = [
         ({"settings": own}, True),

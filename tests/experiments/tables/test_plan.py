@@ -49,7 +49,9 @@ def words_of(plan: Any) -> list[list[tuple[str, str]]]:
 
 def finish(cell: Cell) -> None:
     """A run folder as a finished run leaves it."""
-    cell.folder.mkdir(parents=True)
+    (cell.folder / "renders").mkdir(parents=True)
+    for name in ("environment.json", "metrics.jsonl", "renders/index.json", "point_cloud.ply"):
+        (cell.folder / name).write_text("{}" if name.endswith(".json") else "")
     write_config(cell.folder / "config.yaml", cell.config)
     steps = cell.config["iterations"]
     (cell.folder / "evaluation.json").write_text(

@@ -32,7 +32,9 @@ def cell(row: str, scene: str, seed: int, folder: Path) -> Cell:
 
 def write_run(place: Path, psnr: float | None) -> None:
     """A finished run, or one that failed."""
-    place.mkdir(parents=True)
+    (place / "renders").mkdir(parents=True)
+    for name in ("environment.json", "metrics.jsonl", "renders/index.json", "point_cloud.ply"):
+        (place / name).write_text("{}" if name.endswith(".json") else "")
     (place / "config.yaml").write_text("iterations: 10\nscene: {name: colmap}\n")
     if psnr is None:
         (place / "status.json").write_text(json.dumps({"state": "failed", "reason": "out of memory", "step": 4}))

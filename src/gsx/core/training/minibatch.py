@@ -25,7 +25,7 @@ def next_views(run: Run) -> Iterator[list[int]]:
     colours, batch = run.generator.get_state(), run.sampler.take()
     try:
         yield batch
-    except Exception:
+    except BaseException:
         run.generator.set_state(colours)
         run.sampler.put_back()
         raise

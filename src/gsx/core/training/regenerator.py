@@ -64,6 +64,8 @@ class RegeneratorContext:
     device: torch.device
     folder: Path
     """Where what was learnt can be kept; a resumed run finds it there."""
+    refuse_if_stopping: Callable[[], None] = lambda: None
+    """To be called now and then by what takes long: leaves it by an exception when the run was asked to stop."""
 
 
 @runtime_checkable

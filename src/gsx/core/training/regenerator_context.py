@@ -18,4 +18,5 @@ def regenerator_context(run: Run, seed: int) -> RegeneratorContext:
         seed=seed,
         device=run.device,
         folder=run.folder / "regenerators",
+        refuse_if_stopping=run.refuse_if_stopping,
     )

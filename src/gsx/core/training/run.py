@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.scene import Scene, View
+from gsx.core.errors import Stopped
 from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, Rendering
@@ -149,7 +150,9 @@ class Run:
     seconds: float = 0.0
     """Time spent in training steps, without evaluation and files."""
     stopping: bool = False
-    """Set to end after the current step."""
+    """Set to end after the current step, or within it where that takes long (`refuse_if_stopping`)."""
+    changing: bool = False
+    """A step is being applied: parameters and statistics are neither those before it nor those after it."""
     curves: list[dict[str, float]] = field(default_factory=list)
     """Lines of metrics.jsonl so far."""
 
@@ -157,6 +160,15 @@ class Run:
     def complete(self) -> bool:
         """All iterations are done."""
         return self.step >= self.iterations
+
+    def refuse_if_stopping(self) -> None:
+        """To be called within long parts of a step that change nothing yet.
+
+        Raises:
+            Stopped: the run was asked to stop; not where other processes would wait for this one.
+        """
+        if self.stopping and self.ranks.size == 1:
+            raise Stopped(f"step {self.step + 1} was given up: the run was asked to stop")
 
     @property
     def model_step(self) -> int:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
+from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
@@ -30,7 +31,10 @@ def train(run: Run, plugins: Plugins) -> None:
     plugins.emit.gsx_run_started(run=run)
     while not (run.complete or any(run.ranks.all_gather(run.stopping))):
         begun = time.perf_counter()
-        step = train_step(run, plugins)
+        try:
+            step = train_step(run, plugins)
+        except Stopped:
+            break
         run.seconds += time.perf_counter() - begun
         plugins.emit.gsx_step_finished(run=run, step=step)
     plugins.emit.gsx_training_finished(run=run)
@@ -40,6 +44,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
     step = backward(run)
     reason = veto(run, step, plugins)
+    run.changing = True
     if reason:
         zero_grad(run.backbone.table)
     else:
@@ -47,7 +52,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
             run.backbone.accumulate(seen)
         step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.update(step.number)
-    run.step = step.number
+    run.step, run.changing = step.number, False
     if run.device.type == "cuda":
         torch.cuda.synchronize(run.device)  # so that times mean something
     return step if not reason else replace(step, skipped=reason)

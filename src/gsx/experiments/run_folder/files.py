@@ -12,6 +12,9 @@ from gsx.experiments.run_folder.renamed import renamed
 
 DETAIL_OF = ("render", "enlarged", "photograph")
 """Pictures of a zoom whose explained detail is told, the model's own first."""
+SPLATS = "point_cloud.ply"
+RESULTS = ("metrics.jsonl", "evaluation.json", "renders/index.json", SPLATS)
+"""Files of every run that was carried to its end, beside those it began with."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -53,9 +56,8 @@ class RunFiles:
 
     @property
     def missing(self) -> list[str]:
-        """Files that a complete run has and this one lacks."""
-        names = ("environment.json", "metrics.jsonl", "evaluation.json", "renders/index.json")
-        return [name for name in names if not (self.folder / name).is_file()]
+        """Files that a complete run has and this one lacks; but for its report, which is made of them."""
+        return [name for name in ("environment.json", *RESULTS) if not (self.folder / name).is_file()]
 
     @property
     def scene(self) -> str:
@@ -104,7 +106,7 @@ def read_run(folder: Path) -> RunFiles:
         folder=folder,
         config=config,
         config_text=text,
-        environment=read("environment.json"),
+        environment=read("environment.json", sound_environment),
         lines=read_lines(folder / "metrics.jsonl", problems),
         evaluation=evaluation,
         pictures=read("renders/index.json", sound_pictures),
@@ -130,6 +132,13 @@ def sound_incidents(content: dict[str, Any]) -> bool:
     by_scale = [node for facts in pseudo.values() for node in (facts.get("dropped"), *part(facts, "warned").values())]
     numbers = all(isinstance(node, dict) and all(map(is_number, node.values())) for node in by_scale)
     return numbers and (not cap or is_number(cap.get("step")))
+
+
+def sound_environment(content: dict[str, Any]) -> bool:
+    """Whether the history of an environment.json has the form that gsx gives it."""
+    history = content.get("history", [])
+    changes = [change for entry in history for change in part(entry, "changed").values()] if rows(history) else [None]
+    return all(isinstance(change, list) and len(change) == 2 for change in changes)
 
 
 def sound_pictures(content: dict[str, Any]) -> bool:
@@ -242,10 +251,13 @@ def state_of(files: RunFiles) -> tuple[str, str]:
     if recorded == "failed":
         return "failed", str(files.status.get("reason") or "no reason recorded")
     evaluated = int(files.evaluation.get("step") or 0)
-    if files.evaluation and evaluated >= max(files.step, files.iterations):
+    done = files.evaluation and evaluated >= max(files.step, files.iterations)
+    if done and not files.missing:
         return "ok", ""
     progress = f"{files.step:,} of {files.iterations:,} steps, "
     progress += f"evaluated at step {evaluated:,}" if files.evaluation else "not evaluated"
+    if done:
+        progress += f", without {', '.join(files.missing)}"
     return ("running", f"under way or killed: {progress}") if recorded == "running" else ("interrupted", progress)
 
 

@@ -1,9 +1,11 @@
 """What a run is trained on and with: environment.json, and the first lines of the log."""
 
+import hashlib
 import logging
 import os
 import platform
 import sys
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -11,17 +13,20 @@ from typing import Any
 import torch
 
 from gsx import __version__
-from gsx.core.cache import source_revision
+from gsx.core.cache import content_key, source_revision
+from gsx.core.data.scene import View
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.run import Run
-from gsx.experiments.run_folder.run_key import scene_stamp
+from gsx.experiments.run_folder.run_key import scene_stamp, sorted_items, trained
 from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
+POSE_DIGITS = 6
+"""Digits of camera values that count, of the largest of its kind: what other machines compute differs behind them."""
 
 
 def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
@@ -39,10 +44,12 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
+        "options": options_digest(run.config, run.idle),
         "plan": plan_of(run),
         "training_focal": max(view.camera.focal for view in run.scene.train),
         "scene": {
             "stamp": scene_stamp(run.config),
+            "cameras": camera_digest([*run.scene.train, *run.scene.test]),
             "train_views": len(run.scene.train),
             "test_views": len(run.scene.test),
             "points": len(run.scene.points),
@@ -50,6 +57,24 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
             "notes": list(run.scene.notes),
         },
     }
+
+
+def options_digest(config: dict[str, Any], idle: frozenset[str]) -> str:
+    """Of all options that decide what is trained."""
+    return content_key(sorted_items(trained(config, idle)))
+
+
+def camera_digest(views: Sequence[View]) -> str:
+    """Of names, sizes, intrinsics and poses of views, in order."""
+    content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
+    cameras = [view.camera for view in views]
+    numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
+    numbers += [torch.stack([c.rotation.double().flatten() for c in cameras])]
+    numbers += [torch.stack([c.translation.double() for c in cameras])]
+    for values in numbers:
+        largest = values.abs().max().clamp_min(1e-300)
+        content.update((values / largest * 10**POSE_DIGITS).round().add(0.0).numpy().tobytes())  # -0 becomes 0
+    return content.hexdigest()[:16]
 
 
 def installed_version(package: str) -> str:

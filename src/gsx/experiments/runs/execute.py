@@ -1,9 +1,11 @@
 """Train from the current step on, evaluate, export, report."""
 
+import logging
 from typing import Any
 
-from gsx.core.errors import LostModel, TrainingError
-from gsx.core.files import write_json
+from gsx.core.cache import cache_root
+from gsx.core.errors import LostModel, TrainingError, first_line
+from gsx.core.files import remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.guard import Agreement, Guard
@@ -11,15 +13,17 @@ from gsx.core.training.run import Run, Step
 from gsx.core.training.trainer import train
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder.files import SPLATS
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
-from gsx.experiments.runs.open import say_what_changed
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.tracking import build_trackers, telling_of_failure
+
+logger = logging.getLogger(__name__)
 
 
 class Checkpointer:
@@ -51,8 +55,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         follow(run, plugins)
         return
     trackers = build_trackers(settings.trackers)
-    if not run.complete:
-        say_what_changed(run)
+    remove_partial(cache_root())
     announce(run, plugins)
     warm(run.raster, run.device)
     status(run, "running")
@@ -76,19 +79,29 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
             train(run, plugins)
             if run.complete:
                 finish(run, settings, plugins)
-    except TrainingError as error:
-        if not isinstance(error, LostModel):
-            checkpoint.save(run)
-        status(run, "failed", str(error))
-        raise
     except BaseException as error:
-        status(run, "failed", f"{type(error).__name__}: {error}")
+        keep_what_there_is(run, error)
         raise
     finally:
         log.close()
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)
+
+
+def keep_what_there_is(run: Run, error: BaseException) -> None:
+    """After an error: a checkpoint of the last step, where the model is that of a step, and a word on what happened.
+
+    What cannot be written now is told in the log; the error itself is what matters.
+    """
+    whole = not (run.changing or run.complete or isinstance(error, LostModel))
+    reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
+    try:
+        if whole and run.step > 0:
+            checkpoint.save(run)
+        status(run, "failed", reason)
+    except Exception as problem:  # no space, no memory: it must not hide the error
+        logger.warning("after this error step %d could not be kept (%s)", run.step, first_line(problem))
 
 
 def follow(run: Run, plugins: Plugins) -> None:
@@ -102,8 +115,8 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
     """Evaluate, export, draw and report a trained run."""
     evaluation = evaluate(run, settings)
     plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
-    write_report(run.folder)
-    export(run, run.folder / "point_cloud.ply")
+    export(run, run.folder / SPLATS)
     status(run, "ok")
+    write_report(run.folder)
     plugins.emit.gsx_run_finished(run=run)
     return evaluation

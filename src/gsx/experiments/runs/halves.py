@@ -61,7 +61,7 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
     begun, views = time.perf_counter(), run.scene.train
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
-        model = trained(without(run, anew, half, steps, seed))
+        model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
         numbers = range(half, len(views), HALVES)
         shown |= {n: to_uint8(render(model, views[n].camera).image) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
@@ -89,11 +89,15 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     )
 
 
-def trained(run: Run) -> Run:
-    """The run at its end; nobody but the guard against numbers that are not finite listens."""
+def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
+    """The run at its end; nobody but the guard against numbers that are not finite listens.
+
+    `refuse_if_stopping`: of the run that it is trained for.
+    """
     plugins = load_plugins([], points=[])
     with plugins.listening([Guard()]):
         while not run.complete:
+            refuse_if_stopping()
             train_step(run, plugins)
     return run
 

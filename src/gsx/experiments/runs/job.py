@@ -22,8 +22,8 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report it."""
 
 
-STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2") if hasattr(signal, name))
-"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for the latter)."""
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2", "SIGHUP") if hasattr(signal, name))
+"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for it); its terminal closed."""
 
 
 @contextmanager
@@ -70,8 +70,7 @@ def interruptible(run: "Run") -> Iterator[object]:
         def gsx_training_finished(self) -> None:
             give_back()
 
-    alone = STOPPING if processes() == 1 else ()  # torchrun ends its processes itself, some while they wait for others
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *alone)}
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *heeded())}
     try:
         yield UntilTrained()
     finally:
@@ -80,6 +79,11 @@ def interruptible(run: "Run") -> Iterator[object]:
         logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
         signal.raise_signal(received[0])
         raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
+
+
+def heeded() -> list[signal.Signals]:
+    """Signals of STOPPING that end training; `nohup` has the terminal's end ignored, and it stays so."""
+    return [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]
 
 
 def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
@@ -97,6 +101,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
+    from gsx.experiments.reports.report import write_report
     from gsx.experiments.run_folder.claims import claimed_name
     from gsx.experiments.run_folder.run_key import place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
@@ -109,6 +114,8 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with claimed_name(folder), ExitStack() as claims:
         _, run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
+            if not (folder / "report.html").is_file():  # it was killed while it was written
+                write_report(folder)
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0
         return carry_out(run, settings, loaded)

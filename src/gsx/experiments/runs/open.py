@@ -25,16 +25,17 @@ from gsx.experiments.run_folder.run_key import (
     finished,
     other_revision,
     place_of,
-    scene_stamp,
     trained_on,
 )
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
+from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
 from gsx.experiments.runs.tracking import build_trackers
+from gsx.experiments.runs.verified import verified
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
-    run = build(settings, ranks.rank0_first(lambda: load_scene(settings)), Path(), training=True)
+    run = build(settings, ranks.rank0_first(lambda: verified(load_scene(settings))), Path(), training=True)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run, training=True)
@@ -144,7 +145,8 @@ def open_run(
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
-    run = build(settings, ranks_here().rank0_first(lambda: load_scene(settings)), folder, training)
+    loaded = ranks_here().rank0_first(lambda: verified(load_scene(settings)) if training else load_scene(settings))
+    run = build(settings, loaded, folder, training)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
@@ -182,6 +184,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
         set_aside(folder, str(error))
         return folder, start(at_hand, plugins, claims)
     logger.info("going on with %s at step %d", folder, run.step)
+    go_on(run, plugins, changed=True)
     write_config(folder / "config.yaml", settings.resolved)
     if settings.general.init == "warm_start":
         run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
@@ -205,22 +208,6 @@ def by_another(files: RunFiles) -> str:
     """Words for what another revision of the source has trained; none for what this one has."""
     revision = other_revision(files, this := source_revision())
     return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
-
-
-def say_what_changed(run: Run) -> None:
-    """Warn of a run that goes on with other files or another revision of the source than it began with.
-
-    environment.json then names this revision, too.
-    """
-    files = read_run(run.folder)
-    if trained_on(files) not in ("", scene_stamp(run.config)):
-        logger.warning("files of scene %s are not those that the run began with", run.scene.name)
-    revisions = str(files.environment.get("source", "")).split("+")
-    if files.environment and revisions[-1] != source_revision():
-        logger.warning("the run was begun%s", by_another(files))
-        write_json(
-            run.folder / "environment.json", files.environment | {"source": "+".join([*revisions, source_revision()])}
-        )
 
 
 def set_aside(folder: Path, reason: str) -> None:

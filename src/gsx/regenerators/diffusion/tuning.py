@@ -133,7 +133,7 @@ def new_adapter(
     figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, spec, others)}
     begun = time.perf_counter()
     try:
-        whole = learn(pipe, options, spec, pairs.own, context.seed)
+        whole = learn(pipe, options, spec, pairs.own, context)
     except (RuntimeError, ValueError) as error:
         raise TrainingError(
             f"regenerator {options.name} cannot be tuned ({type(error).__name__}: {error}): lower "
@@ -222,10 +222,12 @@ def cropped(
     return renders, photos
 
 
-def learn(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair], seed: int) -> bool:
+def learn(
+    pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair], context: RegeneratorContext
+) -> bool:
     """Give the model an adapter and train it; whether all steps were taken."""
-    generator, tuning = torch.Generator().manual_seed(seed), options.tuning
-    adapted = add_adapter(pipe, tuning, seed)
+    generator, tuning = torch.Generator().manual_seed(context.seed), options.tuning
+    adapted = add_adapter(pipe, tuning, context.seed)
     optimiser = torch.optim.AdamW(adapted, lr=tuning.rate, weight_decay=WEIGHT_DECAY)
     rates = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: rate_at(step, tuning))
     crops = cropped(pairs, tuning, spec, generator)
@@ -235,6 +237,7 @@ def learn(pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[
     progress = Pace(f"{options.name} is tuned", tuning.steps)
     with as_trained(pipe.unet, tuning.checkpointing):
         for step in range(tuning.steps):
+            context.refuse_if_stopping()
             if tuning.seconds and progress.seconds > tuning.seconds:
                 logger.warning("%s is tuned for %d of %d steps: tuning.seconds", options.name, step, tuning.steps)
                 return False

@@ -1,0 +1,68 @@
+"""Photographs are all decoded once before training: a damaged one is told now, not after an hour."""
+
+import logging
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from gsx.core.cache import cache_folder, content_key, file_stamp
+from gsx.core.data.images import read_image
+from gsx.core.data.scene import FromFile, Scene
+from gsx.core.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+NAMED = 3
+"""Damaged photographs that an error quotes."""
+LONG = 200
+"""Photographs from which on it is said that they are being looked at."""
+
+
+def verified(scene: Scene) -> Scene:
+    """The scene, whose photographs can all be decoded; which ones could be is remembered by name, size and time.
+
+    Raises:
+        InputError: some are damaged or missing.
+    """
+    sources = (view.source for view in (*scene.train, *scene.test))
+    paths = list(dict.fromkeys(source.path for source in sources if isinstance(source, FromFile)))
+    if not paths or (known := remembered(paths)).exists():
+        return scene
+    if len(paths) >= LONG:
+        logger.info("looking at all %d photographs once", len(paths))
+    refuse_damaged(paths)
+    with suppress(OSError):  # without a cache they are looked at again next time
+        known.mkdir(parents=True, exist_ok=True)
+    return scene
+
+
+def remembered(paths: Sequence[Path]) -> Path:
+    """The folder that says that these files, as they are now, could be decoded.
+
+    Raises:
+        InputError: one cannot be looked at.
+    """
+    try:
+        return cache_folder("verified", content_key([(str(path.resolve()), file_stamp(path)) for path in paths]))
+    except OSError as error:
+        raise InputError(f"Image '{error.filename}' cannot be looked at ({error.strerror}): restore it") from error
+
+
+def refuse_damaged(paths: Sequence[Path]) -> None:
+    """Raise InputError naming the files that cannot be decoded; several are at a time."""
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        problems = [problem for problem in pool.map(problem_of, paths) if problem]
+    if problems:
+        more = f" ... and {len(problems) - NAMED} others" if len(problems) > NAMED else ""
+        raise InputError(" ".join(problems[:NAMED]) + more)
+
+
+def problem_of(path: Path) -> str:
+    """Why a file cannot be decoded; empty if it can."""
+    try:
+        read_image(path)
+    except InputError as error:
+        return str(error)
+    return ""

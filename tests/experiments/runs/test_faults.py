@@ -1,0 +1,241 @@
+"""Errors and signals at awkward moments: what there is stays, and the run that goes on ends in the same bits."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from synthetic_colmap import synthesize, write_scene
+from tiny import tiny_run, tiny_settings
+
+from gsx.augmenters.redraw import Redrawer
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
+from gsx.core import files
+from gsx.core.files import remove_partial, replacing
+from gsx.core.plugins import hookimpl
+from gsx.core.training import trainer
+from gsx.core.training.run import Run
+from gsx.experiments.run_folder.files import read_run, state_of
+from gsx.experiments.runs import verified
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.job import train
+from gsx.experiments.runs.open import open_run, start
+
+SHORT = ("iterations=8", "training.checkpoint_every=100", "training.random_background=true",
+         "backbone.density.every=80", "backbone.density.gradient=1e-6")  # fmt: skip
+EVENT = ("iterations=8", "augmenter=[upscale]", "regenerator/upscale=lanczos",
+         *(f"augmenter.upscale.timing.{key}=15000" for key in ("start", "every", "span")))  # fmt: skip
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def assert_ends_as(folder: Path, whole: Path) -> None:
+    """A run that goes on ends with the bits of one that nothing happened to."""
+    run, settings = open_run(folder, plugins(), training=True)
+    execute(run, settings, plugins())
+    expected = tensors(whole)
+    assert all(torch.equal(value, expected[name]) for name, value in tensors(folder).items())
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("faults") / "whole"
+    tiny_run(folder, SHORT)
+    return folder
+
+
+class Failing:
+    """Listener: an error of the file system when a step is told, as where metrics are written to a full disk."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.step == 5:
+            raise OSError(errno.ENOSPC, "No space left on device", "metrics.jsonl")
+
+
+def at_call(number: int, function: Callable[..., Any], error: BaseException) -> Callable[..., Any]:
+    """The function, which raises at its so-manieth call."""
+    calls = []
+
+    def failing(*given: Any, **named: Any) -> Any:
+        calls.append(1)
+        if len(calls) == number:
+            raise error
+        return function(*given, **named)
+
+    return failing
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("none"), KeyboardInterrupt(), OSError(5, "unreadable")])
+def test_an_error_within_a_step_keeps_the_step_before(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    photometric = trainer.photometric
+    monkeypatch.setattr(trainer, "photometric", at_call(6, photometric, error))
+    with pytest.raises(type(error)):
+        tiny_run(tmp_path / "run", SHORT)
+    monkeypatch.setattr(trainer, "photometric", photometric)
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
+    assert [path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.json")] == ["step_0000005"]
+    assert_ends_as(tmp_path / "run", whole)
+
+
+def test_an_error_between_steps_keeps_the_last_one(tmp_path: Path, whole: Path) -> None:
+    settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
+    run = start(settings, loaded)
+    with loaded.listening([Failing()]), pytest.raises(OSError, match="No space left"):
+        execute(run, settings, loaded)
+    assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == ["step_0000005"]
+    assert_ends_as(run.folder, whole)
+
+
+def test_half_a_step_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings, loaded = tiny_settings(tmp_path / "run", *SHORT, "training.checkpoint_every=3"), plugins()
+    run = start(settings, loaded)
+    monkeypatch.setattr(run.backbone, "update", at_call(5, run.backbone.update, RuntimeError("in the middle")))
+    with pytest.raises(RuntimeError, match="in the middle"):
+        execute(run, settings, loaded)
+    assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == ["step_0000003"]
+
+
+def test_a_disk_that_stays_full_does_not_hide_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
+    run = start(settings, loaded)
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "no room", str(path))
+
+    class Full:
+        @hookimpl
+        def gsx_step_finished(self) -> None:
+            monkeypatch.setattr("gsx.core.training.checkpoint.replace_file", full)
+            raise RuntimeError("what happened first")
+
+    with loaded.listening([Full()]), pytest.raises(RuntimeError, match="what happened first"):
+        execute(run, settings, loaded)
+    assert "could not be kept" in caplog.text
+
+
+def test_a_run_that_is_asked_to_stop_leaves_an_event_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny_run(tmp_path / "whole", EVENT)
+    asked: list[str] = []
+    request = Redrawer.request
+
+    def stopping(self: Redrawer, run: Run, event: int, spec: Any) -> Any:
+        asked.append(spec.kind)
+        run.stopping = len(asked) == 2
+        return request(self, run, event, spec)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Redrawer, "request", stopping)
+        run = tiny_run(tmp_path / "run", EVENT)
+    assert run.step == run.augmenters[0].events[0] < 8
+    assert len(asked) == 2, "the third picture is not asked for"
+    assert json.loads((run.folder / "status.json").read_text())["state"] == "interrupted"
+    assert not list((run.folder / "pseudo").glob("*.safetensors"))
+    assert_ends_as(run.folder, tmp_path / "whole")
+
+
+class Sending:
+    """Listener: sends a signal to this process after a step."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.step == 3:
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR2"])
+def test_signals_of_a_jobs_end_keep_its_last_step(tmp_path: Path, name: str) -> None:
+    number, received = getattr(signal, name), []
+    before = signal.signal(number, lambda *_: received.append(name))
+    loaded = plugins()
+    try:
+        with loaded.listening([Sending(number)]), pytest.raises(SystemExit) as ended:
+            train(tiny_settings(tmp_path / "run", *SHORT), loaded)
+    finally:
+        signal.signal(number, before)
+    assert received == [name]  # once stopped, it goes to whoever waited for it before
+    assert ended.value.code == 128 + number
+    assert [path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.json")] == ["step_0000003"]
+
+
+def test_a_signal_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    loaded = plugins()
+    try:
+        with loaded.listening([Sending(signal.SIGHUP)]):
+            assert train(tiny_settings(tmp_path / "run", "iterations=4"), loaded) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("gone", ["report.html", "point_cloud.ply", "renders/index.json"])
+def test_resume_finishes_what_was_killed_after_the_evaluation(whole: Path, tmp_path: Path, gone: str) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(whole, copy)
+    assert main(["resume", str(copy)]) == 2  # there is nothing left to do
+    (copy / gone).unlink()
+    (copy / "status.json").write_text('{"state": "running", "step": 8}')
+    assert state_of(read_run(copy))[0] == ("ok" if gone == "report.html" else "running")
+    assert main(["resume", str(copy)]) == 0
+    assert (copy / gone).is_file()
+    assert state_of(read_run(copy)) == ("ok", "")
+    assert 'id="notice"' not in (copy / "report.html").read_text()
+
+
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    with replacing(tmp_path / "inner" / "a.json") as under_way:
+        under_way.write_text("new")
+        old, others = tmp_path / "inner" / ".b.1-abcd.partial.json", tmp_path / ".c.elsewhere-1-01234567.partial"
+        dead = subprocess.Popen([sys.executable, "-c", ""])
+        dead.wait()
+        of_the_dead = tmp_path / f".d.{files.own_mark().rpartition('-')[0]}-{dead.pid}-01234567.partial.png"
+        for path in (old, others, of_the_dead):
+            path.write_text("half")
+        os.utime(old, (time.time() - files.ABANDONED - 1,) * 2)
+        remove_partial(tmp_path)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [others.name, "a.json", "inner"]
+
+
+def test_a_damaged_photograph_is_told_before_a_folder_exists(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_scene(synthesize(), tmp_path / "scene")
+    command = ["backbone=gs3d", "scene=colmap", f"scene.path={tmp_path / 'scene'}", "iterations=2", "device=cpu"]
+    command += ["scene.downscale=1", "training.test_points=0"]
+    looked: list[Path] = []
+    problem_of = verified.problem_of
+    monkeypatch.setattr(verified, "problem_of", lambda path: looked.append(path) or problem_of(path))
+    photographs = sorted((tmp_path / "scene" / "images").rglob("*.png"))
+    content = photographs[3].read_bytes()
+    photographs[3].write_bytes(content[: len(content) // 2])
+    assert main([*command, f"folder={tmp_path / 'run'}"]) == 2
+    said = capsys.readouterr().err
+    assert str(photographs[3]) in said
+    assert "damaged" in said
+    assert not (tmp_path / "run").exists()
+    photographs[3].write_bytes(content)
+    looked.clear()
+    for name in ("one", "two"):
+        assert main([*command, f"folder={tmp_path / name}"]) == 0
+    assert sorted(looked) == photographs, "each is looked at once for both runs"

@@ -1,0 +1,115 @@
+"""Commands of gsx in forked processes whose changes of files are counted, and fail or kill at a chosen one."""
+
+import errno
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+CHANGING = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.truncate", "os.link", "os.symlink")
+"""Events of Python's audit hooks (PEP 578) that change what is on a disk; os.replace tells of os.rename."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended."""
+
+    code: int
+    """Exit code; of a killed process the signal's number below 0."""
+    said: str
+    """Standard error."""
+    changes: int
+    """Changes of files that it began."""
+
+
+@dataclass
+class Disk:
+    """Audit hook: counts changes below a folder; those from number `at` on fail, or the first of them kills."""
+
+    below: str
+    at: int
+    error: int
+    """Number of the error; 0: the process is killed."""
+    count: int = 0
+
+    def __call__(self, event: str, given: tuple[Any, ...]) -> None:
+        if not (event in CHANGING or (event == "open" and self.writes(given))) or not self.concerns(given):
+            return
+        if event in ("os.remove", "os.rmdir") and self.error in (errno.ENOSPC, errno.EDQUOT):
+            return  # what a full disk still allows
+        self.count += 1
+        if self.count < self.at or not self.at:
+            return
+        if not self.error:
+            os.kill(os.getpid(), signal.SIGKILL)
+        raise OSError(self.error, os.strerror(self.error), str(given[0]))
+
+    def writes(self, given: tuple[Any, ...]) -> bool:
+        """Whether a file is opened for more than reading."""
+        return isinstance(given[2], int) and bool(given[2] & WRITING)
+
+    def concerns(self, given: tuple[Any, ...]) -> bool:
+        """Whether the file lies below the folder."""
+        named = isinstance(given[0], str | bytes | os.PathLike)
+        return named and os.path.abspath(os.fsdecode(given[0])).startswith(f"{self.below}{os.sep}")
+
+
+def run_in_child(words: list[str], place: Path, *, at: int = 0, error: int = 0) -> Ended:
+    """`gsx WORDS` in `place`, which is also where its cache lies; its `at`-th change of a file kills it, or fails with
+    an error as all later ones do. 0: nothing happens to it.
+    """
+    return in_child(lambda: command(words), place, at, error)
+
+
+def command(words: list[str]) -> int:
+    """The command line, inside the child."""
+    from gsx.cli.dispatch import main
+
+    return main(words)
+
+
+def in_child(job: Callable[[], int], place: Path, at: int = 0, error: int = 0) -> Ended:
+    """A job in a forked process; see `run_in_child`."""
+    said, counted = place.parent / f"{place.name}.stderr", place.parent / f"{place.name}.changes"
+    child = os.fork()
+    if child == 0:
+        os._exit(carried_out(job, place, Disk(str(place), at, error), said, counted))
+    _, status = os.waitpid(child, 0)
+    return Ended(
+        code=os.waitstatus_to_exitcode(status),
+        said=said.read_text(errors="replace"),
+        changes=int(counted.read_text() or 0) if counted.exists() else 0,
+    )
+
+
+def carried_out(job: Callable[[], int], place: Path, disk: Disk, said: Path, counted: Path) -> int:
+    """The child's whole life; returns its exit code."""
+    code = 70
+    try:
+        place.mkdir(exist_ok=True)
+        os.chdir(place)
+        os.environ["GSX_CACHE"] = str(place / "cache")
+        stream = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(stream, 1)
+        os.dup2(stream, 2)
+        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.addaudithook(disk)
+        code = job()
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    disk.at = 0
+    counted.write_text(str(disk.count))
+    return code
+
+
+ERRORS = {"ENOSPC": errno.ENOSPC, "EIO": errno.EIO, "EDQUOT": errno.EDQUOT}
