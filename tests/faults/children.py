@@ -1,11 +1,13 @@
 """Commands of gsx in forked processes whose changes of files are counted, and fail or kill at a chosen one."""
 
 import errno
+import importlib
 import os
 import signal
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,21 @@ class Disk:
         """Whether the file lies below the folder."""
         named = isinstance(given[0], str | bytes | os.PathLike)
         return named and os.path.abspath(os.fsdecode(given[0])).startswith(f"{self.below}{os.sep}")
+
+
+def preload(words: list[str], place: Path) -> None:
+    """Import here what a command imports on its way, so that children need not."""
+    names = place.parent / "modules.txt"
+
+    def listed() -> int:
+        code = command(words)
+        names.write_text("\n".join(sys.modules))
+        return code
+
+    assert in_child(listed, place).code == 0
+    for name in names.read_text().splitlines():
+        with suppress(Exception):  # some are parts of others, and come with them
+            importlib.import_module(name)
 
 
 def run_in_child(words: list[str], place: Path, *, at: int = 0, error: int = 0) -> Ended:

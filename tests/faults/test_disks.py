@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tiny import OVERRIDES
 
-from faults.children import ERRORS, Ended, run_in_child
+from faults.children import ERRORS, Ended, preload, run_in_child
 from faults.record import record
 
 pytestmark = pytest.mark.faults
@@ -36,6 +36,7 @@ def orphans(place: Path) -> list[str]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ended, str]:
     """How the command ends that nothing happens to, and the digest of its model."""
     place = tmp_path_factory.mktemp("disks") / "whole"
+    preload(RUN, place.parent / "first")
     ended = run_in_child(RUN, place)
     assert ended.code == 0, ended.said
     assert ended.changes > 50, "the test needs changes to be seen"

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 from tiny import OVERRIDES
 
-from faults.children import Ended, command, in_child
+from faults.children import Ended, command, in_child, preload
 from faults.record import record
 from gsx.builtin import plugins
 from gsx.core.options import flattened
@@ -82,6 +82,7 @@ def problem(ended: Ended, folder: Path, value: str) -> str:
 @pytest.mark.parametrize("part", range(8))
 def test_every_number(tmp_path: Path, part: int) -> None:
     wrong = []
+    preload(SUBJECTS["gs3d"] + [f"folder={tmp_path / 'run'}"], tmp_path / "first")
     with record("a numeric option at -1, 0, 1e308, 2^64, nan, inf, -inf", part) as counts:
         for subject, key in keys()[part::8]:
             for value in VALUES:

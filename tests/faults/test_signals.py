@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from faults.children import in_child, run_in_child
+from faults.children import in_child, preload, run_in_child
 from faults.record import record
 from faults.test_disks import RUN, digest, orphans
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.faults
 PARTS, RUNS = 4, 75
 """Shares of the suite, and runs of each."""
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
-LONGEST = 3.0
+LONGEST = 2.5
 """Seconds within which a signal comes; a run takes about as long."""
 
 
@@ -63,6 +63,7 @@ def send(place: Path, sent: list[signal.Signals], delays: list[float], parent: i
 @pytest.mark.parametrize("part", range(PARTS))
 def test_signals_at_random_moments(tmp_path: Path, part: int) -> None:
     choice = random.Random(part)
+    preload(RUN, tmp_path / "first")
     assert run_in_child(RUN, tmp_path / "whole").code == 0
     expected = digest(tmp_path / "whole")
     with record("signals (KILL, TERM, INT, HUP; one or two) at random moments", part, seed=part) as counts:
