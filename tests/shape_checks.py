@@ -15,7 +15,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 FIRST, EVERY = 4, 16
-"""Calls in a test that are checked, and every so-manieth of the others."""
+"""Calls in a test that are checked, and every EVERY-th of the others."""
 
 check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 calls: Counter[int] = Counter()

@@ -42,11 +42,11 @@ class Disk:
     def __call__(self, event: str, given: tuple[Any, ...]) -> None:
         if not (event in CHANGING or (event == "open" and self.writes(given))) or not self.concerns(given):
             return
-        if event in ("os.remove", "os.rmdir") and self.error in (errno.ENOSPC, errno.EDQUOT):
-            return  # what a full disk still allows
         self.count += 1
         if self.count < self.at or not self.at:
             return
+        if event in ("os.remove", "os.rmdir") and self.error in (errno.ENOSPC, errno.EDQUOT):
+            return  # what a full disk still allows
         if not self.error:
             os.kill(os.getpid(), signal.SIGKILL)
         raise OSError(self.error, os.strerror(self.error), str(given[0]))

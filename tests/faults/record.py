@@ -33,7 +33,7 @@ def record(what: str, part: int = 0, seed: int | None = None) -> Iterator[Counts
 
 
 def table() -> str:
-    """Lines of docs/reliability.md: cases, seeds and seconds of each test whose parts all passed."""
+    """Lines of docs/reliability.md: cases, seeds and seconds of each test; parts that failed left nothing."""
     found: dict[str, list[dict]] = {}
     for path in sorted(COUNTED.glob("*.json")):
         facts = json.loads(path.read_text())

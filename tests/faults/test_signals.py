@@ -26,12 +26,13 @@ def interrupted(place: Path, choice: random.Random) -> tuple[list[signal.Signals
     """A run that is sent one or two signals; returns which, and how it ended."""
     sent = [choice.choice(SIGNALS) for _ in range(choice.choice([1, 1, 2]))]
     delays = [choice.uniform(0, LONGEST), choice.uniform(0, 0.3)]
-    pid = os.getpid()
     begun = time.monotonic()
     sender = os.fork()
     if sender == 0:
-        send(place, sent, delays, pid)
-        os._exit(0)
+        try:
+            send(place, sent, delays)
+        finally:
+            os._exit(0)
     ended = in_child(lambda: announced(place), place)
     os.waitpid(sender, 0)
     assert time.monotonic() - begun < 120, "it has to end"
@@ -46,7 +47,7 @@ def announced(place: Path) -> int:
     return main(RUN)
 
 
-def send(place: Path, sent: list[signal.Signals], delays: list[float], parent: int) -> None:
+def send(place: Path, sent: list[signal.Signals], delays: list[float]) -> None:
     """Send signals to the process that said its number, with delays before them."""
     said = place.parent / f"{place.name}.pid"
     until = time.monotonic() + 30

@@ -224,3 +224,11 @@ def test_the_environment_of_the_user_is_respected_but_for_telemetry(monkeypatch:
     from mlflow.environment_variables import MLFLOW_DISABLE_TELEMETRY, MLFLOW_HTTP_REQUEST_TIMEOUT
 
     assert (MLFLOW_HTTP_REQUEST_TIMEOUT.get(), MLFLOW_DISABLE_TELEMETRY.get()) == (77, True)
+
+
+@pytest.mark.parametrize("uri", ["https://me:secret@host/x", "postgresql://me:secret@host/runs"])
+def test_a_password_in_the_address_is_refused_and_not_repeated(uri: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds a password") as refused:
+        tiny_settings(tmp_path / "run", "tracker=[mlflow]", f"tracker.mlflow.uri='{uri}'")
+    assert "secret" not in str(refused.value)
+    assert tiny_settings(tmp_path / "run", "tracker=[mlflow]", "tracker.mlflow.uri='postgresql://me@host/runs'")

@@ -141,7 +141,7 @@ def verb_resume(arguments: list[str]) -> int:
     words = [word for word in arguments if word not in RESUME_FLAGS]
     folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
     from gsx.experiments.run_folder.claims import claimed
-    from gsx.experiments.run_folder.files import read_run, state_of
+    from gsx.experiments.run_folder.files import read_run, reported, state_of
     from gsx.experiments.runs.history import go_on
     from gsx.experiments.runs.open import open_run, refuse_other
     from gsx.experiments.runs.settings import write_config
@@ -150,7 +150,7 @@ def verb_resume(arguments: list[str]) -> int:
     refuse_other(folder)
     with claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
-        if run.complete and (folder / "report.html").is_file() and state_of(read_run(folder))[0] == "ok":
+        if run.complete and reported(folder) and state_of(read_run(folder))[0] == "ok":
             remedy = "give iterations=N with N above that to lengthen it"
             raise InputError(f"{folder} is complete at step {run.step}: {remedy}")
         if run.ranks.first:

@@ -50,35 +50,42 @@ def keep_names(folder: Path) -> None:
             os.close(number)
 
 
-ABANDONED = 600.0
-"""Seconds after which nobody is still writing a temporary file."""
+ABANDONED = 3600.0
+"""Seconds after which a temporary file of another machine is taken for left behind."""
+MARKED = re.compile(r"^\..+\.(?P<machine>[A-Za-z0-9]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
+"""Names of temporary files."""
 
 
 def own_mark() -> str:
-    """This machine and process, in letters of file names."""
-    return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node())}-{os.getpid()}"
+    """This machine and process, in letters of file names; containers that number processes anew are told apart."""
+    try:
+        counted_by = os.readlink("/proc/self/ns/pid")  # of containers each has its own
+    except OSError:
+        counted_by = ""
+    return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node() + counted_by)}-{os.getpid()}"
 
 
 def remove_partial(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder and below."""
-    for path in folder.rglob(".*.partial*"):
-        with suppress(OSError):
-            if gone(path.name) or time.time() - path.stat().st_mtime > ABANDONED:
-                path.unlink()
+    for place, _, names in os.walk(folder):
+        for name in names:
+            if found := MARKED.match(name):
+                with suppress(OSError):
+                    path = Path(place, name)
+                    if gone(found["machine"], int(found["process"]), path):
+                        path.unlink()
 
 
-def gone(name: str) -> bool:
-    """Whether a temporary file is of a process of this machine that is no more."""
-    host, _, process = own_mark().rpartition("-")
-    found = re.search(rf"\.{host}-(\d+)-[0-9a-f]{{8}}\.partial", name)
-    if found is None or found[1] == process or os.name != "posix":
-        return False
+def gone(machine: str, process: int, path: Path) -> bool:
+    """Whether the process that wrote a temporary file is no more; of other machines its age tells."""
+    if machine != own_mark().rpartition("-")[0] or os.name != "posix":
+        return time.time() - path.stat().st_mtime > ABANDONED
     try:
-        os.kill(int(found[1]), 0)
+        os.kill(process, 0)
     except ProcessLookupError:
         return True
-    except OSError:
-        return False
+    except OSError:  # another user's
+        pass
     return False
 
 

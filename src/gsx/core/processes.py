@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import suppress
 
 
 def processes() -> int:
@@ -15,6 +16,12 @@ def speaks() -> bool:
 
 
 def say(text: str, *, as_error: bool = False) -> None:
-    """Write to standard output, or to standard error, once for all processes."""
-    if speaks():
-        (sys.stderr if as_error else sys.stdout).write(text)
+    """Write to standard output, or to standard error, once for all processes; a closed terminal loses messages."""
+    if not speaks():
+        return
+    if not as_error:
+        sys.stdout.write(text)
+        return
+    with suppress(OSError):
+        sys.stderr.write(text)
+        sys.stderr.flush()

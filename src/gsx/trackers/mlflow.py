@@ -55,10 +55,10 @@ class MLflowOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.seconds < math.inf:
             raise ValueError(f"tracker.mlflow.seconds is {self.seconds}; give a number from 0")
-        if "@" in urlsplit(self.uri).netloc:  # config.yaml, the report and logs would tell it
+        if ":" in urlsplit(self.uri).netloc.rpartition("@")[0]:  # config.yaml, the report and logs would tell it
             raise ValueError(
-                "tracker.mlflow.uri holds a name or a password; leave them out and set MLFLOW_TRACKING_USERNAME and "
-                "MLFLOW_TRACKING_PASSWORD"
+                "tracker.mlflow.uri holds a password; leave it out: for a server set MLFLOW_TRACKING_USERNAME and "
+                "MLFLOW_TRACKING_PASSWORD, for a database use its own means, such as PGPASSWORD"
             )
 
 

@@ -22,9 +22,10 @@ from gsx.augmenters.redraw import Redrawer
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core import files
+from gsx.core.errors import TrainingError
 from gsx.core.files import remove_partial, replacing
 from gsx.core.plugins import hookimpl
-from gsx.core.training import trainer
+from gsx.core.training import checkpoint, trainer
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs import verified
@@ -67,7 +68,7 @@ class Failing:
 
 
 def at_call(number: int, function: Callable[..., Any], error: BaseException) -> Callable[..., Any]:
-    """The function, which raises at its so-manieth call."""
+    """The function, which raises at its `number`-th call."""
     calls = []
 
     def failing(*given: Any, **named: Any) -> Any:
@@ -206,7 +207,8 @@ def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> N
     (tmp_path / "inner").mkdir()
     with replacing(tmp_path / "inner" / "a.json") as under_way:
         under_way.write_text("new")
-        old, others = tmp_path / "inner" / ".b.1-abcd.partial.json", tmp_path / ".c.elsewhere-1-01234567.partial"
+        old = tmp_path / "inner" / ".b.elsewhere-1-01234567.partial.json"
+        others = tmp_path / ".c.elsewhere-1-01234567.partial"
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
         of_the_dead = tmp_path / f".d.{files.own_mark().rpartition('-')[0]}-{dead.pid}-01234567.partial.png"
@@ -215,6 +217,44 @@ def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> N
         os.utime(old, (time.time() - files.ABANDONED - 1,) * 2)
         remove_partial(tmp_path)
     assert sorted(path.name for path in tmp_path.rglob("*")) == [others.name, "a.json", "inner"]
+
+
+class AtGradients:
+    """Listener: an error before the fourth step is applied."""
+
+    @hookimpl
+    def gsx_gradients_ready(self, run: Run) -> None:
+        if run.step == 3:
+            raise TrainingError("at the gradients")
+
+
+class AfterLast:
+    """Listener: an error when the last step is told."""
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        if run.complete:
+            raise OSError(errno.ENOSPC, "no room")
+
+
+@pytest.mark.parametrize(("listener", "step"), [(AtGradients(), 3), (AfterLast(), 8)])
+def test_errors_of_listeners_keep_the_bits(tmp_path: Path, whole: Path, listener: object, step: int) -> None:
+    """At the gradients the step has not been taken; after the last step it is kept."""
+    settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
+    run = start(settings, loaded)
+    with loaded.listening([listener]), pytest.raises((TrainingError, OSError)):
+        execute(run, settings, loaded)
+    assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == [f"step_000000{step}"]
+    assert_ends_as(run.folder, whole)
+
+
+def test_a_status_is_kept_where_a_checkpoint_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
+    run = start(settings, loaded)
+    monkeypatch.setattr("gsx.core.training.checkpoint.write", at_call(1, checkpoint.write, MemoryError("none left")))
+    with loaded.listening([Failing()]), pytest.raises(OSError, match="No space left"):
+        execute(run, settings, loaded)
+    assert json.loads((run.folder / "status.json").read_text())["state"] == "failed"
 
 
 def test_a_damaged_photograph_is_told_before_a_folder_exists(

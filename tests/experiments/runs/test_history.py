@@ -103,6 +103,19 @@ def test_an_edited_config_is_refused_and_an_override_is_kept(run: Path, caplog: 
     assert changed["training.ssim_weight"] == [0.2, 0.1]
 
 
+def test_a_config_that_lags_behind_its_history_goes_on(run: Path) -> None:
+    """Killed between both: the history has the digest of options that config.yaml has not got yet."""
+    resumed(run, "iterations=6")
+    resumed(run, "iterations=6")
+    resumed(run)
+
+
+def test_plugins_that_came_and_went_are_told(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    alter(run, plugins=facts(run)["plugins"] | {"gone": "1.0"})
+    resumed(run)
+    assert "plugins.gone=None, before it was 1.0" in caplog.text
+
+
 def test_a_run_of_an_older_gsx_goes_on(run: Path, caplog: pytest.LogCaptureFixture) -> None:
     old = {key: value for key, value in facts(run).items() if key not in ("options", "plugins", "scene")}
     (run / "environment.json").write_text(json.dumps(old))

@@ -17,14 +17,11 @@ from gsx.core.training.run import Run, Step
 
 
 @contextmanager
-def next_views(run: Run) -> Iterator[list[int]]:
-    """Numbers of the views of the next step.
-
-    A step that fails has not been taken: a checkpoint written then begins with the same views and colours again.
-    """
-    colours, batch = run.generator.get_state(), run.sampler.take()
+def taken_or_not(run: Run) -> Iterator[None]:
+    """A step that fails has not been taken: a checkpoint written then begins with the same views and colours again."""
+    colours = run.generator.get_state()
     try:
-        yield batch
+        yield
     except BaseException:
         run.generator.set_state(colours)
         run.sampler.put_back()

@@ -17,7 +17,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Drawn, Observation, remove_nonfinite
-from gsx.core.training.minibatch import gradients_added, merge_gradients, next_views
+from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
@@ -42,8 +42,9 @@ def train(run: Run, plugins: Plugins) -> None:
 
 def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
-    step = backward(run)
-    reason = veto(run, step, plugins)
+    with taken_or_not(run):
+        step = backward(run)
+        reason = veto(run, step, plugins)
     run.changing = True
     if reason:
         zero_grad(run.backbone.table)
@@ -71,6 +72,7 @@ def remove_lost(run: Run, step: Step) -> str:
     cameras = [run.scene.train[number].camera for number in run.sampler.taken]
     removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed:
+        run.changing = True
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
         )
@@ -80,7 +82,8 @@ def remove_lost(run: Run, step: Step) -> str:
 def backward(run: Run) -> Step:
     """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
     number = run.step + 1
-    with next_views(run) as batch:
+    with taken_or_not(run):
+        batch = run.sampler.take()
         picked = run.ranks.share(batch)
         asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
         colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike

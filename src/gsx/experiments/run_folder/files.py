@@ -13,8 +13,8 @@ from gsx.experiments.run_folder.renamed import renamed
 DETAIL_OF = ("render", "enlarged", "photograph")
 """Pictures of a zoom whose explained detail is told, the model's own first."""
 SPLATS = "point_cloud.ply"
-RESULTS = ("metrics.jsonl", "evaluation.json", "renders/index.json", SPLATS)
-"""Files of every run that was carried to its end, beside those it began with."""
+RESULTS = ("evaluation.json", "renders/index.json", SPLATS)
+"""Files that end every run; `gsx eval` makes them again."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -57,7 +57,12 @@ class RunFiles:
     @property
     def missing(self) -> list[str]:
         """Files that a complete run has and this one lacks; but for its report, which is made of them."""
-        return [name for name in ("environment.json", *RESULTS) if not (self.folder / name).is_file()]
+        return [name for name in ("environment.json", "metrics.jsonl", *RESULTS) if not (self.folder / name).is_file()]
+
+    @property
+    def unfinished(self) -> list[str]:
+        """Those of `missing` that are results."""
+        return [name for name in self.missing if name in RESULTS]
 
     @property
     def scene(self) -> str:
@@ -252,13 +257,21 @@ def state_of(files: RunFiles) -> tuple[str, str]:
         return "failed", str(files.status.get("reason") or "no reason recorded")
     evaluated = int(files.evaluation.get("step") or 0)
     done = files.evaluation and evaluated >= max(files.step, files.iterations)
-    if done and not files.missing:
+    if done and not files.unfinished:
         return "ok", ""
     progress = f"{files.step:,} of {files.iterations:,} steps, "
     progress += f"evaluated at step {evaluated:,}" if files.evaluation else "not evaluated"
     if done:
-        progress += f", without {', '.join(files.missing)}"
+        progress += f", without {', '.join(files.unfinished)}"
     return ("running", f"under way or killed: {progress}") if recorded == "running" else ("interrupted", progress)
+
+
+def reported(folder: Path) -> bool:
+    """Whether a run's report is of its last state, which is recorded before the report is written."""
+    try:
+        return (folder / "report.html").stat().st_mtime_ns >= (folder / "status.json").stat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def runs_below(folder: Path) -> Iterator[Path]:

@@ -123,7 +123,7 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
     stamp, and evaluated the same."""
     return (
         files.status.get("state") == "ok"
-        and not files.missing
+        and not files.unfinished
         and files.evaluation.get("step") == config["iterations"]
         and evaluated_as(files, config) == evaluation_settings(config)
         and composition_key(files.config, trained_on(files), idle) == composition_key(config, stamp, idle)

@@ -1,6 +1,8 @@
 """Train from the current step on, evaluate, export, report."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from gsx.core.cache import cache_root
@@ -94,14 +96,22 @@ def keep_what_there_is(run: Run, error: BaseException) -> None:
 
     What cannot be written now is told in the log; the error itself is what matters.
     """
-    whole = not (run.changing or run.complete or isinstance(error, LostModel))
+    kept = run.step in map(checkpoint.step_of, checkpoint.sidecars(run.folder / "checkpoints"))
     reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
-    try:
-        if whole and run.step > 0:
+    with told_of(f"the checkpoint of step {run.step}"):
+        if not (kept or run.changing or run.step == 0 or isinstance(error, LostModel)):
             checkpoint.save(run)
+    with told_of("its status"):
         status(run, "failed", reason)
-    except Exception as problem:  # no space, no memory: it must not hide the error
-        logger.warning("after this error step %d could not be kept (%s)", run.step, first_line(problem))
+
+
+@contextmanager
+def told_of(what: str) -> Iterator[None]:
+    """What cannot be written after an error, for want of space or memory, must not hide it."""
+    try:
+        yield
+    except Exception as problem:
+        logger.warning("after this error %s could not be kept (%s)", what, first_line(problem))
 
 
 def follow(run: Run, plugins: Plugins) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
-from gsx.core.errors import InputError
+from gsx.core.errors import InputError, LostModel, TrainingError
 from gsx.core.files import replace_file
 from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
@@ -93,12 +93,18 @@ def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
     """The run at its end; nobody but the guard against numbers that are not finite listens.
 
     `refuse_if_stopping`: of the run that it is trained for.
+
+    Raises:
+        TrainingError: it was lost; the run that it is trained for is not.
     """
     plugins = load_plugins([], points=[])
     with plugins.listening([Guard()]):
         while not run.complete:
             refuse_if_stopping()
-            train_step(run, plugins)
+            try:
+                train_step(run, plugins)
+            except LostModel as error:
+                raise TrainingError(f"a model of half of the views was lost: {error}") from error
     return run
 
 

@@ -53,7 +53,11 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
         return
     before, now = circumstances(files.environment), circumstances(environment(run, plugins))
     differing = {key: (before[key], now[key]) for key in now if key in before and before[key] != now[key]}
-    edited = before.get("options") not in (None, options_digest(files.config, run.idle))
+    if any(key.startswith("plugins.") for key in before):
+        installed = changes(plugins_of(before), plugins_of(now))
+        differing |= {key: pair for key, pair in installed.items() if None in pair}
+    known = known_options(files.environment)
+    edited = known and options_digest(files.config, run.idle) not in known
     if not changed:
         others = ["options"] if edited and "source" not in differing else []  # another source may read it otherwise
         refuse_another(run, [*(key for key in differing if key != "options"), *others])
@@ -62,6 +66,17 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
         if key != "options":
             logger.warning("%s", told(key, then, value))
     record(run, files.environment, differing | asked)
+
+
+def plugins_of(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Versions of plugins among comparable entries."""
+    return {key: value for key, value in entries.items() if key.startswith("plugins.")}
+
+
+def known_options(facts: Mapping[str, Any]) -> set[str]:
+    """Digests of all options that the run has had: config.yaml may lag behind a history that was written before it."""
+    ways = [part(entry, "changed").get("options", []) for entry in facts.get("history", [])]
+    return {str(digest) for digest in (facts.get("options"), *(one for way in ways for one in way)) if digest}
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsx.core.errors import ConfigError
+from gsx.core.files import remove_partial
 from gsx.core.processes import processes, say, speaks
 
 if TYPE_CHECKING:
@@ -102,7 +103,8 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
     from gsx.experiments.reports.report import write_report
-    from gsx.experiments.run_folder.claims import claimed_name
+    from gsx.experiments.run_folder.claims import claimed, claimed_name
+    from gsx.experiments.run_folder.files import reported
     from gsx.experiments.run_folder.run_key import place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
 
@@ -114,8 +116,10 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with claimed_name(folder), ExitStack() as claims:
         _, run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
-            if not (folder / "report.html").is_file():  # it was killed while it was written
-                write_report(folder)
+            with claimed(folder):  # what a process left that was killed at its very end
+                remove_partial(folder)
+                if not reported(folder):
+                    write_report(folder)
             sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0
         return carry_out(run, settings, loaded)

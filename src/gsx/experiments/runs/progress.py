@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -45,14 +46,16 @@ class Line:
     def show(self, text: str) -> None:
         """Write over the last line on a terminal, below it elsewhere."""
         end, start = ("", "\r") if self.live else ("\n", "")
-        self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
-        self.stream.flush()
+        with suppress(OSError):  # its terminal was closed
+            self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
+            self.stream.flush()
         self.width = len(text)
 
     def end(self) -> None:
         """Leave the last line standing."""
         if self.live and self.width:
-            self.stream.write("\n")
+            with suppress(OSError):
+                self.stream.write("\n")
             self.width = 0
 
 

@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsx.core.cache import cache_folder, content_key, file_stamp
-from gsx.core.data.images import read_image
-from gsx.core.data.scene import FromFile, Scene
+from gsx.core.data.images import PhotoSource, read_image
+from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ def verified(scene: Scene) -> Scene:
         InputError: some are damaged or missing.
     """
     sources = (view.source for view in (*scene.train, *scene.test))
-    paths = list(dict.fromkeys(source.path for source in sources if isinstance(source, FromFile)))
+    paths = list(dict.fromkeys(source.path for source in sources if isinstance(source, PhotoSource)))
     if not paths or (known := remembered(paths)).exists():
         return scene
     if len(paths) >= LONG:
