@@ -15,7 +15,7 @@ from faults.test_disks import RUN, digest, orphans
 
 pytestmark = pytest.mark.faults
 
-PARTS, RUNS = 4, 75
+PARTS, RUNS = 4, 25
 """Shares of the suite, and runs of each."""
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 LONGEST = 2.5
