@@ -27,6 +27,8 @@ class Ended:
     """Standard error."""
     changes: int
     """Changes of files that it began."""
+    failed: int
+    """Those of them that failed, but for removing a lock."""
 
 
 @dataclass
@@ -38,6 +40,7 @@ class Disk:
     error: int
     """Number of the error; 0: the process is killed."""
     count: int = 0
+    failed: int = 0
 
     def __call__(self, event: str, given: tuple[Any, ...]) -> None:
         if not (event in CHANGING or (event == "open" and self.writes(given))) or not self.concerns(given):
@@ -49,6 +52,7 @@ class Disk:
             return  # what a full disk still allows
         if not self.error:
             os.kill(os.getpid(), signal.SIGKILL)
+        self.failed += not (event == "os.remove" and str(given[0]).endswith(".lock"))  # void without its process
         raise OSError(self.error, os.strerror(self.error), str(given[0]))
 
     def writes(self, given: tuple[Any, ...]) -> bool:
@@ -97,11 +101,9 @@ def in_child(job: Callable[[], int], place: Path, at: int = 0, error: int = 0) -
     if child == 0:
         os._exit(carried_out(job, place, Disk(str(place), at, error), said, counted))
     _, status = os.waitpid(child, 0)
-    return Ended(
-        code=os.waitstatus_to_exitcode(status),
-        said=said.read_text(errors="replace"),
-        changes=int(counted.read_text() or 0) if counted.exists() else 0,
-    )
+    changes, failed = map(int, counted.read_text().split()) if counted.exists() else (0, 0)
+    code = os.waitstatus_to_exitcode(status)
+    return Ended(code=code, said=said.read_text(errors="replace"), changes=changes, failed=failed)
 
 
 def carried_out(job: Callable[[], int], place: Path, disk: Disk, said: Path, counted: Path) -> int:
@@ -125,7 +127,7 @@ def carried_out(job: Callable[[], int], place: Path, disk: Disk, said: Path, cou
     sys.stdout.flush()
     sys.stderr.flush()
     disk.at = 0
-    counted.write_text(str(disk.count))
+    counted.write_text(f"{disk.count} {disk.failed}")
     return code
 
 

@@ -15,7 +15,7 @@ from faults.test_disks import RUN, digest, orphans
 
 pytestmark = pytest.mark.faults
 
-PARTS, RUNS = 4, 25
+PARTS, RUNS = 4, 20
 """Shares of the suite, and runs of each."""
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 LONGEST = 2.5
