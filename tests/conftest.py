@@ -1,4 +1,4 @@
-"""Shape annotations are checked on every call in the tests (jaxtyping and beartype); single-threaded torch."""
+"""Shape annotations are checked in every test (jaxtyping and beartype); single-threaded torch."""
 
 import os
 from collections import Counter

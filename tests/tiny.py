@@ -5,10 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from safetensors.torch import load_file
+from torch import Tensor
+
 from gsx.builtin import plugins
 from gsx.core.data.scene import Scene
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder.files import RESULTS
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import start
@@ -61,6 +65,20 @@ def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = No
     return run
 
 
+def final_tensors(folder: Path) -> dict[str, Tensor]:
+    """All tensors of a run's newest checkpoint."""
+    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def leave_results(folder: Path) -> None:
+    """Give a folder the files of a finished run that it lacks, with nothing in them."""
+    for name in ("environment.json", "metrics.jsonl", *RESULTS):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            path.write_text("{}" if path.suffix == ".json" else "")
+
+
 class StopAfter:
     """Listener that does what Ctrl-C does."""
 
@@ -71,3 +89,16 @@ class StopAfter:
     def gsx_step_finished(self, run: Run) -> None:
         """Ask the run to stop."""
         run.stopping = run.step >= self.step
+
+
+class Raises:
+    """Listener that ends the run after a step."""
+
+    def __init__(self, error: BaseException, step: int = 3) -> None:
+        self.error, self.step = error, step
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        """Raise when due."""
+        if run.step == self.step:
+            raise self.error

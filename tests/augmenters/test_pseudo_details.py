@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 from regenerating import of_role
-from safetensors.torch import load_file
-from tiny import tiny_run, tiny_settings
+from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
@@ -553,10 +552,6 @@ RUN = (
     "augmenter.bootstrap.timing.span=2000",
     "training.checkpoint_every=100",
 )
-
-
-def final_tensors(folder: Path) -> dict[str, Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 @pytest.fixture(scope="module")

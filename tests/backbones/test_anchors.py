@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from small_scene import small_scene, spread
-from tiny import tiny_run
+from tiny import final_tensors, tiny_run
 from torch import Tensor
 
 from gsx.backbones.anchor_grids import LevelGrids
@@ -556,11 +555,6 @@ MORE = {
 
 def run_words(name: str) -> tuple[str, ...]:
     return (f"backbone={name}", *RUN, *MORE[name])
-
-
-def final_tensors(folder: Path) -> dict[str, Tensor]:
-    """All tensors of a run's newest checkpoint."""
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from small_scene import small_scene, spread
-from tiny import tiny_run
+from tiny import final_tensors, tiny_run
 from torch import Tensor
 
 from gsx.backbones.clone_split import (
@@ -532,10 +531,6 @@ RUN = (
     "backbone.clone_split.density.gradient=1e-6",
     "backbone.clone_split.density.split_extent=0.5",
 )
-
-
-def final_tensors(folder: Path) -> dict[str, Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 @pytest.mark.parametrize("more", [(), ("backbone.filter=mip",)], ids=["plain", "mip"])

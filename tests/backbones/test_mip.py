@@ -10,9 +10,8 @@ import pytest
 import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from safetensors.torch import load_file
 from small_scene import published_options, small_gs3d, small_scene, spread
-from tiny import OVERRIDES, tiny_run
+from tiny import OVERRIDES, final_tensors, tiny_run
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
@@ -523,10 +522,6 @@ def test_wrong_options_are_refused(override: str, message: str) -> None:
 
 
 # -- whole runs --------------------------------------------------------------------------------------------------------
-
-
-def final_tensors(folder: Path) -> dict[str, Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 @pytest.fixture(scope="module")

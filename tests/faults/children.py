@@ -129,6 +129,3 @@ def carried_out(job: Callable[[], int], place: Path, disk: Disk, said: Path, cou
     disk.at = 0
     counted.write_text(f"{disk.count} {disk.failed}")
     return code
-
-
-ERRORS = {"ENOSPC": errno.ENOSPC, "EIO": errno.EIO, "EDQUOT": errno.EDQUOT}

@@ -1,14 +1,14 @@
 """Killed or out of disk at every change of a file: the same command again ends in the bits of a run left alone."""
 
+import errno
 import hashlib
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from tiny import OVERRIDES
 
-from faults.children import ERRORS, Ended, preload, run_in_child
+from faults.children import Ended, preload, run_in_child
 from faults.record import record
 
 pytestmark = pytest.mark.faults
@@ -43,9 +43,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ended, str]:
     return ended, digest(place)
 
 
-def places(ended: Ended, part: int, every: int = 1) -> Iterator[int]:
+def places(ended: Ended, part: int, every: int = 1) -> range:
     """Numbers of changes, from the first to the last."""
-    return iter(range(1 + part, ended.changes + 1, PARTS * every))
+    return range(1 + part, ended.changes + 1, PARTS * every)
 
 
 @pytest.mark.parametrize("part", range(PARTS))
@@ -71,7 +71,7 @@ def test_a_disk_that_fails_from_any_change_on(
     with record(f"{name} from a change of a file on, then the same command", part) as counts:
         for at in places(whole[0], part, every):
             place = tmp_path / f"at_{at}"
-            ended = run_in_child(RUN, place, at=at, error=ERRORS[name])
+            ended = run_in_child(RUN, place, at=at, error=getattr(errno, name))
             told = sum(line.startswith("gsx: ") for line in ended.said.splitlines())
             assert (ended.code, told) == ((2, 1) if ended.failed else (0, 0)), (at, ended.said)
             assert "Traceback" not in ended.said, (at, ended.said)

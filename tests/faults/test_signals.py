@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from faults.children import in_child, preload, run_in_child
+from faults.children import command, in_child, preload, run_in_child
 from faults.record import record
 from faults.test_disks import RUN, digest, orphans
 
@@ -41,10 +41,8 @@ def interrupted(place: Path, choice: random.Random) -> tuple[list[signal.Signals
 
 def announced(place: Path) -> int:
     """The run, whose process says its number."""
-    from gsx.cli.dispatch import main
-
     (place.parent / f"{place.name}.pid").write_text(str(os.getpid()))
-    return main(RUN)
+    return command(RUN)
 
 
 def send(place: Path, sent: list[signal.Signals], delays: list[float]) -> None:

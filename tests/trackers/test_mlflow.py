@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny import tiny_run, tiny_settings
+from tiny import Raises, tiny_run, tiny_settings
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError, TrainingError
@@ -128,18 +128,6 @@ def test_a_run_that_goes_on_elsewhere_is_begun_there_with_all_its_points(
     assert json.loads((folder / "mlflow.json").read_text())["uri"] == f"sqlite:///{tmp_path / 'other.db'}"
     assert curves(folder) == expected_curves(folder)
     assert {path.name for path in tmp_path.iterdir()} == {"other.db", "mlflow_files", ".mlflow.lock"}
-
-
-class Raises:
-    """Listener that ends the run at step 3."""
-
-    def __init__(self, error: BaseException) -> None:
-        self.error = error
-
-    @hookimpl
-    def gsx_step_finished(self, run: Run) -> None:
-        if run.step == 3:
-            raise self.error
 
 
 @pytest.mark.parametrize(

@@ -337,7 +337,7 @@ def test_a_step_that_fails_has_not_been_taken(tmp_path: Path) -> None:
     run = fresh(tmp_path / "run", "training.batch=2", "training.random_background=true")
     run.augmenters, state = [Failing((1,))], run.generator.get_state()
     with pytest.raises(TrainingError, match="lost its pictures"):
-        backward(run)
+        train_step(run, plugins())
     assert run.sampler.order == [0, 5, 1, 4]
     assert torch.equal(run.generator.get_state(), state)
 

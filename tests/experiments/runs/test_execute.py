@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
-from tiny import tiny_run, tiny_settings
+from tiny import final_tensors, tiny_run, tiny_settings
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
@@ -21,11 +20,6 @@ from gsx.core.training.run import Run
 from gsx.experiments.runs.evaluate import remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
-
-
-def final_tensors(folder: Path) -> dict[str, torch.Tensor]:
-    """All tensors of a run's newest checkpoint."""
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:

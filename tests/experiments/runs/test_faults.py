@@ -14,9 +14,8 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from synthetic_colmap import synthesize, write_scene
-from tiny import tiny_run, tiny_settings
+from tiny import Raises, final_tensors, tiny_run, tiny_settings
 
 from gsx.augmenters.redraw import Redrawer
 from gsx.builtin import plugins
@@ -39,16 +38,12 @@ EVENT = ("iterations=8", "augmenter=[upscale]", "regenerator/upscale=lanczos",
          *(f"augmenter.upscale.timing.{key}=15000" for key in ("start", "every", "span")))  # fmt: skip
 
 
-def tensors(folder: Path) -> dict[str, torch.Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
-
-
 def assert_ends_as(folder: Path, whole: Path) -> None:
     """A run that goes on ends with the bits of one that nothing happened to."""
     run, settings = open_run(folder, plugins(), training=True)
     execute(run, settings, plugins())
-    expected = tensors(whole)
-    assert all(torch.equal(value, expected[name]) for name, value in tensors(folder).items())
+    expected = final_tensors(whole)
+    assert all(torch.equal(value, expected[name]) for name, value in final_tensors(folder).items())
 
 
 @pytest.fixture(scope="module")
@@ -58,13 +53,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Failing:
-    """Listener: an error of the file system when a step is told, as where metrics are written to a full disk."""
-
-    @hookimpl
-    def gsx_step_finished(self, run: Run) -> None:
-        if run.step == 5:
-            raise OSError(errno.ENOSPC, "No space left on device", "metrics.jsonl")
+def full_disk() -> OSError:
+    """As where metrics are written."""
+    return OSError(errno.ENOSPC, "No space left on device", "metrics.jsonl")
 
 
 def at_call(number: int, function: Callable[..., Any], error: BaseException) -> Callable[..., Any]:
@@ -97,7 +88,7 @@ def test_an_error_within_a_step_keeps_the_step_before(
 def test_an_error_between_steps_keeps_the_last_one(tmp_path: Path, whole: Path) -> None:
     settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
     run = start(settings, loaded)
-    with loaded.listening([Failing()]), pytest.raises(OSError, match="No space left"):
+    with loaded.listening([Raises(full_disk(), 5)]), pytest.raises(OSError, match="No space left"):
         execute(run, settings, loaded)
     assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == ["step_0000005"]
     assert_ends_as(run.folder, whole)
@@ -228,16 +219,7 @@ class AtGradients:
             raise TrainingError("at the gradients")
 
 
-class AfterLast:
-    """Listener: an error when the last step is told."""
-
-    @hookimpl
-    def gsx_step_finished(self, run: Run) -> None:
-        if run.complete:
-            raise OSError(errno.ENOSPC, "no room")
-
-
-@pytest.mark.parametrize(("listener", "step"), [(AtGradients(), 3), (AfterLast(), 8)])
+@pytest.mark.parametrize(("listener", "step"), [(AtGradients(), 3), (Raises(full_disk(), 8), 8)])
 def test_errors_of_listeners_keep_the_bits(tmp_path: Path, whole: Path, listener: object, step: int) -> None:
     """At the gradients the step has not been taken; after the last step it is kept."""
     settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
@@ -252,7 +234,7 @@ def test_a_status_is_kept_where_a_checkpoint_cannot_be(tmp_path: Path, monkeypat
     settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
     run = start(settings, loaded)
     monkeypatch.setattr("gsx.core.training.checkpoint.write", at_call(1, checkpoint.write, MemoryError("none left")))
-    with loaded.listening([Failing()]), pytest.raises(OSError, match="No space left"):
+    with loaded.listening([Raises(full_disk(), 5)]), pytest.raises(OSError, match="No space left"):
         execute(run, settings, loaded)
     assert json.loads((run.folder / "status.json").read_text())["state"] == "failed"
 

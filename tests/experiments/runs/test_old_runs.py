@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tiny import leave_results
 
 from gsx.builtin import plugins
 from gsx.core.training.parameter_table import table_tensors
@@ -75,9 +76,7 @@ def test_figures_by_another_filter_are_not_those_of_the_composition(tmp_path: Pa
     write_config(tmp_path / "config.yaml", made.resolved)
     (tmp_path / "status.json").write_text('{"state": "ok", "step": 1}')
     (tmp_path / "environment.json").write_text('{"scene": {"stamp": ""}}')
-    (tmp_path / "renders").mkdir()
-    for name in ("metrics.jsonl", "renders/index.json", "point_cloud.ply"):
-        (tmp_path / name).write_text("{}")
+    leave_results(tmp_path)
     own = evaluation_settings(made.resolved)
     cases = [
         ({"settings": own}, True),

@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
-from tiny import StopAfter, tiny_run, tiny_settings, words
+from tiny import Raises, StopAfter, final_tensors, tiny_run, tiny_settings, words
 
 from gsx import builtin
 from gsx.builtin import plugins
@@ -91,18 +90,6 @@ class Third:
         registry.add("tracker", "heard", Heard, HeardOptions)
 
 
-class Raises:
-    """Listener that ends the run at step 3."""
-
-    def __init__(self, error: BaseException) -> None:
-        self.error = error
-
-    @hookimpl
-    def gsx_step_finished(self, run: Run) -> None:
-        if run.step == 3:
-            raise self.error
-
-
 def loaded() -> Plugins:
     return load_plugins([("gsx", builtin), ("third", Third())], points=[])
 
@@ -115,10 +102,6 @@ def heard_run(folder: Path, *more: str, listener: object | None = None) -> None:
     run = start(settings, known)
     with known.listening([listener] if listener else []):
         execute(run, settings, known)
-
-
-def final_tensors(folder: Path) -> dict[str, torch.Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 def test_a_tracker_hears_every_event_after_the_files_have_it(tmp_path: Path) -> None:

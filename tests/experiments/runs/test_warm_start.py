@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
-from tiny import tiny_run
-from torch import Tensor
+from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
 from gsx.experiments.runs.execute import execute
@@ -31,10 +29,6 @@ def augmented(*names: str) -> tuple[str, ...]:
         f"augmenter=[{','.join(files.get(name, name) for name in names)}]",
         *(word for words in few for word in words),
     )
-
-
-def final_tensors(folder: Path) -> dict[str, Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
 def assert_same(a: Path, b: Path) -> None:

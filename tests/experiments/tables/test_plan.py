@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny import leave_results
 
 from gsx.builtin import plugins
 from gsx.experiments.run_folder.files import read_run
@@ -49,9 +50,8 @@ def words_of(plan: Any) -> list[list[tuple[str, str]]]:
 
 def finish(cell: Cell) -> None:
     """A run folder as a finished run leaves it."""
-    (cell.folder / "renders").mkdir(parents=True)
-    for name in ("environment.json", "metrics.jsonl", "renders/index.json", "point_cloud.ply"):
-        (cell.folder / name).write_text("{}" if name.endswith(".json") else "")
+    cell.folder.mkdir(parents=True)
+    leave_results(cell.folder)
     write_config(cell.folder / "config.yaml", cell.config)
     steps = cell.config["iterations"]
     (cell.folder / "evaluation.json").write_text(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from tiny import final_tensors
 
 from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
@@ -40,10 +40,6 @@ def run_of(folder: Path, variant: str) -> Path:
     """The run folder of a variant."""
     configs = folder.glob("outputs/demo/*/*/config.yaml")
     return next(path.parent for path in configs if f"variant: {variant}\n" in path.read_text())
-
-
-def last_state(run: Path) -> dict[str, torch.Tensor]:
-    return load_file(sorted((run / "checkpoints").glob("*.safetensors"))[-1])
 
 
 def test_a_table_shares_beginnings_survives_a_failure_and_redoes_nothing(
@@ -86,7 +82,7 @@ def test_a_table_shares_beginnings_survives_a_failure_and_redoes_nothing(
         for variant in ("3d_gs_up", "3d_gs_ub"):
             words = [word for word in TABLE if "experiment" not in word]
             assert main([f"variant={variant}", *words, "reuse=true"]) == 0
-            branch, scratch = (last_state(run_of(place, variant)) for place in (tmp_path, tmp_path / "scratch"))
+            branch, scratch = (final_tensors(run_of(place, variant)) for place in (tmp_path, tmp_path / "scratch"))
             assert branch.keys() == scratch.keys()
             assert all(torch.equal(branch[name], scratch[name]) for name in branch)
 
@@ -133,7 +129,7 @@ def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
     words = ["reuse=true", "backbone=gs3d", "iterations=6", *SMALL, "training.checkpoint_every=2"]
     assert main(words) == 0
     (run,) = tmp_path.glob("outputs/demo/gs3d/*/")
-    state, stamp = last_state(run), (run / "checkpoints" / "step_0000006.safetensors").stat().st_mtime_ns
+    state, stamp = final_tensors(run), (run / "checkpoints" / "step_0000006.safetensors").stat().st_mtime_ns
     capsys.readouterr()
     assert main(words) == 0
     assert "finished earlier" in capsys.readouterr().err
@@ -144,13 +140,13 @@ def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
     (run / "evaluation.json").unlink()
     assert main(words) == 0
     assert "going on with" in capsys.readouterr().err
-    assert all(torch.equal(value, state[name]) for name, value in last_state(run).items())
+    assert all(torch.equal(value, state[name]) for name, value in final_tensors(run).items())
     for path in (run / "checkpoints").glob("step_*.safetensors"):
         path.write_bytes(b"damaged")
     (run / "evaluation.json").unlink()
     assert main(words) == 0
     assert "training anew" in capsys.readouterr().err
-    assert all(torch.equal(value, state[name]) for name, value in last_state(run).items())
+    assert all(torch.equal(value, state[name]) for name, value in final_tensors(run).items())
     assert list(run.parent.glob(".*_set_aside_1/config.yaml"))
     assert stamp
     assert main([*words, f"folder={tmp_path / 'x'}"]) == 2

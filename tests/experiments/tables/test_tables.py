@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tiny import leave_results
 
 from gsx.core.cache import source_revision
 from gsx.experiments.tables.plan import Cell, Experiment
@@ -32,9 +33,7 @@ def cell(row: str, scene: str, seed: int, folder: Path) -> Cell:
 
 def write_run(place: Path, psnr: float | None) -> None:
     """A finished run, or one that failed."""
-    (place / "renders").mkdir(parents=True)
-    for name in ("environment.json", "metrics.jsonl", "renders/index.json", "point_cloud.ply"):
-        (place / name).write_text("{}" if name.endswith(".json") else "")
+    place.mkdir(parents=True)
     (place / "config.yaml").write_text("iterations: 10\nscene: {name: colmap}\n")
     if psnr is None:
         (place / "status.json").write_text(json.dumps({"state": "failed", "reason": "out of memory", "step": 4}))
@@ -45,6 +44,7 @@ def write_run(place: Path, psnr: float | None) -> None:
     zoom = {"1": {"psnr": psnr}, "2": {"psnr": psnr - 1, "detail": {"render": {"explained": psnr / 100}}}}
     evaluation = figures | {"train_seconds": 12.0, "groups": groups, "zoom": zoom}
     (place / "evaluation.json").write_text(json.dumps(evaluation))
+    leave_results(place)
 
 
 @pytest.fixture

@@ -82,19 +82,18 @@ def remove_lost(run: Run, step: Step) -> str:
 def backward(run: Run) -> Step:
     """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
     number = run.step + 1
-    with taken_or_not(run):
-        batch = run.sampler.take()
-        picked = run.ranks.share(batch)
-        asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
-        colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
-        steps = []
-        for view, terms, colour in zip(picked, asked, colours, strict=True):
-            with gradients_added(run.backbone.table):
-                given = [term for term in terms if term is not None]
-                steps.append(view_loss(run, number, run.scene.train[view], given, colour))
-        told = {tally.name: tally.account_at(number) for tally in run.tallies}
-        steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
-        return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
+    batch = run.sampler.take()
+    picked = run.ranks.share(batch)
+    asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
+    colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
+    steps = []
+    for view, terms, colour in zip(picked, asked, colours, strict=True):
+        with gradients_added(run.backbone.table):
+            given = [term for term in terms if term is not None]
+            steps.append(view_loss(run, number, run.scene.train[view], given, colour))
+    told = {tally.name: tally.account_at(number) for tally in run.tallies}
+    steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
+    return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
 
 
 def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:

@@ -1,6 +1,5 @@
 """What a run is trained on and with: environment.json, and the first lines of the log."""
 
-import hashlib
 import logging
 import os
 import platform
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsx import __version__
 from gsx.core.cache import content_key, source_revision
@@ -19,7 +19,7 @@ from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.run import Run
-from gsx.experiments.run_folder.run_key import scene_stamp, sorted_items, trained
+from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
-        "options": options_digest(run.config, run.idle),
+        "options": composition_key(run.config, "", run.idle),
         "plan": plan_of(run),
         "training_focal": max(view.camera.focal for view in run.scene.train),
         "scene": {
@@ -59,22 +59,18 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
     }
 
 
-def options_digest(config: dict[str, Any], idle: frozenset[str]) -> str:
-    """Of all options that decide what is trained."""
-    return content_key(sorted_items(trained(config, idle)))
-
-
 def camera_digest(views: Sequence[View]) -> str:
     """Of names, sizes, intrinsics and poses of views, in order."""
-    content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
     cameras = [view.camera for view in views]
-    numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
-    numbers += [torch.stack([c.rotation.double().flatten() for c in cameras])]
-    numbers += [torch.stack([c.translation.double() for c in cameras])]
-    for values in numbers:
-        largest = values.abs().max().clamp_min(1e-300)
-        content.update((values / largest * 10**POSE_DIGITS).round().add(0.0).numpy().tobytes())  # -0 becomes 0
-    return content.hexdigest()[:16]
+    intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
+    poses = (torch.stack([getattr(c, name).double() for c in cameras]) for name in ("rotation", "translation"))
+    return content_key([(view.name, view.camera.size) for view in views], *map(in_digits, (intrinsics, *poses)))
+
+
+def in_digits(values: Tensor) -> list[Any]:
+    """Values in units of the last digit that counts."""
+    largest = values.abs().max().clamp_min(1e-300)
+    return (values / largest * 10**POSE_DIGITS).round().add(0.0).tolist()  # -0 becomes 0
 
 
 def installed_version(package: str) -> str:

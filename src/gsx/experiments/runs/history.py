@@ -14,8 +14,8 @@ from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import part, read_run
-from gsx.experiments.run_folder.run_key import trained
-from gsx.experiments.runs.environment import environment, options_digest
+from gsx.experiments.run_folder.run_key import composition_key, trained
+from gsx.experiments.runs.environment import environment
 
 logger = logging.getLogger(__name__)
 
@@ -52,12 +52,9 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
     if not files.environment:
         return
     before, now = circumstances(files.environment), circumstances(environment(run, plugins))
-    differing = {key: (before[key], now[key]) for key in now if key in before and before[key] != now[key]}
-    if any(key.startswith("plugins.") for key in before):
-        installed = changes(plugins_of(before), plugins_of(now))
-        differing |= {key: pair for key, pair in installed.items() if None in pair}
+    differing = {key: pair for key, pair in changes(before, now).items() if can_be_compared(key, before, now)}
     known = known_options(files.environment)
-    edited = known and options_digest(files.config, run.idle) not in known
+    edited = known and composition_key(files.config, "", run.idle) not in known
     if not changed:
         others = ["options"] if edited and "source" not in differing else []  # another source may read it otherwise
         refuse_another(run, [*(key for key in differing if key != "options"), *others])
@@ -68,9 +65,11 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
     record(run, files.environment, differing | asked)
 
 
-def plugins_of(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Versions of plugins among comparable entries."""
-    return {key: value for key, value in entries.items() if key.startswith("plugins.")}
+def can_be_compared(key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether an entry is known of both times; plugins come and go, where they are known at all."""
+    if key.startswith("plugins."):
+        return any(other.startswith("plugins.") for other in before)
+    return key in before and key in now
 
 
 def known_options(facts: Mapping[str, Any]) -> set[str]:
@@ -80,7 +79,7 @@ def known_options(facts: Mapping[str, Any]) -> set[str]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """(before, now) of options that have another value, by dotted key; None where there is no such option."""
+    """(before, now) of what has another value, by dotted key; None where there is no such entry."""
     then, later = flattened(before), flattened(now)
     keys = dict.fromkeys([*then, *later])
     return {key: (then.get(key), later.get(key)) for key in keys if then.get(key) != later.get(key)}
