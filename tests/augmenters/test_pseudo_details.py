@@ -676,15 +676,15 @@ def test_files_hold_everything(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("word", "complaint"), [
     ("augmenter.upscale.window=middle", "choose from center, random, grid, error"),
-    ("augmenter.upscale.scales=[0]", "give factors of 1 or more"),
+    ("augmenter.upscale.scales=[]", "give factors of 1 or more"),
     ("augmenter.upscale.narrow=0", "give a fraction above 0"),
     ("augmenter.upscale.weights=[0.1]", "give two values"),
     ("augmenter.upscale.weights=[0.1,2]", "from 0 to 1"),
     ("augmenter.upscale.base=false augmenter.upscale.variants=0", "no pseudo view"),
     ("augmenter.upscale.timing.span=2001", "windows would overlap"),
     ("augmenter.upscale.narow=0.5", "Did you mean"),
-    ("augmenter.upscale.samples=0", "samples at least 1"),
-    ("augmenter.upscale.least_alpha=2", "give a coverage from 0 to 1"),
+    ("augmenter.upscale.samples=0", "give a number from 1"),
+    ("augmenter.upscale.least_alpha=2", "give a number from 0 to 1"),
 ])  # fmt: skip
 def test_options_are_checked(word: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):

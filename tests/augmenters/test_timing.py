@@ -88,7 +88,7 @@ def test_the_30k_runs_of_objects_have_their_windows_at_the_same_fractions() -> N
     assert span_of(UP, schedule(30000)) == 750
 
 
-@pytest.mark.parametrize("change", [{"span": 2001}, {"start": 39000}, {"every": 0}, {"start": -1}])
+@pytest.mark.parametrize("change", [{"span": 2001}, {"start": 39000}, {"every": 0}])
 def test_timing_is_checked(change: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="timing"):
         replace(UP, **change)

@@ -477,7 +477,7 @@ def test_a_view_as_a_standard_file_draws_the_same_picture(mode: str) -> None:
     (("levels=null",), "without levels: backbone=gs3d"),
     (("clone_split=null",), "clone_split is null"),
     (("clone_split.level_density.shrink=0",), "give 0 < shrink <= 1"),
-    (("clone_split.level_density.bias_step=-1",), "must be at least 0"),
+    (("clone_split.level_density.bias_step=-1",), "give a number from 0"),
     (("clone_split.density.absolute=true",), "does not know"),
     (("levels.coarse_until=40000",), "would never train"),
 ])  # fmt: skip

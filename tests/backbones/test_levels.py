@@ -521,16 +521,10 @@ def test_facts_count_primitives_of_every_level():
     [
         ("mode", "nearest"),
         ("extend_rule", "none"),
-        ("fork", 1),
         ("count", 0),
-        ("first", -2),
-        ("base_layer", -2),
-        ("voxel", 0.0),
         ("distance_quantile", 0.5),
-        ("extend", 0.9),
         ("visible_threshold", 1.0),
         ("visible_threshold", -0.5),
-        ("coarse_factor", 0.5),
     ],
 )
 def test_options_are_checked(name, value):

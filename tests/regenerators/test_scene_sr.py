@@ -125,7 +125,7 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
     photos = [view.image() for view in context_for(tmp_path).views]
     kept_at(options(steps=5), photos, BOX, 0, CPU).write_bytes(b"no network")
     assert "loss" in again.prepare(context_for(tmp_path))
-    assert "learnt again" in caplog.text
+    assert "made again" in caplog.text
     given = request(stripes(3, 12).float() / 255)
     assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
 
@@ -158,7 +158,6 @@ def test_only_powers_of_two(learnt: SceneSR) -> None:
         learnt.check([], [2, 3], True)
 
 
-@pytest.mark.parametrize("change", [{"steps": 0}, {"crop": 4}, {"rate": 0}, {"seconds": -1}])
-def test_options_are_checked(change: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"regenerator\.upscale"):
-        options(**change)
+def test_options_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"regenerator\.upscale\.rate is 0, by which nothing is learnt"):
+        options(rate=0)

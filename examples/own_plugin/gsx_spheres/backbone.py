@@ -1,6 +1,7 @@
 """The backbone `spheres`: a mean, a radius, an opacity and a colour each, as many as there are points."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch.nn import Parameter
@@ -9,6 +10,7 @@ from torch.nn.functional import logsigmoid
 from gsx.core.gaussians.neighbours import mean_square_distance
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.ranges import Interval, Range, Rate
 from gsx.core.training.backbone import BackboneContext, DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 
@@ -16,12 +18,12 @@ from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 @dataclass(frozen=True, kw_only=True)
 class SpheresOptions:
     name: str
-    published_iterations: int
-    opacity: float
-    means: float
-    log_radii: float
-    opacity_logits: float
-    colours: float
+    published_iterations: Interval
+    opacity: Annotated[float, Range(0.01, 0.99)]
+    means: Rate
+    log_radii: Rate
+    opacity_logits: Rate
+    colours: Rate
 
 
 class Spheres:

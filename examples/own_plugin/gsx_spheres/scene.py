@@ -13,6 +13,7 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.options import without_effect
+from gsx.core.ranges import Interval, Points
 
 FILE = "snapshots.json"
 FORMAT = SceneFormat(meaning=f"snapshots ({FILE})", sign=FILE, recognise=lambda path: (path / FILE).is_file())
@@ -22,8 +23,8 @@ FORMAT = SceneFormat(meaning=f"snapshots ({FILE})", sign=FILE, recognise=lambda 
 class SnapshotOptions:
     name: str
     path: str = without_effect()  # a run is named by what lies there
-    every: int
-    points: int
+    every: Interval
+    points: Points
 
 
 def load(options: SnapshotOptions) -> Scene:

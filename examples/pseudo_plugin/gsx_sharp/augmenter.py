@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsx.core.data.resize import to_uint8
+from gsx.core.ranges import Share, Weight
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Request
@@ -14,9 +15,9 @@ from gsx.core.training.run import Run
 @dataclass(frozen=True, kw_only=True)
 class SteadyOptions:
     name: str
-    start: float
+    start: Share
     """Fraction of the run after which it begins."""
-    weight: float
+    weight: Weight
 
 
 class SteadyZoom:

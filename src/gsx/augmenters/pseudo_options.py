@@ -1,10 +1,12 @@
 """Options of pseudo details, checked."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from gsx.augmenters.cameras import KEPT, NOISES, WINDOWS
 from gsx.augmenters.pixel_weights import WeightMap, sampled_better, splatsure
 from gsx.augmenters.timing import SPLITS, Timing, events_of
+from gsx.core.ranges import Range, Seed, Share, Steps, Weight
 from gsx.core.training.checked_regenerator import Checks
 from gsx.core.training.schedule import Schedule
 
@@ -42,25 +44,25 @@ class PseudoOptions:
     role: str
     """Regenerator: upscale or restore."""
     timing: Timing
-    scales: list[int]
+    scales: Annotated[list[int], Range(1, 64)]
     """Zoom factors a; [1]: none."""
     base: bool
     """Whether the training camera itself is zoomed in."""
     base_source: str
     """photo: its window of the photograph is redrawn; render: what the model shows there."""
-    variants: int
+    variants: Annotated[int, Range(0, 1000)]
     """Cameras moved at random per training camera and scale."""
-    first_cameras: int
+    first_cameras: Steps
     """Training cameras, in order, that pseudo views are made from; 0: all."""
-    narrow: float
+    narrow: Share
     """Width of the window in training as a fraction of the raster; 1: uncropped."""
     window: str
     """center, random, grid (one after the other over the events), or error (where the model is worst)."""
     zoom: str
     """intrinsics: the result is seen at a times the focal length; none: rendered at 1/a of the density and compared at
     the training density, the other reading of the paper."""
-    rotation_noise: float
-    translation_noise: float
+    rotation_noise: Annotated[float, Range(0, 10)]
+    translation_noise: Annotated[float, Range(0, 1e6)]
     translation_unit: str
     """world, or extent: of the scene."""
     noise: str
@@ -72,16 +74,16 @@ class PseudoOptions:
     mode: str
     """hybrid: the term takes its share of the backbone's loss; direct: it is added; auto: hybrid with shared
     parameters, such as colour networks, direct without (the paper, Further Details)."""
-    weights: list[float]
+    weights: Annotated[list[float], Range(0, 1)]
     """lambda: first and last."""
     weight_split: str
     """window: the first weight holds for half of each window; run: for half of the run; linear: in between."""
-    direct_weight: float
+    direct_weight: Weight
     """In direct mode, in place of lambda."""
     loss: str
     """l1: mean |difference|, as in the paper; l2: mean square. Squares weigh the gaps that open between small splats;
     |difference| weighs a softer enlargement everywhere as much."""
-    gain: float
+    gain: Weight
     """Of the pseudo loss, before it is weighted."""
     per_pixel: bool
     """Ours: weigh a pixel of a window like one of a whole picture, so that small windows do not outweigh the photos."""
@@ -92,18 +94,18 @@ class PseudoOptions:
     freeze_shared: str
     """none; half, active: pseudo views do not move shared parameters, in the first half of a window or all of it
     (de-MLP)."""
-    strength: list[float]
+    strength: Annotated[list[float], Range(0, 1)]
     """How much may change: at the first event and at the last."""
     prompt: str
     """For regenerators that read; {scene} is the name of the scene."""
     seeds: str
     """fixed: `seed` for every picture; per_view: another for each."""
-    seed: int
-    samples: int
+    seed: Seed
+    samples: Annotated[int, Range(1, 1000)]
     """Results averaged for each picture."""
-    context: int
+    context: Annotated[int, Range(0, 1000)]
     """Pixels around the window that the regenerator also sees."""
-    least_alpha: float
+    least_alpha: Share
     """Windows at random places, or of cameras moved at random, are drawn again, ten times at most, while the model's
     mean alpha in them is lower: objects fill little of their pictures (the paper). 0: the first is taken."""
     project: str
@@ -112,16 +114,16 @@ class PseudoOptions:
     weight_map: str
     """none; splatsure: surfaces count that no other photograph shows more finely; finer, ours: those
     that no photograph shows as finely as the pseudo view does."""
-    gate: float
+    gate: Annotated[float, Range(0, 1e6)]
     """Blocks do not count that reduce to what is further than this from the known photograph, in 8-bit levels; 0: all
     count."""
-    coarse_weight: float
+    coarse_weight: Weight
     """Of the mean difference between the reduced render and the known photograph, beside that of the pixels."""
     progressive: bool
     """The scales one after the other over the events, instead of all at once."""
     checks: Checks
     """Of redrawn pictures against what they were made from; those of the regenerator's role unless said otherwise."""
-    coarser: list[int] = field(default_factory=list)
+    coarser: Annotated[list[int], Range(2, 64)] = field(default_factory=list)
     """Training cameras also count at these fractions of their size: photographs as the scene reduces them, renders by
     box averages (Mipmap-GS)."""
 
@@ -132,21 +134,13 @@ class PseudoOptions:
                 raise ValueError(f"{where}.{key} is '{getattr(self, key)}'; choose from {', '.join(allowed)}")
         if self.translation_unit not in ("world", "extent"):
             raise ValueError(f"{where}.translation_unit is '{self.translation_unit}'; choose world or extent")
-        if not self.scales or min(self.scales) < 1:
-            raise ValueError(f"{where}.scales is {list(self.scales)}; give factors of 1 or more")
-        if any(factor < 2 for factor in self.coarser):
-            raise ValueError(f"{where}.coarser is {list(self.coarser)}; give factors of 2 or more")
-        if not 0 < self.narrow <= 1:
+        if not self.scales:
+            raise ValueError(f"{where}.scales is empty; give factors of 1 or more")
+        if not self.narrow > 0:
             raise ValueError(f"{where}.narrow is {self.narrow}; give a fraction above 0, at most 1")
         for key in ("weights", "strength"):
-            if len(getattr(self, key)) != 2 or not all(0 <= value <= 1 for value in getattr(self, key)):
+            if len(getattr(self, key)) != 2:
                 raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
-        if self.variants < 0 or self.first_cameras < 0 or self.samples < 1 or self.context < 0:
-            raise ValueError(f"{where}: variants, first_cameras and context must be at least 0, samples at least 1")
-        if not 0 <= self.least_alpha <= 1:
-            raise ValueError(f"{where}.least_alpha is {self.least_alpha}; give a coverage from 0 to 1")
-        if min(self.gate, self.coarse_weight, self.gain, self.direct_weight) < 0:
-            raise ValueError(f"{where}: gate, coarse_weight, gain and direct_weight must be at least 0")
         if not self.base and self.variants == 0:
             raise ValueError(f"{where}.base is false and variants is 0: there would be no pseudo view")
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsx.core.ranges import Interval, Steps
 from gsx.core.training.schedule import Schedule
 
 SPLITS = ("window", "run", "linear")
@@ -12,20 +13,18 @@ SPLITS = ("window", "run", "linear")
 class Timing:
     """Events of a published run and the windows after them, in steps of that run."""
 
-    published_iterations: int
-    start: int
+    published_iterations: Interval
+    start: Steps
     """Step at whose end pseudo views are first made."""
-    stop: int
-    every: int
-    span: int
+    stop: Steps
+    every: Interval
+    span: Interval
     """Steps after an event in which its pseudo views count."""
     stop_inclusive: bool
 
     def __post_init__(self) -> None:
-        if self.published_iterations < 1 or self.every < 1 or self.span < 1:
-            raise ValueError("timing: published_iterations, every and span must be at least 1")
-        if not 0 <= self.start <= self.stop:
-            raise ValueError(f"timing: start is {self.start} and stop {self.stop}; give 0 <= start <= stop")
+        if self.start > self.stop:
+            raise ValueError(f"timing: start is {self.start} and stop {self.stop}; give start <= stop")
         if self.span > self.every:
             raise ValueError(f"timing: span is {self.span}, longer than every, {self.every}: windows would overlap")
 

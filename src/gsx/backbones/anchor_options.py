@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from gsx.backbones.growth_options import GrowthOptions, Quirks, resolved
 from gsx.backbones.heads import HeadOptions
 from gsx.backbones.level_options import LevelOptions, checked_end
 from gsx.backbones.mip import MipOptions, checked_filter
+from gsx.core.ranges import Count, Interval, Range, Rate, Steps, Weight
 from gsx.core.training.schedule import log_linear
 
 
@@ -16,8 +17,8 @@ from gsx.core.training.schedule import log_linear
 class Decay:
     """A learning rate, log-linear over the published run."""
 
-    first: float
-    last: float
+    first: Rate
+    last: Rate
 
     def __post_init__(self) -> None:
         if not ((self.first > 0 and self.last > 0) or self.first == self.last == 0):
@@ -67,21 +68,21 @@ class AnchorOptions:
     """What all anchor backbones share; values in conf/backbone, with their sources."""
 
     name: str
-    published_iterations: int
+    published_iterations: Interval
     fidelity: str
     """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
     filter: str
-    max_primitives: int
+    max_primitives: Count
     """No anchor is added beyond this number; 0: none is withheld."""
-    volume_weight: float
+    volume_weight: Weight
     """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
-    voxel: float
+    voxel: Annotated[float, Range(0, 1e6)]
     """Edge of the initial grid's cells without levels, world units; 0: from the points (Scaffold-GS)."""
     growth: GrowthOptions
     quirks: Quirks
     mip: MipOptions
     levels: LevelOptions | None
-    decay_until: int = 0
+    decay_until: Steps = 0
     """Published step at which learning rates have come down; 0: at the end of the run."""
     reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
@@ -90,10 +91,6 @@ class AnchorOptions:
         checked_filter(self.filter)
         checked_end(self.levels, self.published_iterations)
         self.switches()
-        if self.max_primitives < 0:
-            raise ValueError(f"backbone.max_primitives is {self.max_primitives}; give a number, or 0 for no cap")
-        if self.voxel < 0:
-            raise ValueError(f"backbone.voxel is {self.voxel}; give a length, or 0 to take it from the points")
 
     def switches(self) -> Quirks:
         """All quirks decided, by themselves or by the fidelity.
@@ -108,16 +105,11 @@ class AnchorOptions:
 class NeuralOptions(AnchorOptions):
     """Anchors decoded by networks."""
 
-    offsets: int
+    offsets: Annotated[int, Range(1, 100)]
     """k: Gaussians per anchor."""
     heads: HeadOptions
     rates: NeuralRates
     head_rates: HeadRates
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.offsets < 1:
-            raise ValueError(f"backbone.offsets is {self.offsets}; give at least 1 Gaussian per anchor")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +117,8 @@ class ExplicitOptions(AnchorOptions):
     """Anchors of one explicit Gaussian each."""
 
     rates: ExplicitRates
-    sh_degree: int
-    sh_every: int
+    sh_degree: Annotated[int, Range(0, 3)]
+    sh_every: Interval
     """Published steps between SH degrees."""
-    initial_opacity: float
+    initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     reference: ClassVar[Mapping[str, str]] = MappingProxyType({"bias": "level"})

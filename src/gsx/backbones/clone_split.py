@@ -7,7 +7,7 @@ and stay as they are. Without pointers between levels, a Gaussian's level is all
 import logging
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from gsx.backbones.sampling import sampled_means
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.quality.losses import volume_loss
+from gsx.core.ranges import Range, Share, Weight
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import DrawnSplats
@@ -34,24 +35,20 @@ logger = logging.getLogger(__name__)
 class LevelDensityOptions:
     """Numbers of density control across levels; values in conf/backbone, with their sources."""
 
-    update_ratio: float
+    update_ratio: Annotated[float, Range(0, 100)]
     """The gradient threshold grows by fork ** this per level."""
-    bias_gradient: float
+    bias_gradient: Annotated[float, Range(0, 100)]
     """Gaussians with this multiple of the threshold are drawn from a little farther."""
-    bias_step: float
+    bias_step: Annotated[float, Range(0, 100)]
     """By how much, in levels."""
-    shrink: float
+    shrink: Share
     """A child's scale is its parent's times this."""
-    volume_weight: float
+    volume_weight: Weight
     """Of the mean volume of the Gaussians drawn, in the loss."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.shrink <= 1:
+        if not self.shrink > 0:
             raise ValueError(f"backbone.clone_split.level_density.shrink is {self.shrink}; give 0 < shrink <= 1")
-        if min(self.bias_gradient, self.bias_step, self.volume_weight) < 0:
-            raise ValueError(
-                "backbone.clone_split.level_density: bias_gradient, bias_step and volume_weight must be at least 0"
-            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

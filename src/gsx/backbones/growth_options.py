@@ -3,45 +3,46 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Annotated
+
+from gsx.core.ranges import Gradient, Interval, Range, Share, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthOptions:
     """Numbers of growing and pruning, in steps of the published run; values in conf/backbone, with their sources."""
 
-    observe_from: int
-    start: int
-    stop: int
-    every: int
-    success: float
+    observe_from: Steps
+    start: Steps
+    stop: Steps
+    every: Interval
+    success: Share
     """Fraction of an interval's steps in which an anchor must have been visited before it is judged; offsets: half.
     Of a step's views each counts by its weight in the loss."""
-    gradient: float
+    gradient: Gradient
     """Mean NDC gradient above which an offset grows an anchor."""
-    prune_opacity: float
+    prune_opacity: Share
     """Anchors whose opacities sum to less than this per visit are removed."""
-    largest_log_scale: float
+    largest_log_scale: Annotated[float, Range(-100, 100)]
     """While growing, log-scales of the Gaussians are held below this; see `Quirks.clamp`."""
-    depths: int
+    depths: Annotated[int, Range(1, 20)]
     """Without levels: sizes of cells tried in turn."""
-    hierarchy: int
+    hierarchy: Annotated[int, Range(2, 64)]
     """Without levels: each size is this much smaller, its threshold half as many times larger."""
-    coarsest: int
+    coarsest: Annotated[int, Range(1, 10**6)]
     """Without levels: voxels along the largest cell."""
-    update_ratio: float
+    update_ratio: Annotated[float, Range(0, 100)]
     """With levels: the threshold grows by fork ** this per level."""
-    bias_gradient: float
+    bias_gradient: Annotated[float, Range(0, 100)]
     """With levels: anchors with this fraction of the threshold are drawn from a little farther."""
-    bias_step: float
+    bias_step: Annotated[float, Range(0, 100)]
     """With levels: by how much, in levels."""
     overlap: bool
     """With levels: cells that hold an anchor may get another."""
 
     def __post_init__(self) -> None:
-        if self.every < 1 or not 0 < self.success <= 1:
-            raise ValueError("backbone.growth.every must be at least 1 and success above 0, at most 1")
-        if self.hierarchy < 2:
-            raise ValueError(f"backbone.growth.hierarchy is {self.hierarchy}; give at least 2: cells get smaller by it")
+        if not self.success > 0:
+            raise ValueError(f"backbone.growth.success is {self.success}; give a share above 0")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
 from gsx.core.errors import InputError
+from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 
 LEAST_DISTANCE = 1e-8
@@ -17,7 +19,7 @@ LEAST_DISTANCE = 1e-8
 class HeadOptions:
     """Shape of the networks; values in conf/backbone, with their sources."""
 
-    features: int
+    features: Annotated[int, Range(4, 1024)]
     """C: width of an anchor's feature and of the one hidden layer of every head."""
     bank: bool
     """Mix the feature with coarser copies of itself by view (Scaffold-GS, gaussian_model.py)."""
@@ -29,18 +31,14 @@ class HeadOptions:
     """Feed the distance between camera and anchor to a head."""
     level: bool
     """Feed an anchor's level to every head and to the bank (Octree-GS: add_level)."""
-    appearance: int
+    appearance: Annotated[int, Range(0, 1024)]
     """Length of a training view's code, seen by the colour head; 0: none."""
-    appearance_code: int
+    appearance_code: Annotated[int, Range(-1, 10**6)]
     """Code of any other camera: a training view's number; -1: the mean of all codes."""
 
     def __post_init__(self) -> None:
-        if self.features < 4 or self.features % 4:
+        if self.features % 4:
             raise ValueError(f"backbone.heads.features is {self.features}; give a multiple of 4")
-        if self.appearance < 0:
-            raise ValueError(f"backbone.heads.appearance is {self.appearance}; give a length, or 0 for none")
-        if self.appearance_code < -1:
-            raise ValueError(f"backbone.heads.appearance_code is {self.appearance_code}; give a view's number or -1")
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:

@@ -1,6 +1,9 @@
 """Options of levels of detail."""
 
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+from gsx.core.ranges import Length, Range, Share, Steps
 
 MODES = ("round", "floor", "ceil", "progressive")
 EXTEND_RULES = ("reference", "sane")
@@ -11,23 +14,23 @@ ZOOM_RULES = ("finer", "training")
 class LevelOptions:
     """Options of the levels; values in conf/backbone, with their sources."""
 
-    fork: int
-    count: int
+    fork: Annotated[int, Range(2, 64)]
+    count: Annotated[int, Range(-1, 32)]
     """Number of levels; -1: from the range of distances in the scene (Octree-GS, set_level)."""
-    first: int
+    first: Annotated[int, Range(-1, 32)]
     """Highest level at the start; -1: half of them (Octree-GS, set_level)."""
-    base_layer: int
+    base_layer: Annotated[int, Range(-1, 64)]
     """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel`."""
-    voxel: float
+    voxel: Length
     """Cell of the middle level where base_layer is -1, scene units."""
-    distance_quantile: float
+    distance_quantile: Share
     """Distances between this quantile and its mirror count, per camera and over cameras (Octree-GS, set_level)."""
-    extend: float
+    extend: Annotated[float, Range(1, 1000)]
     """The box is the points' range of coordinates times this (Octree-GS, octree_sample)."""
     extend_rule: str
     """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
     box grows on both sides wherever it lies, to the same length (Octree-GS); '': as backbone.fidelity says."""
-    visible_threshold: float
+    visible_threshold: Annotated[float, Range(-1, 1)]
     """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
     fraction (Octree-GS, weed_out)."""
     mode: str
@@ -38,9 +41,9 @@ class LevelOptions:
     zoom: str
     """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
     reference does, trained there or not; training: none that the finest training camera would not draw."""
-    coarse_until: int
+    coarse_until: Steps
     """Published step at which all levels take part in training (Octree-GS, set_coarse_interval); 0: from the start."""
-    coarse_factor: float
+    coarse_factor: Annotated[float, Range(1, 1000)]
     """Each interval between two levels is this much shorter than the one before (Octree-GS, set_coarse_interval)."""
 
     def __post_init__(self) -> None:
@@ -48,15 +51,9 @@ class LevelOptions:
         self.demand("mode", self.mode in MODES, f"choose {', '.join(MODES)}")
         self.demand("extend_rule", self.extend_rule in ("", *EXTEND_RULES), f"choose {rules}")
         self.demand("zoom", self.zoom in ZOOM_RULES, f"choose {', '.join(ZOOM_RULES)}")
-        self.demand("fork", self.fork >= 2, "give at least 2")
-        self.demand("count", self.count == -1 or self.count >= 1, "give at least 1, or -1 to take it from the scene")
-        self.demand("first", self.first >= -1, "give a level from 0, or -1 for half of them")
-        self.demand("base_layer", self.base_layer >= -1, "give at least 0, or -1 to take it from voxel")
-        self.demand("voxel", self.voxel > 0, "give a length above 0")
-        self.demand("distance_quantile", 0.5 < self.distance_quantile <= 1, "give a value above 0.5, at most 1")
-        self.demand("extend", self.extend >= 1, "give at least 1")
+        self.demand("count", self.count != 0, "give at least 1, or -1 to take it from the scene")
+        self.demand("distance_quantile", self.distance_quantile > 0.5, "give a value above 0.5, at most 1")
         self.demand("visible_threshold", threshold == -1 or 0 <= threshold < 1, "give -1, or from 0 to below 1")
-        self.demand("coarse_factor", self.coarse_factor >= 1, "give at least 1")
 
     def demand(self, name: str, met: bool, advice: str) -> None:
         """Refuse a value that does not meet a condition."""

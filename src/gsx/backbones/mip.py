@@ -6,7 +6,7 @@ The 3D filter widens each Gaussian by what the finest training camera can resolv
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.ranges import Interval, Range, Steps
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext
@@ -32,17 +33,17 @@ LEAST_SHARE = 1e-30
 class MipOptions:
     """Numbers of the filters; values in conf/backbone, with their sources."""
 
-    variance: float
+    variance: Annotated[float, Range(1e-6, 1000)]
     """Of the 3D filter, px^2 at the finest camera."""
-    kernel: float
+    kernel: Annotated[float, Range(1e-6, 1000)]
     """Variance of the 2D filter, px^2 at every render resolution."""
-    margin: float
+    margin: Annotated[float, Range(0, 100)]
     """Fraction of the raster beside it in which a camera still counts as seeing a point."""
-    near: float
+    near: Annotated[float, Range(0, 1e6)]
     """Points nearer than this count as not seen, scene units."""
-    every: int
+    every: Interval
     """Published steps between updates of the 3D filter after density control, every event of which updates it too."""
-    stop: int
+    stop: Steps
     """Published step from which the 3D filter is frozen."""
     rate: str = "release"
     """What the finest camera is of those that see a primitive. `release`: one of the largest focal length of all, at

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import replace_file
+from gsx.core.ranges import Interval, Range, Rate
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
@@ -35,28 +37,24 @@ class RestorerOptions:
     """Options; values in conf/regenerator/restore/scene_restorer.yaml."""
 
     name: str
-    channels: int
-    steps: int
+    channels: Annotated[int, Range(1, 1024)]
+    steps: Interval
     """At the first event of a run."""
-    later_steps: int
+    later_steps: Interval
     """At each later one at which it learns; it goes on from there."""
-    again: float
+    again: Annotated[float, Range(1, 1000)]
     """It learns again at the first event by which the run has become so many times as long as at the last time."""
-    halves: float = 0.35
+    halves: Annotated[float, Range(0, 100)] = 0.35
     """The models that render what it learns from are trained for this share of the steps that the run has taken. The
     default: runs older than this option."""
-    batch: int
-    crop: int
+    batch: Annotated[int, Range(1, 4096)]
+    crop: Annotated[int, Range(16, 4096)]
     """Edge of a training crop, px."""
-    rate: float
+    rate: Rate
 
     def __post_init__(self) -> None:
-        if min(self.channels, self.steps, self.later_steps, self.batch) < 1 or self.crop < 16:
-            raise ValueError(
-                "regenerator.restore: channels, steps, later_steps, batch must be at least 1, crop at least 16"
-            )
-        if not self.rate > 0 or not self.again >= 1 or not self.halves > 0:
-            raise ValueError("regenerator.restore: rate and halves must be above 0, again at least 1")
+        if not (self.rate > 0 and self.halves > 0):
+            raise ValueError("regenerator.restore: rate and halves must be above 0")
 
 
 class Residual(nn.Module):

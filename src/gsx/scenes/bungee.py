@@ -23,6 +23,7 @@ from gsx.core.data.images import checked_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_model import model_folders
@@ -49,8 +50,8 @@ class BungeeOptions(colmap.ColmapOptions):
 
     points: str
     """For scenes without COLMAP model. random: in what the cameras see, up to 250 m high | a PLY file."""
-    random_points: int
-    seed: int
+    random_points: Points
+    seed: Seed
     """Of the random points."""
 
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
+from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
 from gsx.scenes.options import SceneOptions
@@ -41,7 +42,7 @@ class ColmapOptions(SceneOptions):
 
     images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
-    max_reprojection_px: float
+    max_reprojection_px: Annotated[float, Range(0, 1e6)]
     """The scene is refused when the median reprojection error exceeds this, in pixels of the model's cameras."""
 
 

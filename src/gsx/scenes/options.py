@@ -1,8 +1,10 @@
 """What every loader of photographs can be told; the values and their sources are in conf/scene/*.yaml."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from gsx.core.options import without_effect
+from gsx.core.ranges import Gigabytes, Range, Share, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -11,16 +13,16 @@ class SceneOptions:
 
     name: str
     """Name of the format, which is also the name of its file in conf/scene."""
-    background: list[float]
+    background: Annotated[list[float], Range(0, 1)]
     """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (3D-GS, dataset_readers.py)."""
-    iterations: int = without_effect(default=0)
+    iterations: Steps = without_effect(default=0)
     """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
     published one."""
     path: str = without_effect(default="")
     """Folder of the scene."""
-    downscale: int = 1
+    downscale: Annotated[int, Range(1, 1024)] = 1
     """Train on images reduced by this factor; the originals stay the truth of zoomed-in views (3D-GS)."""
-    max_width: int = 1600
+    max_width: Annotated[int, Range(0, 1 << 20)] = 1600
     """With downscale=1, wider images are reduced to this many pixels; 0: no limit (3D-GS, camera_utils.py)."""
     resize_filter: str = "bicubic"
     """bicubic (as published) | area | lanczos; all of them prefilter."""
@@ -28,16 +30,12 @@ class SceneOptions:
     """display (as published): filter the stored values; linear: filter light, after undoing the sRGB curve."""
     principal_point: str = "exact"
     """exact | centred; centred ignores the measured principal point, as 3D-GS does (3D-GS, dataset_readers.py)."""
-    unit: float = 1.0
+    unit: Annotated[float, Range(1e-9, 1e9)] = 1.0
     """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
     0.2, least distances, limits of scales) expect scenes of a few units."""
-    cache_gb: float = without_effect(default=2.0)
+    cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
-    missing: float = without_effect(default=0.1)
+    missing: Share = without_effect(default=0.1)
     """Share of the images named by a file of poses that may be absent from the disk; more are refused."""
     split: str = "every:8"
     """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.missing <= 1:
-            raise ValueError(f"scene.missing is {self.missing}; give a share from 0 to 1")

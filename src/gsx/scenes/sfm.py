@@ -14,9 +14,10 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from gsx.core.errors import InputError
+from gsx.core.ranges import Count, Range
 
 logger = logging.getLogger(__name__)
 
@@ -34,23 +35,23 @@ class SfmOptions:
 
     matcher: str
     """auto | exhaustive (every pair) | sequential (neighbours in order of name: video frames, walks)."""
-    exhaustive_limit: int
+    exhaustive_limit: Count
     """`auto` matches every pair of up to this many photos, neighbours of more."""
-    overlap: int
+    overlap: Annotated[int, Range(1, 1000)]
     """`sequential` matches photos at the distances 1, 2, 4, ... 2^(overlap - 1) in the sorted list."""
-    max_feature_size: int
+    max_feature_size: Annotated[int, Range(16, 1 << 16)]
     """Features are found on photos reduced to this many pixels on the longer side; training is not affected."""
-    max_features: int
+    max_features: Annotated[int, Range(1, 10**6)]
     """Features kept of each photo."""
     camera_mode: str
     """auto (photos of one size share a camera) | single (all share one) | per_image."""
     camera_model: str
     """COLMAP's name of the lens model to estimate."""
-    num_threads: int
+    num_threads: Annotated[int, Range(-1, 4096)]
     """For features and matches, which do not depend on it; 0: all cores."""
-    mapping_threads: int
+    mapping_threads: Annotated[int, Range(-1, 4096)]
     """For the reconstruction, which is the same bit for bit only with 1; 0: all cores."""
-    seed: int
+    seed: Annotated[int, Range(0, 2**31 - 1)]
 
 
 def reconstruct(folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> Any:

@@ -18,6 +18,7 @@ from gsx.core.data.resize import Size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
+from gsx.core.ranges import Points, Seed
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
@@ -53,9 +54,9 @@ class TransformsOptions(SceneOptions):
 
     points: str
     """auto: the file's ply_file_path if it has one, else random | random | a PLY file, relative to the folder."""
-    random_points: int
+    random_points: Points
     """Random points are uniform in the smallest cube around the middle of the cameras that holds them all."""
-    seed: int
+    seed: Seed
     """Of the random points."""
 
 

@@ -1,7 +1,6 @@
 """MLflow: parameters, metrics and files of a run in a store beside the runs, or on a tracking server."""
 
 import logging
-import math
 import os
 import re
 import time
@@ -18,6 +17,7 @@ from gsx.core.locks import lock
 from gsx.core.options import flattened
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
+from gsx.core.ranges import Seconds
 from gsx.core.training.run import Run
 from gsx.trackers.figures import evaluation_figures, line_figures
 
@@ -49,12 +49,10 @@ class MLflowOptions:
     """MLflow's tracking URI; empty: `mlflow.db` in the output folder."""
     experiment: str
     """Experiment that runs are listed under; empty: the scene's name."""
-    seconds: float
+    seconds: Seconds
     """Least time between requests during training; what is due meanwhile goes together."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seconds < math.inf:
-            raise ValueError(f"tracker.mlflow.seconds is {self.seconds}; give a number from 0")
         if ":" in urlsplit(self.uri).netloc.rpartition("@")[0]:  # config.yaml, the report and logs would tell it
             raise ValueError(
                 "tracker.mlflow.uri holds a password; leave it out: for a server set MLFLOW_TRACKING_USERNAME and "

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from gsx.core.data.images import read_image
 from gsx.core.files import read_json
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
+from gsx.core.ranges import Range
 from gsx.core.training.run import Run
 from gsx.trackers.figures import evaluation_figures, line_figures
 
@@ -19,12 +20,8 @@ class TensorBoardOptions:
     name: str
     folder: str
     """Where runs are written, each to a folder of its own; empty: `tensorboard` in the run folder."""
-    pictures: int
+    pictures: Annotated[int, Range(0, 10**6)]
     """Test views that are shown beside their truth when the run is evaluated."""
-
-    def __post_init__(self) -> None:
-        if self.pictures < 0:
-            raise ValueError(f"tracker.tensorboard.pictures is {self.pictures}; give a number from 0")
 
 
 class TensorBoard:

@@ -344,7 +344,7 @@ def test_a_step_that_fails_has_not_been_taken(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("batch", [0, -2])
 def test_a_batch_without_views_is_refused(batch: int, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=f"training.batch is {batch}; give at least 1"):
+    with pytest.raises(ConfigError, match=f"training.batch is {batch}; give a number from 1"):
         tiny_settings(tmp_path / "run", f"training.batch={batch}")
 
 

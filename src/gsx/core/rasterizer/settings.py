@@ -2,6 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from gsx.core.ranges import Count, Range, Share, Steps
 
 WINDOW_TILE = 16
 """Tile edge of the published rasterizer: its 3-sigma windows are whole numbers of these (3D-GS, forward.cu)."""
@@ -38,7 +41,7 @@ LARGEST_BATCH = 1 << 27
 class RasterSettings:
     """Rules that shape the image, then sizes that only shape the work."""
 
-    dilation: float = 0.3
+    dilation: Annotated[float, Range(LEAST_VARIANCE, 1e6)] = 0.3
     """Added to both diagonal entries of the screen covariance, px^2 (3D-GS, forward.cu)."""
     compensate: bool = False
     """Opacity times sqrt(|S| / |S + dilation I|), S the screen covariance before dilation: Mip-Splatting's 2D filter
@@ -54,37 +57,37 @@ class RasterSettings:
     Mip-Splatting). `window`: its integral over what is left of the pixel (Gaussian Blending): exact where splats cover
     parts of pixels, above all from afar; several times slower. Instead of the dilation, of which 1/12 px^2 are the
     pixel's own: all of a compensated one is left out."""
-    training_focal: float = 0.0
+    training_focal: Annotated[float, Range(0, 1e9)] = 0.0
     """Largest focal length of the training cameras, px, as the backbone knows it; 0: every camera counts as one of
     them."""
-    alpha_min: float = 1 / 255
+    alpha_min: Share = 1 / 255
     """Contributions below are skipped (3D-GS, renderCUDA)."""
-    alpha_max: float = 0.99
+    alpha_max: Share = 0.99
     """Alphas are clamped here (3D-GS, renderCUDA)."""
-    transmittance_stop: float = 1e-4
+    transmittance_stop: Share = 1e-4
     """A pixel ends before the splat that would take its transmittance below (3D-GS, renderCUDA)."""
     cull: str = "published"
     """`published`: a splat reaches only the 16 px tiles of its 3-sigma square, as 3D-GS draws it.
     `tight`: it reaches every pixel where its alpha is at least alpha_min (the better rule: no truncation)."""
-    jacobian_margin: float = 0.3
+    jacobian_margin: Annotated[float, Range(0, 100)] = 0.3
     """x/z, y/z are clamped to the raster widened by this fraction of half its extent in the Jacobian (3D-GS)."""
-    tile_size: int = 8
+    tile_size: Annotated[int, Range(1, 1024)] = 8
     """Edge of the compositing tiles, px; with cull=published it must divide 16."""
-    chunk: int = 16
+    chunk: Annotated[int, Range(1, 4096)] = 16
     """Eager path: splats composited per step of a tile."""
-    batch_values: int = 1 << 18
+    batch_values: Annotated[int, Range(1, LARGEST_BATCH)] = 1 << 18
     """Eager path: alpha values evaluated at once; bounds working memory and should fit the CPU's cache."""
-    unrolled: int = 8
+    unrolled: Annotated[int, Range(1, 64)] = 8
     """Compiled path: splats composited per step of a tile, unrolled in one loop; compile time grows with it."""
-    compiled_values: int = 1 << 22
+    compiled_values: Annotated[int, Range(1, LARGEST_BATCH)] = 1 << 22
     """Compiled path: alpha values evaluated at once."""
-    max_pairs: int = 100_000_000
+    max_pairs: Annotated[int, Range(1, 1 << 31)] = 100_000_000
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
     Blending more than 8 channels, sums in 16 bits and largest weights take the eager way regardless.
     `auto`: a training run decides (`auto_steps`), and its evaluations follow it; everything else is eager."""
-    auto_steps: int = 300
+    auto_steps: Steps = 300
     """path=auto compiles for runs of at least this many steps, where a compiler works."""
     schedule: str = "auto"
     """Of the compiled path. `chunks`: front to back, saturated tiles leave. `segments`: all chunks of all tiles at
@@ -99,7 +102,7 @@ class RasterSettings:
     accumulation: str = "float32"
     """Format of transmittance, weights and sums of light: float64, float32 (at least the splats' own), bfloat16 or
     float16. Sums over pixels that make a splat's gradient are never narrower than the splats."""
-    tile_cap: int = 0
+    tile_cap: Count = 0
     """At most this many splats are blended per tile, the nearest; 0: all."""
 
     def __post_init__(self) -> None:

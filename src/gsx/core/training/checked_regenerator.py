@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from gsx.core.data.reduction import projected
 from gsx.core.data.scene import View
 from gsx.core.errors import TrainingError
 from gsx.core.quality.metrics import psnr
+from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import Refusing, Regenerator, RegeneratorContext, Request
 
@@ -34,15 +35,13 @@ ACTIONS = ("drop", "warn", "off")
 class Check:
     """A limit, and what happens to a picture beyond it."""
 
-    limit: float
+    limit: Annotated[float, Range(0, 1e6)]
     action: str
     """drop; warn: it is kept, counted and told; off: nothing is looked at."""
 
     def __post_init__(self) -> None:
         if self.action not in ACTIONS:
             raise ValueError(f"the action of a check is '{self.action}'; choose drop, warn or off (in YAML 'off')")
-        if not self.limit >= 0:
-            raise ValueError(f"the limit of a check is {self.limit}; give at least 0")
 
     @property
     def active(self) -> bool:

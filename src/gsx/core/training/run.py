@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.errors import Stopped
 from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
+from gsx.core.ranges import Interval, Range, Share
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
@@ -25,32 +26,23 @@ from gsx.core.training.pseudo_views import Term
 class TrainingOptions:
     """Options of the loop; values in conf/config.yaml."""
 
-    ssim_weight: float
+    ssim_weight: Share
     random_background: bool
-    log_every: int = without_effect()
-    checkpoint_every: int = without_effect()
-    checkpoints_kept: int = without_effect()
-    test_points: int = without_effect()
-    batch: int = 1
+    log_every: Interval = without_effect()
+    checkpoint_every: Interval = without_effect()
+    checkpoints_kept: Interval = without_effect()
+    test_points: Annotated[int, Range(0, 10**6)] = without_effect()
+    batch: Annotated[int, Range(1, 10**6)] = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
-    supersample: int = 1
+    supersample: Annotated[int, Range(1, 16)] = 1
     """Renders are so many times as fine as photographs, and are reduced as these were before they are compared
     (`core.training.supersampling`); whoever looks at the model does the same. 1: published."""
-    supersample_from: float = 0.0
+    supersample_from: Share = 0.0
     """Share of the steps that are rendered at the photographs' resolution before that."""
 
     def __post_init__(self) -> None:
-        for name in ("batch", "supersample", "log_every", "checkpoint_every", "checkpoints_kept"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"training.{name} is {getattr(self, name)}; give at least 1")
-        if self.test_points < 0:
-            raise ValueError(f"training.test_points is {self.test_points}; give a number of times, 0: never")
-        if not 0 <= self.supersample_from < 1:
-            raise ValueError(
-                f"training.supersample_from is {self.supersample_from}; give a share of the steps from 0 to below 1"
-            )
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"training.ssim_weight is {self.ssim_weight}; give a value from 0 to 1")
+        if self.supersample_from == 1:
+            raise ValueError("training.supersample_from is 1.0; give a share of the steps below 1")
 
     def finer_after(self, iterations: int) -> int:
         """Steps that a run of so many takes at the photographs' own resolution before it renders more finely; or 0."""

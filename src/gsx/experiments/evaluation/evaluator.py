@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torch import Tensor
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
+from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Float
@@ -39,12 +40,12 @@ LEAST_TILE_PIXELS = 16 * 16
 class EvalOptions:
     """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
 
-    zoom: list[float]
+    zoom: Annotated[list[float], Range(1 / 64, 64)]
     quantise: bool
     ssim: str
-    tile_pixels: int
+    tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
     lpips: LpipsOptions
-    supersample: int = 0
+    supersample: Annotated[int, Range(0, 16)] = 0
     """Renders are so many times as fine as each picture and are reduced; 0: as the run was trained."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
@@ -52,12 +53,8 @@ class EvalOptions:
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
-        if self.supersample < 0:
-            raise ValueError(f"eval.supersample is {self.supersample}; give at least 1, or 0 for what training does")
-        if not self.zoom or not all(0 < factor < math.inf for factor in self.zoom):
-            raise ValueError(f"eval.zoom is {list(self.zoom)}; give positive factors, for example [1,2,4]")
-        if self.tile_pixels < LEAST_TILE_PIXELS:
-            raise ValueError(f"eval.tile_pixels is {self.tile_pixels}; give at least {LEAST_TILE_PIXELS}")
+        if not self.zoom:
+            raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
 
 
 def peak_memory_mb(device: torch.device) -> float | None:

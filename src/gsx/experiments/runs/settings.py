@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
+from gsx.core.ranges import Range, Share, beyond_range
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.checked_regenerator import Checks, WithChecks
@@ -32,11 +33,11 @@ class Budget:
     """How much of a published run is run; values in conf/budget."""
 
     name: str
-    share: float
+    share: Share
     """Of the iterations."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
+        if not self.share > 0:
             raise ValueError(f"budget.share is {self.share}; give a fraction above 0, at most 1")
 
 
@@ -55,6 +56,8 @@ class Dataset:
     """What the folder of a scene must hold."""
     scenes: dict[str, str]
     """Folder and name in tables, by scene."""
+    images: Annotated[dict[str, int], Range(0, 10**6)] = dataclasses.field(default_factory=dict)
+    """Published number of images in a scene's folder `images`, by scene; where it is known."""
     scene: str
     """The one that is trained."""
 
@@ -206,6 +209,9 @@ def typed(schema: type, values: Any, path: str) -> Any:
     try:
         given = values if isinstance(values, dict) else {}
         merged = OmegaConf.merge(writable(OmegaConf.structured(schema), given), OmegaConf.create(values or {}))
+        plain: Any = OmegaConf.to_container(merged)
+        for key, value, bounds in beyond_range(schema, plain):
+            raise ConfigError(f"{f'{path}.{key}'.lstrip('.')} is {value}; give a number {bounds}")
         return OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(complaint(error, schema, path)) from error
@@ -265,9 +271,9 @@ def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
 
 def write_config(path: Path, resolved: dict[str, Any]) -> None:
     """Save a resolved configuration as YAML."""
-    from gsx.core.files import replace_file
+    from gsx.core.files import replace_text
 
-    replace_file(path, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
+    replace_text(path, OmegaConf.to_yaml(OmegaConf.create(resolved)))
 
 
 def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:

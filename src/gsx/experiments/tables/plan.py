@@ -8,10 +8,11 @@ trained first and leaves its state wherever another of them sets out; the others
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from gsx.core.cache import content_key
 from gsx.core.errors import ConfigError, nearest
+from gsx.core.ranges import LARGEST_SEED, Range
 from gsx.core.training.augmenter import Foretold
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
@@ -37,7 +38,7 @@ class Experiment:
     """Rows that are not run, and why."""
     overrides: list[str] = field(default_factory=list)
     """Of every run."""
-    seeds: list[int] = field(default_factory=lambda: [0])
+    seeds: Annotated[list[int], Range(0, LARGEST_SEED)] = field(default_factory=lambda: [0])
     only: list[str] = field(default_factory=list)
     """Rows that are run; none given: all."""
     scenes: list[str] = field(default_factory=list)
