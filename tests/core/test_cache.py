@@ -1,11 +1,27 @@
 """Where cached results live, and what their keys depend on."""
 
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, trim
+from gsx.core.cache import (
+    IN_USE,
+    MANIFEST,
+    cache_folder,
+    content_key,
+    enlist,
+    entries,
+    file_stamp,
+    in_use,
+    make_folder,
+    trim,
+    whole,
+)
 from gsx.core.errors import InputError
 
 
@@ -78,17 +94,110 @@ def test_folder_is_made_with_its_parents_and_may_exist(tmp_path: Path) -> None:
     assert make_folder(tmp_path / "a" / "b").is_dir()
 
 
-def test_what_was_used_longest_ago_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of five folders of 100 bytes, but never the one at hand, though it is the oldest."""
-    monkeypatch.setenv("GSX_CACHE", str(tmp_path))
-    folders = [cache_folder("warm_starts", name) for name in "abcde"]
-    for age, folder in enumerate(folders):
-        make_folder(folder)
-        (folder / "state").write_bytes(bytes(100))
-        os.utime(folder, (1000 - age, 1000 - age))
-    make_folder(cache_folder("other", "z"))
-    assert trim("warm_starts", 500, folders[4]) == []
-    assert trim("warm_starts", 320, folders[4]) == [folders[3], folders[2]]
-    assert [folder.is_dir() for folder in folders] == [True, True, False, False, True]
-    assert trim("warm_starts", 0, folders[4]) == [folders[1], folders[0]]
-    assert cache_folder("other", "z").is_dir()
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def entry(name: str, used: float, size: int = 100) -> Path:
+    """An entry with one file, used so many seconds after 1970."""
+    file = make_folder(cache_folder(name[0], name)) / "state"
+    file.write_bytes(bytes(size))
+    enlist(file)
+    os.utime(file.parent / MANIFEST, (used, used))
+    return file.parent
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*"))
+
+
+@pytest.mark.usefixtures("cache")
+def test_what_was_used_longest_ago_makes_room_whatever_its_kind() -> None:
+    entries = [entry(name, used) for name, used in (("a1", 300), ("b1", 100), ("a2", 200), ("c1", 400))]
+    foreign = make_folder(cache_folder("compiled", "z")) / "kernel"
+    foreign.write_bytes(bytes(10**4))
+    each = size_of(entries[0])
+    assert trim(4 * each / 1e9) == []
+    assert trim(2.5 * each / 1e9) == [entries[1], entries[2]]
+    assert [path.is_dir() for path in entries] == [True, False, False, True]
+    foreign_manifest = make_folder(cache_folder("data", "set")) / "manifest.jsonl"
+    foreign_manifest.write_text("{}")
+    assert trim(0) == [entries[0], entries[3]]
+    assert foreign.is_file()
+    assert foreign_manifest.is_file()
+
+
+def test_what_a_process_at_work_has_used_stays(cache: Path) -> None:
+    now = time.time()
+    before, since = entry("a1", now - 100), entry("a2", now - 100)
+    program = (
+        "import sys; from gsx.core.cache import in_use\nwith in_use(): print('in', flush=True); sys.stdin.readline()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "in\n"
+        assert whole(since / "state")  # used now, by whomever
+        assert trim(0) == [before]
+        other.kill()
+    assert len(list((cache / IN_USE).iterdir())) == 1, "a killed process leaves its file"
+    assert trim(0) == [since]
+    assert list((cache / IN_USE).iterdir()) == []
+
+
+def test_what_is_used_while_others_are_removed_stays(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = entry("a1", 100)
+    seen = entries
+
+    def overtaken() -> Any:
+        found = seen()
+        os.utime(made / MANIFEST, (200, 200))
+        return found
+
+    monkeypatch.setattr("gsx.core.cache.entries", overtaken)
+    assert trim(0) == []
+    assert whole(made / "state")
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="permissions do not hold root")
+def test_what_cannot_be_removed_is_not_counted(cache: Path) -> None:
+    made = entry("a1", 100)
+    made.chmod(0o500)
+    assert trim(0) == []
+    made.chmod(0o700)
+    assert trim(0) == [made]
+
+
+def test_its_own_use_ends_with_the_context(cache: Path) -> None:
+    with in_use():
+        made = entry("a1", time.time() + 1)
+        assert trim(0) == []
+    assert list((cache / IN_USE).iterdir()) == []
+    assert trim(0) == [made]
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_file_is_whole_as_it_was_written_last(caplog: pytest.LogCaptureFixture) -> None:
+    file = entry("a1", 0) / "state"
+    assert whole(file)
+    assert (file.parent / MANIFEST).stat().st_mtime > 1e9
+    file.write_bytes(bytes(99) + b"1")
+    assert not whole(file)
+    assert "is not as it was written: it is made again" in caplog.text
+    enlist(file)
+    assert whole(file)
+    (file.parent / MANIFEST).write_text('{"file": "state"')  # a line that was cut
+    assert not whole(file)
+    assert not whole(file.with_name("absent"))
+
+
+def test_where_nothing_can_be_written_the_cache_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "file" / "cache"))
+    with in_use():
+        assert trim(0) == []

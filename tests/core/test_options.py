@@ -43,7 +43,7 @@ def test_fields_inside_count_too() -> None:
 def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
     """As they stood in one list before every field said it of itself."""
     assert sorted(WHERE) == sorted(
-        ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "warm_start_gb", "warm_start_at")
+        ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "disk_cache_gb", "warm_start_at")
     )
     assert sorted(NAMES) == sorted(("variant", "length", "budget", "dataset"))
     settings = compose(
@@ -52,7 +52,7 @@ def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
     own = {f"training.{name}" for name in ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")}
     own |= {f"scene.{name}" for name in ("path", "iterations", "cache_gb", "missing")}
     for model in ("x2", "x4"):
-        for name in ("cache_gb", "download", "offload", "batch_pixels", "slicing"):
+        for name in ("cached", "download", "offload", "batch_pixels", "slicing"):
             own.add(f"regenerator.upscale.{model}.{name}")
     assert settings.idle == own
 

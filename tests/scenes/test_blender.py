@@ -165,6 +165,12 @@ def test_names_with_suffix_are_found(folder: Path) -> None:
     assert [view.name for view in load(options(folder)).train] == ["train/r_0.png", "train/r_1.png"]
 
 
+def test_an_image_of_both_files_is_refused(folder: Path) -> None:
+    (folder / "transforms_test.json").write_bytes((folder / "transforms_train.json").read_bytes())
+    with pytest.raises(InputError, match=r"transforms_test.json' lists 2 images that are trained on, too .*r_0.png"):
+        load(options(folder))
+
+
 def test_a_single_image_is_refused(folder: Path) -> None:
     write(folder, "train", [FRONT])
     with pytest.raises(InputError, match="at least 2 images"):

@@ -13,6 +13,7 @@ import torch
 from synthetic_colmap import HEIGHT, WIDTH, colmap_options, synthesize, write_photos, write_scene
 from torch import Tensor
 
+from gsx.core.cache import enlist
 from gsx.core.data.images import read_image, write_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
@@ -97,7 +98,7 @@ def test_images_of_a_text_model_are_counted_past_empty_keypoint_lines(tmp_path: 
     for name in ("cameras", "points3D"):
         (tmp_path / f"{name}.txt").touch()
     lines = ["# comment", "1 1 0 0 0 0 0 0 1 a.png", "", "2 1 0 0 0 0 0 0 1 b.png", "1.0 2.0 -1", "3 1 0 0 0 0 0 0 1 c"]
-    (tmp_path / "images.txt").write_text("\n".join(lines))
+    (tmp_path / "images.txt").write_bytes("\n".join(lines).encode() + b"\xff\n\n")  # a name that is no UTF-8
     assert count_images(tmp_path) == 3
 
 
@@ -501,15 +502,18 @@ def test_undistorted_photos_are_kept_and_found_again(tmp_path: Path, cache: Path
         return views(load(colmap_options(tmp_path)))[0]
 
     fresh = first_view().image()
-    (stored,) = [file for file in cache.rglob("*") if file.is_file()]
-    assert stored.suffix == ".png"
+    (stored,) = cache.rglob("*.png")
     assert torch.equal(read_image(stored).float() / 255, fresh)
     write_image(stored, torch.zeros_like(fresh))
+    assert torch.equal(first_view().image(), fresh)  # what is not as it was written is made again
+    write_image(stored, torch.zeros_like(fresh))
+    enlist(stored)
     assert not first_view().image().any()  # taken from the cache
     photo = tmp_path / "images" / first_view().name
     os.utime(photo, ns=(0, 0))
     assert torch.equal(first_view().image(), fresh)  # a replaced photo is undistorted anew
-    assert all(file.suffix == ".png" for file in cache.rglob("*") if file.is_file())  # nothing half-written
+    kinds = {file.suffix for file in cache.rglob("*") if file.is_file()}
+    assert kinds == {".png", ".jsonl"}  # nothing half-written
 
 
 def test_sampling_reproduces_cubics_along_an_axis_to_second_order() -> None:

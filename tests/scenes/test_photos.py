@@ -13,6 +13,7 @@ import pytest
 import torch
 from synthetic_colmap import shipped
 
+from gsx.core.cache import enlist
 from gsx.core.data.images import image_size, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
@@ -234,15 +235,27 @@ class StubModel:
 
 def test_another_process_that_finishes_first_wins(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def overtaken(folder: Path, sizes: Any, chosen: Any, work: Path) -> StubModel:
-        final = work.parent / work.name.partition(".partial")[0]
+        final = work.parent / work.name.split(".")[1]
         final.mkdir()
         (final / "cameras.bin").write_bytes(b"theirs")
+        enlist(final / "cameras.bin")
         return StubModel()
 
     monkeypatch.setattr(sfm, "reconstruct", overtaken)
     final = reconstruct(tmp_path, two_photos(tmp_path), options(tmp_path))
     assert (final / "cameras.bin").read_bytes() == b"theirs"
     assert list((cache / "sfm").iterdir()) == [final]
+
+
+def test_a_damaged_reconstruction_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: StubModel())
+    sizes = two_photos(tmp_path)
+    final = reconstruct(tmp_path, sizes, options(tmp_path))
+    for damage in (b"", b"theirs"):
+        (final / "cameras.bin").write_bytes(damage)
+        assert (reconstruct(tmp_path, sizes, options(tmp_path)) / "cameras.bin").read_bytes() == b"mine"
+    (final / "cameras.bin").unlink()
+    assert (reconstruct(tmp_path, sizes, options(tmp_path)) / "cameras.bin").is_file()
 
 
 def test_a_replaced_photo_is_reconstructed_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,6 +140,7 @@ def verb_resume(arguments: list[str]) -> int:
     )
     words = [word for word in arguments if word not in RESUME_FLAGS]
     folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
+    from gsx.core.cache import in_use
     from gsx.experiments.run_folder.claims import claimed
     from gsx.experiments.run_folder.files import read_run, reported, state_of
     from gsx.experiments.runs.history import go_on
@@ -148,7 +149,7 @@ def verb_resume(arguments: list[str]) -> int:
 
     loaded = plugins()
     refuse_other(folder)
-    with claimed(folder) if speaks() else nullcontext():
+    with in_use(), claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
         if run.complete and reported(folder) and state_of(read_run(folder))[0] == "ok":
             remedy = "give iterations=N with N above that to lengthen it"

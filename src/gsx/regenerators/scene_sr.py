@@ -12,19 +12,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from gsx.core.cache import cache_folder, content_key
+from gsx.core.cache import cache_folder, content_key, enlist, whole
 from gsx.core.data.reduction import Reduction, projected
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
+from gsx.core.ranges import Interval, Range, Rate, Seconds
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 
@@ -39,23 +40,21 @@ class SceneSROptions:
     """Options; values in conf/regenerator/upscale/scene_sr.yaml."""
 
     name: str
-    channels: int
-    layers: int
-    steps: int
-    batch: int
-    crop: int
+    channels: Annotated[int, Range(1, 1024)]
+    layers: Annotated[int, Range(1, 100)]
+    steps: Interval
+    batch: Annotated[int, Range(1, 4096)]
+    crop: Annotated[int, Range(8, 4096)]
     """Edge of a training crop at the low resolution, px."""
-    rate: float
-    noise: float
+    rate: Rate
+    noise: Annotated[float, Range(0, 255)]
     """Standard deviation of noise added to inputs, in 8-bit levels: renders are not photographs."""
-    seconds: float
+    seconds: Seconds
     """Training ends after this time; 0: never. A run cut short by it cannot be repeated bit for bit."""
 
     def __post_init__(self) -> None:
-        if min(self.channels, self.layers, self.steps, self.batch) < 1 or self.crop < 8:
-            raise ValueError("regenerator.upscale: channels, layers, steps, batch must be at least 1, crop at least 8")
-        if not self.rate > 0 or self.seconds < 0 or self.noise < 0:
-            raise ValueError("regenerator.upscale: rate must be above 0, seconds and noise at least 0")
+        if not self.rate > 0:
+            raise ValueError("regenerator.upscale.rate is 0, by which nothing is learnt; give more")
 
 
 class Enlarger(nn.Module):
@@ -110,14 +109,14 @@ class SceneSR:
             self.options.channels, self.options.layers, torch.Generator().manual_seed(context.seed)
         ).to(context.device)
         path = kept_at(self.options, photos, context.reduction, context.seed, context.device)
-        if path.is_file() and (found := read_network(path)) is not None:
+        if whole(path) and (found := read_network(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
-        loss, whole = train(self.network, photos, context, self.options)
+        loss, complete = train(self.network, photos, context, self.options)
         seconds = time.perf_counter() - begun
         logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
-        if whole:
+        if complete:
             write_network(path, self.network)
         return {"seconds": seconds, "loss": loss}
 
@@ -220,6 +219,7 @@ def write_network(path: Path, network: nn.Module) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, save({name: value.contiguous() for name, value in network.state_dict().items()}))
+        enlist(path)
     except OSError as error:
         logger.warning("%s cannot be written (%s): the next run learns again", path, error.strerror)
 

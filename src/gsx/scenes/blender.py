@@ -1,10 +1,10 @@
 """NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (3D-GS)."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -15,12 +15,14 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
     frames_line,
+    named,
     plain_name,
     pose_from_opengl,
     present_frames,
@@ -40,21 +42,20 @@ class BlenderOptions(SceneOptions):
 
     points: str
     """auto: points3d.ply if the folder has one, else random | random | a PLY file, relative to `path`."""
-    random_points: int
-    points_bound: float
+    random_points: Points
+    points_bound: Length
     """Random points are uniform in the cube [-points_bound, points_bound]^3, scene units."""
-    seed: int
+    seed: Seed
     """Of the random points."""
-    scales: list[int] = field(default_factory=lambda: [1])
+    scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
     """Factors by which training images are reduced, each a set of views; a factor given twice is trained on twice."""
-    test_scales: list[int] = field(default_factory=lambda: [1])
+    test_scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
     """The same of test images."""
 
     def __post_init__(self) -> None:
         for name in ("scales", "test_scales"):
-            factors = getattr(self, name)
-            if not factors or min(factors) < 1:
-                raise ValueError(f"scene.{name} is {list(factors)}; give whole factors of reduction, 1 or more")
+            if not getattr(self, name):
+                raise ValueError(f"scene.{name} is empty; give whole factors of reduction, 1 or more")
         if len(set(self.test_scales)) < len(self.test_scales):
             raise ValueError(f"scene.test_scales is {list(self.test_scales)}; give each factor once")
 
@@ -72,6 +73,7 @@ def load(options: BlenderOptions) -> Scene:
     train_file, test_file = folder / "transforms_train.json", _test_file(folder)
     train_shots, train_notes = read_shots(train_file, options.missing)
     test_shots, test_notes = read_shots(test_file, options.missing)
+    refuse_shared(train_shots, test_shots, test_file)
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
     train, test = views[: len(train_shots)], views[len(train_shots) :]
     refuse_too_few(train, train_file)
@@ -92,6 +94,16 @@ def load(options: BlenderOptions) -> Scene:
             options, len(views), test_file=test_file.name, points=options.points, **_scales_named(options)
         ),
     )
+
+
+def refuse_shared(train: Sequence[Shot], test: Sequence[Shot], file: Path) -> None:
+    """Raise InputError for an image that is trained on and tested on."""
+    shared = sorted({shot.photo.resolve() for shot in train} & {shot.photo.resolve() for shot in test})
+    if shared:
+        raise InputError(
+            f"'{file}' lists {len(shared)} images that are trained on, too ({named([path.name for path in shared])}): "
+            "remove them from one of the files."
+        )
 
 
 def reduced(view: View, factor: int, grouped: bool = False) -> View:

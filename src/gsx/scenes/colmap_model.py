@@ -102,7 +102,7 @@ def count_images(folder: Path) -> int:
 
 def _count_text(file: Path) -> int:
     count = 0
-    with file.open() as lines:
+    with file.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
             if line.strip() and not line.startswith("#"):
                 count += 1

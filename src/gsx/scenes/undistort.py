@@ -4,7 +4,6 @@ The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, 
 are at +0.5 on both rasters. Sampling is cubic where COLMAP's own undistorter is bilinear: it keeps more detail.
 """
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +14,10 @@ from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import read_image, write_image
+from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
-
-logger = logging.getLogger(__name__)
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
@@ -147,15 +144,12 @@ class StoredUndistortion:
     """(width, height) of the result."""
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
-        stored = self.stored()
-        if stored.is_file():
-            try:
-                return read_image(stored)
-            except InputError as problem:
-                logger.warning("%s It is made anew.", problem)
+        stored = kept_image(self.stored())
+        if stored is not None:
+            return stored
+        make_folder(self.stored().parent)  # without it every photo would be undistorted many times
         result = undistort(image, self.intrinsics, self.pinhole, self.size)
-        make_folder(stored.parent)
-        write_image(stored, result)
+        keep_image(self.stored(), result)
         return result
 
     def stored(self) -> Path:

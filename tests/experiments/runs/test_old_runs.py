@@ -53,11 +53,23 @@ def test_an_old_run_goes_on(folder: Path) -> None:
 def test_keys_of_an_old_run_have_their_new_names_wherever_it_is_read(folder: Path) -> None:
     config, (_, settings) = read_run(folder).config, open_run(folder, plugins())
     for found in (config, settings.resolved):
-        assert (found["warm_start_at"], found["warm_start_gb"]) == ([], 10.0)
+        assert found["warm_start_at"] == []
+        assert "disk_cache_gb" not in found  # what was a budget of states is not that of the whole cache
         assert found["backbone"]["rates"]["sh_dc"] == {"first": 0.0025, "last": 0.0025}
         assert found["backbone"]["clone_split"]["rates"]["sh_dc"] == 0.0025
         assert not {"trunk_at", "trunk_gb", "sh_constant"} & found.keys()
+    assert settings.general.disk_cache_gb == 20
     assert renamed({"init": "trunk", "backbone": None}) == {"init": "warm_start", "backbone": None}
+
+
+def test_diffusion_models_once_said_by_a_size_whether_results_are_kept() -> None:
+    model = {"offload": "none", "batch_pixels": 1, "cache_gb": 0}
+    nested = {"name": "sd_by_scale", "x2": model, "x4": model | {"cache_gb": 5.0}}
+    foreign = {"name": "mine", "cache_gb": 3.0}
+    found = renamed({"regenerator": {"upscale": nested, "restore": foreign}})["regenerator"]
+    assert found["upscale"]["x2"] == {"offload": "none", "batch_pixels": 1, "cached": False}
+    assert found["upscale"]["x4"]["cached"] is True
+    assert found["restore"] == foreign
 
 
 def test_a_configuration_that_was_read_back_is_the_same_composition(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import torch
 from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
+from gsx.core.cache import in_use
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
@@ -104,6 +105,12 @@ def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytes
     tiny_run(tmp_path / "second", (*RUN, "init=warm_start"), stop_after=17)
     assert "truncated or altered" in caplog.text
     assert "branching at step 10" in caplog.text
+    tiny_run(tmp_path / "third", (*RUN, "init=warm_start"), stop_after=17)
+    assert "branching at step 15" in caplog.text, "it was kept again"
+    (warm_start_folder(run, plugins().versions) / "lines_step_0000015.json").write_text("{}")
+    caplog.clear()
+    tiny_run(tmp_path / "fourth", (*RUN, "init=warm_start"), stop_after=17)
+    assert "branching at step 10" in caplog.text, "what it would have told of its beginning is damaged"
 
 
 def test_a_cache_that_cannot_be_written_ends_no_run(
@@ -120,7 +127,8 @@ def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.Mon
     """Room for one composition: the second makes the first go; a run's own states stay whatever their size."""
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
     first = tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
-    second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=warm_start", "warm_start_gb=0"), stop_after=12)
+    with in_use():
+        second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=warm_start", "disk_cache_gb=0"), stop_after=12)
     folders = [warm_start_folder(run, plugins().versions) for run in (first, second)]
     assert [folder.is_dir() for folder in folders] == [False, True]
 

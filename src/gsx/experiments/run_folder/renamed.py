@@ -5,7 +5,8 @@ from typing import Any
 
 RENAMED = {
     "trunk_at": "warm_start_at",
-    "trunk_gb": "warm_start_gb",
+    "trunk_gb": "disk_cache_gb",
+    "warm_start_gb": "disk_cache_gb",
     "backbone.rates.sh_constant": "backbone.rates.sh_dc",
     "backbone.clone_split.rates.sh_constant": "backbone.clone_split.rates.sh_dc",
 }
@@ -13,8 +14,14 @@ RENAMED = {
 
 
 def renamed(config: dict[str, Any]) -> dict[str, Any]:
-    """A copy with the new names, in the same order; `init: trunk` is `init: warm_start`."""
+    """A copy with the new names, in the same order; `init: trunk` is `init: warm_start`.
+
+    A budget of states alone is dropped: it would be that of the whole cache.
+    """
     config = copy.deepcopy(config)
+    for key in ("trunk_gb", "warm_start_gb"):
+        config.pop(key, None)
+    say_what_is_cached(config.get("regenerator"))
     if config.get("init") == "trunk":
         config["init"] = "warm_start"
     for old, new in RENAMED.items():
@@ -27,3 +34,13 @@ def renamed(config: dict[str, Any]) -> dict[str, Any]:
             node.clear()
             node.update(items)
     return config
+
+
+def say_what_is_cached(node: Any) -> None:
+    """In options of diffusion models, which other options lie around: a size of the cache once said whether to keep."""
+    if not isinstance(node, dict):
+        return
+    if {"offload", "batch_pixels", "cache_gb"} <= node.keys() and "cached" not in node:
+        node["cached"] = node.pop("cache_gb") != 0
+    for inner in node.values():
+        say_what_is_cached(inner)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from gsx.core.cache import cache_root
+from gsx.core.cache import cache_root, trim
 from gsx.core.errors import LostModel, TrainingError, first_line
 from gsx.core.files import remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
@@ -73,9 +73,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     ]  # trackers read the log
     if run.warm_starts is not None:
         general = settings.general
-        listeners.append(
-            warm_start.WarmStartKeeper(run.warm_starts, general.warm_start_gb * 1e9, general.warm_start_at)
-        )
+        listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
     try:
         with plugins.listening(listeners), telling_of_failure(run, plugins):
             train(run, plugins)
@@ -86,6 +84,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         raise
     finally:
         log.close()
+        trim(settings.general.disk_cache_gb)
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsx.core.cache import in_use
 from gsx.core.errors import ConfigError
 from gsx.core.files import remove_partial
 from gsx.core.processes import processes, say, speaks
@@ -33,7 +34,7 @@ def logged_to(folder: Path) -> Iterator[None]:
     if not speaks():
         yield
         return
-    handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
+    handler = logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
     logging.getLogger("gsx").addHandler(handler)
@@ -93,7 +94,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = 
 
     if settings.general.reuse:
         return reused(settings, loaded, [] if folders is None else folders)
-    with ExitStack() as claims:
+    with in_use(), ExitStack() as claims:
         run = start(settings, loaded, claims)
         if folders is not None:
             folders.append(run.folder)
@@ -113,7 +114,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     stamp = scene_stamp(settings.resolved)
     folder = place_of(settings.resolved, stamp, settings.idle)
     folders.append(folder)
-    with claimed_name(folder), ExitStack() as claims:
+    with in_use(), claimed_name(folder), ExitStack() as claims:
         _, run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
             with claimed(folder):  # what a process left that was killed at its very end

@@ -7,10 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-from gsx.core.cache import cache_folder, content_key, file_stamp
+from gsx.core.cache import cache_folder, content_key, enlist, file_stamp, whole
 from gsx.core.data.images import PhotoSource, read_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
+from gsx.core.files import write_json
 
 logger = logging.getLogger(__name__)
 
@@ -28,24 +29,27 @@ def verified(scene: Scene) -> Scene:
     """
     sources = (view.source for view in (*scene.train, *scene.test))
     paths = list(dict.fromkeys(source.path for source in sources if isinstance(source, PhotoSource)))
-    if not paths or (known := remembered(paths)).exists():
+    if not paths or whole(known := remembered(paths)):
         return scene
     if len(paths) >= LONG:
         logger.info("looking at all %d photographs once", len(paths))
     refuse_damaged(paths)
     with suppress(OSError):  # without a cache they are looked at again next time
-        known.mkdir(parents=True, exist_ok=True)
+        known.parent.mkdir(parents=True, exist_ok=True)
+        write_json(known, [str(path) for path in paths])
+        enlist(known)
     return scene
 
 
 def remembered(paths: Sequence[Path]) -> Path:
-    """The folder that says that these files, as they are now, could be decoded.
+    """The file that says that these, as they are now, could be decoded.
 
     Raises:
         InputError: one cannot be looked at.
     """
     try:
-        return cache_folder("verified", content_key([(str(path.resolve()), file_stamp(path)) for path in paths]))
+        key = content_key([(str(path.resolve()), file_stamp(path)) for path in paths])
+        return cache_folder("verified", key) / "photographs.json"
     except OSError as error:
         raise InputError(f"Image '{error.filename}' cannot be looked at ({error.strerror}): restore it") from error
 

@@ -9,10 +9,20 @@ import json
 import logging
 import shutil
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder, source_revision, trim
+from gsx.core.cache import (
+    cache_folder,
+    content_key,
+    enlist,
+    file_stamp,
+    make_folder,
+    source_revision,
+    trim,
+    whole,
+)
 from gsx.core.data.scene import FromFile
 from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
@@ -74,10 +84,13 @@ def adopt(run: Run, folder: Path) -> None:
     for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
             checkpoint.read(sidecar)
-            folder.touch()  # the last to make room
+            if not whole(lines_at(sidecar)):
+                raise CheckpointError(f"{sidecar} lacks the lines up to its step")
             branch(run, sidecar)
         except (CheckpointError, OSError) as error:
             logger.warning("%s", error)
+            with suppress(OSError):
+                sidecar.unlink()  # it is kept again
             continue
         return
     logger.info("init=warm_start: no earlier run of this composition to branch from; its states will be kept")
@@ -89,23 +102,24 @@ def branch(run: Run, sidecar: Path) -> None:
     own.mkdir(parents=True, exist_ok=True)
     for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
         shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
-    (run.folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines_of(sidecar)))
+    (run.folder / "metrics.jsonl").write_text(
+        "".join(json.dumps(line) + "\n" for line in read_json(lines_at(sidecar))["lines"])
+    )
     checkpoint.restore(run, training=True)
     write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
     logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
 
 
-def lines_of(sidecar: Path) -> list[dict[str, Any]]:
-    """Lines of metrics.jsonl up to a kept state."""
-    path = sidecar.with_name(f"lines_{sidecar.stem}.json")
-    return read_json(path)["lines"] if path.is_file() else []
+def lines_at(sidecar: Path) -> Path:
+    """File of the lines of metrics.jsonl up to a kept state."""
+    return sidecar.with_name(f"lines_{sidecar.stem}.json")
 
 
 class WarmStartKeeper:
     """Listener: keeps states that other runs can branch from."""
 
-    def __init__(self, folder: Path, budget: float, steps: Collection[int] = ()) -> None:
-        self.folder, self.budget, self.steps = folder, budget, steps
+    def __init__(self, folder: Path, gigabytes: float, steps: Collection[int] = ()) -> None:
+        self.folder, self.gigabytes, self.steps = folder, gigabytes, steps
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
@@ -122,8 +136,11 @@ class WarmStartKeeper:
     def keep(self, run: Run) -> None:
         """Write the state where other runs look for it."""
         folder = make_folder(self.folder)
-        if any(checkpoint.step_of(path) == run.step for path in checkpoint.sidecars(folder)):
+        kept = [path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) == run.step]
+        if kept and whole(lines_at(kept[0])):
             return
-        write_json(folder / f"lines_step_{run.step:07d}.json", {"lines": run.curves})
-        checkpoint.write(run, folder)
-        trim("warm_starts", self.budget, folder)
+        lines = lines_at(folder / f"step_{run.step:07d}.json")
+        write_json(lines, {"lines": run.curves})
+        enlist(lines)
+        checkpoint.write(run, folder)  # its sidecar has the digest of its tensors
+        trim(self.gigabytes)

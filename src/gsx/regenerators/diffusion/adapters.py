@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.cache import make_folder, make_room
+from gsx.core.cache import enlist, make_folder, whole
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file
 from gsx.regenerators.diffusion.options import TuningOptions
@@ -56,7 +56,7 @@ def adapter_bytes(pipe: Any) -> bytes:
 
 def adopted(shared: Path, own: Path) -> bool:
     """Whether the cache had the adapter; it is then in the run's folder too."""
-    if not (shared / FACTS).is_file():
+    if not (whole(shared / FACTS) and whole(shared / WEIGHTS)):
         return False
     try:
         read_facts(shared)
@@ -67,13 +67,11 @@ def adopted(shared: Path, own: Path) -> bool:
     return True
 
 
-def share(own: Path, shared: Path, cache_gb: float) -> None:
+def share(own: Path, shared: Path) -> None:
     """Let later runs have the adapter; a cache that cannot be written is no error."""
-    if not cache_gb:
-        return
     try:
         copy_adapter(own, make_folder(shared))
-        make_room(ADAPTERS, cache_gb)
+        enlist(shared / WEIGHTS, shared / FACTS)
     except (OSError, InputError) as error:
         logger.warning("%s: later runs will learn again", error)
 

@@ -1,9 +1,10 @@
 """Options of diffusion models; values in conf/regenerator, with their sources."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from gsx.core.options import without_effect
+from gsx.core.ranges import Range, Rate, Seconds, Share, Steps
 
 DTYPES = ("auto", "float32", "bfloat16", "float16")
 OFFLOADS = ("none", "model", "sequential")
@@ -30,13 +31,13 @@ class DiffusionOptions:
     """Encode and decode one picture of a batch at a time."""
     tiling: bool
     """Encode and decode large pictures in overlapping tiles; changes results slightly."""
-    batch_pixels: int = without_effect()
+    batch_pixels: Annotated[int, Range(1, 1 << 31)] = without_effect()
     """Pixels of the results of one call; one picture at least."""
-    cache_gb: float = without_effect()
-    """Disk for results, which runs with the same pictures share, 10^9 bytes; 0: none are kept."""
-    guidance: float
+    cached: bool = without_effect()
+    """Whether results are kept in the cache for later runs."""
+    guidance: Annotated[float, Range(0, 1000)]
     """1: none (no second pass without the prompt)."""
-    steps: int
+    steps: Annotated[int, Range(0, 10000)]
     """Denoising steps; of a restorer 0: as many as make it execute exactly one."""
 
     def __post_init__(self) -> None:
@@ -47,21 +48,19 @@ class DiffusionOptions:
             raise ValueError(f"{where}: dtype is '{self.dtype}'; choose from {', '.join(DTYPES)}")
         if self.offload not in OFFLOADS:
             raise ValueError(f"{where}: offload is '{self.offload}'; choose from {', '.join(OFFLOADS)}")
-        if self.batch_pixels < 1 or self.steps < 0 or min(self.cache_gb, self.guidance) < 0:
-            raise ValueError(f"{where}: batch_pixels must be at least 1, steps, cache_gb and guidance at least 0")
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpscalerOptions(DiffusionOptions):
     """Of an upscaler."""
 
-    noise_level: int
+    noise_level: Annotated[int, Range(0, 10000)]
     """Noise on what is enlarged, as a step of the model's schedule (x4 alone)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.steps < 1 or self.noise_level < 0:
-            raise ValueError(f"regenerator {self.name}: steps must be at least 1, noise_level at least 0")
+        if self.steps < 1:
+            raise ValueError(f"regenerator {self.name}: steps must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +70,11 @@ class PipelineOptions(DiffusionOptions):
 
     custom: str
     """File of a pipeline that is not in `diffusers`; empty: the class that model_index.json names."""
-    scale: int
+    scale: Annotated[int, Range(1, 64)]
     """Its results are so many times as wide and high; 1: it restores."""
-    multiple: int
+    multiple: Annotated[int, Range(1, 4096)]
     """Of which both sides of a picture must be a multiple, px."""
-    least: int
+    least: Annotated[int, Range(1, 4096)]
     """Shortest side that it takes, px."""
     prompt: str
     """In place of the augmenter's; empty: that one."""
@@ -87,8 +86,8 @@ class PipelineOptions(DiffusionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.scale < 1 or self.steps < 1 or min(self.multiple, self.least) < 1:
-            raise ValueError(f"regenerator {self.name}: scale, steps, multiple and least must be at least 1")
+        if self.steps < 1:
+            raise ValueError(f"regenerator {self.name}: steps must be at least 1")
         if self.custom and not self.custom.endswith(".py"):
             raise ValueError(f"regenerator {self.name}: custom is '{self.custom}'; give a file ending in .py")
         taken = set(self.arguments) & {"image", "prompt", "generator", "output_type", self.reference}
@@ -106,39 +105,37 @@ class PipelineOptions(DiffusionOptions):
 class TuningOptions:
     """Per-scene LoRA on (render, photograph) pairs."""
 
-    steps: int
+    steps: Steps
     """0: the model is used as it is."""
-    rank: int
+    rank: Annotated[int, Range(1, 4096)]
     layers: list[str]
     """Ends of the names of the layers that are adapted."""
-    rate: float
-    warm_up: int
+    rate: Rate
+    warm_up: Steps
     """Steps in which the rate rises to `rate`."""
-    batch: int
-    crop: int
+    batch: Annotated[int, Range(1, 4096)]
+    crop: Annotated[int, Range(1, 4096)]
     """Edge of a training crop, px."""
-    crops: int
+    crops: Annotated[int, Range(1, 10**6)]
     """Crops that are encoded once and learnt from."""
-    held_out: float
+    held_out: Share
     """Share of the training views that is only measured on."""
-    halves: float = 0.35
+    halves: Annotated[float, Range(0, 100)] = 0.35
     """The models that render what it learns from are trained for this share of the steps that the run has taken. The
     default: runs older than this option."""
-    strengths: list[float]
+    strengths: Annotated[list[float], Range(0, 1)]
     """Least and greatest of those that the model will be called with."""
     prompt: str
-    seconds: float
+    seconds: Seconds
     """Learning ends after this time; 0: never. A run cut short by it cannot be repeated bit for bit."""
     checkpointing: bool
     """Compute activations twice to save memory."""
 
     def __post_init__(self) -> None:
         where = "regenerator.restore.tuning"
-        if self.steps < 0 or self.warm_up < 0 or min(self.rank, self.batch, self.crops, self.crop) < 1:
-            raise ValueError(f"{where}: rank, batch, crop and crops must be at least 1, steps and warm_up at least 0")
-        if not (self.rate > 0 and self.halves > 0) or not 0 < self.held_out < 1 or self.seconds < 0:
-            raise ValueError(f"{where}: rate and halves must be above 0, held_out between 0 and 1, seconds at least 0")
-        if len(self.strengths) != 2 or not 0 < self.strengths[0] <= self.strengths[1] <= 1:
+        if not (self.rate > 0 and self.halves > 0 and 0 < self.held_out < 1):
+            raise ValueError(f"{where}: rate and halves must be above 0, held_out between 0 and 1")
+        if len(self.strengths) != 2 or not 0 < self.strengths[0] <= self.strengths[1]:
             raise ValueError(f"{where}.strengths is {list(self.strengths)}; give the least and the greatest, up to 1")
 
 

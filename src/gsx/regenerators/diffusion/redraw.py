@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key, make_folder, make_room
-from gsx.core.data.images import read_image, write_image
+from gsx.core.cache import cache_folder, content_key
+from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
@@ -44,7 +43,7 @@ PICTURES = "diffusion_pictures"
 """Kind of the results in the cache."""
 MEMORY = ("allocate memory", "out of memory")
 """Words of errors that smaller batches may avoid."""
-IRRELEVANT = ("download", "offload", "cache_gb", "model", "revision")
+IRRELEVANT = ("download", "offload", "cached", "model", "revision")
 """Options that do not change results; what the model is says its fingerprint."""
 
 
@@ -92,8 +91,6 @@ class Diffusion:
         Raises:
             TrainingError: it cannot be loaded or does not fit into memory; the run keeps its checkpoint.
         """
-        if self.options.cache_gb:
-            make_room(PICTURES, self.options.cache_gb)
         if self.pipe is not None:
             return {}
         begun = time.perf_counter()
@@ -148,13 +145,13 @@ class Diffusion:
         """Results of a batch, from the cache if it holds this batch: what is drawn may depend on the company."""
         contents = [content_of(part) for part in together]
         paths = [self.path(contents, number, turn) for number in range(len(together))]
-        kept = [read_kept(path) for path in paths] if self.options.cache_gb else []
+        kept = [kept_image(path) for path in paths] if self.options.cached else []
         if kept and all(result is not None for result in kept):
-            return [result for result in kept if result is not None]
+            return [result.float() / 255 for result in kept if result is not None]
         results = [rounded(result) for result in self.called(batch_of(together))]
         for path, result in zip(paths, results, strict=True):
-            if self.options.cache_gb and bool(torch.isfinite(result).all()):
-                keep(path, result)
+            if self.options.cached and bool(torch.isfinite(result).all()):
+                keep_image(path, result)
         return results
 
     def called(self, batch: Batch) -> Float[Tensor, "B 3 H W"]:
@@ -257,23 +254,3 @@ def content_of(part: PaddedImage) -> str:
 def rounded(result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """In steps of 1/255, if it is finite."""
     return to_uint8(result.clamp(0, 1)).float() / 255 if bool(torch.isfinite(result).all()) else result
-
-
-def read_kept(path: Path) -> Float[Tensor, "3 H W"] | None:
-    """A result as `keep` left it; None if it is not there."""
-    try:
-        if not path.is_file():
-            return None
-        os.utime(path.parent)  # what is used stays longest
-        return read_image(path).float() / 255
-    except (OSError, InputError) as error:
-        logger.warning("%s; it is drawn again", error)
-        return None
-
-
-def keep(path: Path, result: Float[Tensor, "3 H W"]) -> None:
-    """Keep a result; a cache that cannot be written is no error."""
-    try:
-        write_image(make_folder(path.parent) / path.name, result)
-    except InputError as error:
-        logger.warning("%s: it will be drawn again", error)

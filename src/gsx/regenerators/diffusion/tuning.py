@@ -90,7 +90,8 @@ def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: Regener
         shared = cache_folder(ADAPTERS, key_of(pairs, options, context, files))
         if not adopted(shared, own):
             new_adapter(pipe.to(context.device), options, spec, context, pairs, files, own)
-            share(own, shared, options.cache_gb)
+            if options.cached:
+                share(own, shared)
     facts = read_facts(own)
     refuse_another(facts, own, options, files)
     figures = {name: math.nan if value is None else value for name, value in facts["figures"].items()}

@@ -6,17 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import ImageCache, read_image, write_image
+from gsx.core.data.images import ImageCache
+from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.errors import ConfigError
+from gsx.core.ranges import Points, Range, Seed
 from gsx.core.shapes import Float, UInt8
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import rays_through, render, shade, trace
@@ -36,16 +38,16 @@ SAME = 1e-6  # intrinsics that agree to this many pixels are the same
 class DemoOptions(SceneOptions):
     """The built-in scene; `path`, `split` and what concerns photographs do not apply to it."""
 
-    width: int
+    width: Annotated[int, Range(1, 16384)]
     """Width of the pictures before `downscale`, pixels."""
-    height: int
-    train_views: int
-    test_views: int
-    points: int
+    height: Annotated[int, Range(1, 16384)]
+    train_views: Annotated[int, Range(2, 10**5)]
+    test_views: Annotated[int, Range(1, 10**5)]
+    points: Points
     """Number of initial points."""
-    samples: int
+    samples: Annotated[int, Range(1, 64)]
     """Rays per pixel, averaged in display light."""
-    seed: int
+    seed: Seed
     """Of the initial points."""
 
 
@@ -72,8 +74,12 @@ class DemoSource:
         """Rendered, or read where an earlier run has rendered it."""
         if not same_view(camera, self.own):
             return render(self.life, camera, self.samples)
-        kept = kept_picture(path, camera)
-        return keep_picture(path, render(self.life, camera, self.samples)) if kept is None else kept
+        kept = kept_image(path)
+        if kept is not None and kept.shape == (3, camera.height, camera.width):
+            return kept
+        made = render(self.life, camera, self.samples)
+        keep_image(path, made)
+        return made
 
 
 def same_view(camera: Camera, own: Camera) -> bool:
@@ -82,28 +88,6 @@ def same_view(camera: Camera, own: Camera) -> bool:
     back = camera.resize(*own.size)
     intrinsics = ((back.fx, own.fx), (back.fy, own.fy), (back.cx, own.cx), (back.cy, own.cy))
     return pose and all(abs(a - b) < SAME for a, b in intrinsics)
-
-
-def kept_picture(path: Path, camera: Camera) -> UInt8[Tensor, "3 H W"] | None:
-    """The picture on disk, unless there is none or it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        picture = read_image(path)
-    except InputError as error:
-        logger.warning("the kept picture is rendered again: %s", error)
-        return None
-    return picture if picture.shape == (3, camera.height, camera.width) else None
-
-
-def keep_picture(path: Path, picture: UInt8[Tensor, "3 H W"]) -> UInt8[Tensor, "3 H W"]:
-    """The same picture, also on disk where that can be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, picture)
-    except (OSError, InputError) as error:
-        logger.warning("rendered pictures are not kept for the next run: %s", error)
-    return picture
 
 
 def camera_key(camera: Camera) -> str:

@@ -1,0 +1,34 @@
+"""Pictures that are dear to make, kept in the cache between runs."""
+
+import logging
+from pathlib import Path
+
+from torch import Tensor
+
+from gsx.core.cache import enlist, make_folder, whole
+from gsx.core.data.images import read_image, write_image
+from gsx.core.errors import InputError
+from gsx.core.shapes import Float, UInt8
+
+logger = logging.getLogger(__name__)
+
+
+def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
+    """A picture as `keep_image` left it; None if it is not there or damaged."""
+    if not whole(path):
+        return None
+    try:
+        return read_image(path)
+    except InputError as error:
+        logger.warning("%s It is made again.", error)
+        return None
+
+
+def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
+    """Keep a picture as PNG; a cache that cannot be written is no error."""
+    try:
+        make_folder(path.parent)
+        write_image(path, image)
+        enlist(path)
+    except (OSError, InputError) as error:
+        logger.warning("%s; it is made again next time", error)
