@@ -53,6 +53,9 @@ def table(tmp_path: Path) -> Table:
     cells = [cell(r, s, n, tmp_path) for r in ("base", "more") for s in DATASET["scenes"] for n in (0, 1)]
     for c in cells:
         write_run(c.folder, PSNR.get((c.row, c.scene, c.seed)))
+    partial = {"scene": {"notes": ["Skipped 1 of the 9 images of poses.json, not on disk: 4.png."]}}
+    for row in ("base", "more"):
+        (tmp_path / f"{row}_one_1" / "environment.json").write_text(json.dumps(partial))
     (tmp_path / "more_one_0" / "branch.json").write_text(json.dumps({"step": 5, "seconds": 4.0}))
     figures = {
         ("base", "Set & Co", "PSNR"): 25.0, ("more", "Set & Co", "PSNR"): 26.5, ("quoted", "Set & Co", "PSNR"): 24.0,
@@ -96,7 +99,11 @@ def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
     quoted = table.at("quoted", "Set & Co", "PSNR")
     assert (quoted.ours, quoted.paper, quoted.paper_gain) == (None, 24.0, -1.0)
     assert (table.seconds, table.saved) == (7 * 12 - 4, 4)
-    assert table.notes == ["quoted: from its own paper", "corrected: a slip"]
+    assert table.notes == [
+        "quoted: from its own paper",
+        "corrected: a slip",
+        "one: Skipped 1 of the 9 images of poses.json, not on disk: 4.png.",
+    ]
 
 
 def test_the_same_figures_in_every_form(table: Table) -> None:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import content_key
+from gsx.core.cache import content_key, in_use
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.files import replace_file
+from gsx.core.files import replace_text
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.run_key import sorted_items
@@ -64,7 +64,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
     overrides = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in overrides]
     common = [word for word in overrides if key_of(word) not in OWN or is_below_dataset(word)]
     launching = [word for word in overrides if key_of(word) == "hydra"]
-    with Compositions(plugins) as compositions:
+    with in_use(), Compositions(plugins) as compositions:  # its runs begin with states of each other
         refuse_sweeps(common)
         refuse_taken(common)
         chosen = [word for word in overrides if key_of(word) == "experiment"]
@@ -203,6 +203,6 @@ def write_table(table: Table, folder: Path, runs: Sequence[Path]) -> None:
     """table.csv, table.md and table.tex, and the report over the runs."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (("table.csv", as_csv(table)), ("table.md", as_markdown(table)), ("table.tex", as_latex(table))):
-        replace_file(folder / name, text.encode())
+        replace_text(folder / name, text)
     if runs:
         write_overview(folder, list(dict.fromkeys(runs)))

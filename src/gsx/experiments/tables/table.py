@@ -315,10 +315,17 @@ def notes_of(
     same = [" and ".join(rows) for rows in shared.values() if len(rows) > 1]
     notes += dict.fromkeys(f"{rows} are the same composition here" for rows in same)
     notes += of_other_revisions(cells, files)
+    notes += dict.fromkeys(f"{cell.scene}: {note}" for cell in cells for note in scene_notes(files[cell.folder]))
     devices = {str(run.environment.get("device")) for run in files.values() if run.environment}
     if len(devices) > 1:
         notes.append(f"these runs were trained on different devices: {', '.join(sorted(devices))}")
     return notes
+
+
+def scene_notes(files: RunFiles) -> list[str]:
+    """What was said of a run's scene when it was loaded: images that were absent, above all."""
+    notes = part(files.environment, "scene").get("notes")
+    return [str(note) for note in notes] if isinstance(notes, list) else []
 
 
 def of_other_revisions(cells: Sequence[Cell], files: dict[Path, RunFiles]) -> list[str]:
