@@ -73,7 +73,7 @@ def test_everything_is_imported_without_what_only_unix_has(tmp_path: Path) -> No
 def test_a_folder_is_claimed_by_one_at_a_time_by_windows_locks(tmp_path: Path) -> None:
     done = on_windows(LOCKS, tmp_path)
     assert "refused: " in done.stdout, done.stderr
-    assert "is being trained by " in done.stdout
+    assert "is in use by " in done.stdout
 
 
 def test_without_any_locks_a_claim_is_refused_and_not_taken_for_granted(tmp_path: Path) -> None:

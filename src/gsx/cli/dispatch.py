@@ -1,5 +1,6 @@
 """The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
 
+import io
 import sys
 from collections.abc import Callable, Sequence
 
@@ -45,6 +46,8 @@ Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files as they are, whatever their bytes
     if processes() > 1:
         from gsx.core.training.distributed import as_one
 

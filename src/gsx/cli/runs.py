@@ -16,21 +16,26 @@ def verb_eval(arguments: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
     told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
     folder, overrides = run_arguments("eval", arguments, told)
+    from gsx.core.files import remove_partial
     from gsx.experiments.reports.report import write_report
+    from gsx.experiments.run_folder.claims import claimed
     from gsx.experiments.runs.evaluate import evaluate
     from gsx.experiments.runs.execute import finish
-    from gsx.experiments.runs.open import as_trained, open_run
+    from gsx.experiments.runs.open import as_trained, open_run, refuse_other
     from gsx.experiments.runs.rasterizer_path import warm
 
     loaded = plugins()
-    run, settings = open_run(folder, loaded, overrides)
-    run.raster = as_trained(run)
-    warm(run.raster, run.device)
-    if run.complete:
-        finish(run, settings, loaded)
-    else:
-        loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
-        write_report(folder)
+    refuse_other(folder)
+    with claimed(folder):
+        remove_partial(folder)
+        run, settings = open_run(folder, loaded, overrides)
+        run.raster = as_trained(run)
+        warm(run.raster, run.device)
+        if run.complete:
+            finish(run, settings, loaded)
+        else:
+            loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
+            write_report(folder)
     sys.stdout.write(f"{folder / 'report.html'}\n")
     return 0
 
@@ -68,6 +73,7 @@ def verb_export(arguments: list[str]) -> int:
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     given = parser.parse_args(arguments)
+    from gsx.core.files import remove_partial
     from gsx.core.gaussians.splat_files import refuse_suffix
     from gsx.experiments.runs.export import export, reimport_psnr
     from gsx.experiments.runs.open import open_run
@@ -78,6 +84,7 @@ def verb_export(arguments: list[str]) -> int:
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
+    remove_partial(path.parent, below=False)
     if export(run, path, view.camera if view else None):
         views = [view] if view else run.scene.test
         logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views))

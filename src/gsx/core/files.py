@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -38,6 +39,11 @@ def replace_file(path: Path, content: bytes) -> None:
     keep_names(path.parent)
 
 
+def replace_text(path: Path, text: str) -> None:
+    """`replace_file` as UTF-8; bytes of file names that are no text, which Python has as surrogates, become escapes."""
+    replace_file(path, text.encode("utf-8", "backslashreplace"))
+
+
 def keep_names(folder: Path) -> None:
     """Have the disk keep what a folder's files are called now, where a system lets folders be written through."""
     if not hasattr(os, "O_DIRECTORY"):
@@ -52,7 +58,7 @@ def keep_names(folder: Path) -> None:
 
 ABANDONED = 3600.0
 """Seconds after which a temporary file of another machine is taken for left behind."""
-MARKED = re.compile(r"^\..+\.(?P<machine>[A-Za-z0-9]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
+MARKED = re.compile(r"^\..+\.(?P<machine>[A-Za-z0-9]*)-(?P<process>\d+)-[0-9a-z_]{8}\.partial")
 """Names of temporary files."""
 
 
@@ -65,15 +71,17 @@ def own_mark() -> str:
     return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node() + counted_by)}-{os.getpid()}"
 
 
-def remove_partial(folder: Path) -> None:
-    """Remove what killed processes left half-written in a folder and below."""
-    for place, _, names in os.walk(folder):
-        for name in names:
+def remove_partial(folder: Path, below: bool = True) -> None:
+    """Remove what killed processes left half-written in a folder, and below it."""
+    for place, inner, names in os.walk(folder):
+        for name in (*names, *inner):
             if found := MARKED.match(name):
                 with suppress(OSError):
                     path = Path(place, name)
                     if gone(found["machine"], int(found["process"]), path):
-                        path.unlink()
+                        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if not below:
+            inner.clear()
 
 
 def gone(machine: str, process: int, path: Path) -> bool:

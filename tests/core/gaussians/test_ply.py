@@ -102,3 +102,10 @@ def test_unequal_columns_leave_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="i8"):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(2, np.int64)})
     assert not list(tmp_path.iterdir())
+
+
+def test_comments_are_one_line_of_ascii(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)}, ["scene 客厅 \udcff\nelement vertex 5"])
+    header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].splitlines()
+    assert header[2] == rb"comment scene \u5ba2\u5385 \udcff element vertex 5"
+    assert len(read_ply(tmp_path / "a.ply")["x"]) == 1

@@ -275,8 +275,9 @@ def test_pictures_of_an_earlier_evaluation_are_removed_and_others_left(run: Run)
     assert len(list((run.folder / "renders").glob("*.x2.*"))) == 9
 
 
-def test_an_unreadable_index_is_replaced(run: Run) -> None:
-    (run.folder / "renders" / "index.json").write_text("{")
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"views": [{"files": {"render": null}}], "zoom": []}'])
+def test_an_index_that_is_none_is_replaced(run: Run, content: str) -> None:
+    (run.folder / "renders" / "index.json").write_text(content)
     write_pictures(run, OPTIONS, figures(run))
     assert len(read_index(run)["views"]) == 3
 

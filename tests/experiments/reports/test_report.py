@@ -285,6 +285,14 @@ def test_any_file_may_be_missing_or_damaged(tmp_path: Path, name: str, content: 
     assert Page(write_report(folder)).text("settings").startswith("Settings")
 
 
+def test_a_picture_without_a_name_is_no_picture(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    index = json.loads((folder / "renders" / "index.json").read_text())
+    index["views"][0]["files"]["render"] = None
+    (folder / "renders" / "index.json").write_text(json.dumps(index))
+    assert "index.json is not what gsx writes" in Page(write_report(folder)).text("notice")
+
+
 def test_pictures_that_are_gone_are_said_to_be(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run")
     (folder / "renders" / "one.render.png").unlink()

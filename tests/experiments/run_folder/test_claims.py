@@ -38,7 +38,7 @@ def test_the_second_is_told_who_is_first_and_nothing_stays_behind(tmp_path: Path
     for claim, path in ((claimed, run / LOCK), (claimed_name, tmp_path / f".run{LOCK}")):
         with claim(run):
             assert path.is_file()
-            with pytest.raises(InputError, match=f"{run} is being trained by {who}"), claim(run):
+            with pytest.raises(InputError, match=f"{run} is in use by {who}"), claim(run):
                 pytest.fail("two had it")
         assert not path.exists()
         with claim(run):
@@ -131,6 +131,6 @@ def test_a_run_under_way_is_neither_resumed_nor_begun_again(tmp_path: Path, caps
         assert train(tiny_settings(folder, "iterations=4"), loaded) == 0
     assert second.codes == [2, 2]
     said = capsys.readouterr().err
-    assert f"{folder} is being trained by process {os.getpid()} on " in said
+    assert f"{folder} is in use by process {os.getpid()} on " in said
     assert f"folder={folder} is not empty" in said
     assert not (folder / LOCK).exists()

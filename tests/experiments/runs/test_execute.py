@@ -1,5 +1,6 @@
 """Whole runs: what they leave, exact resume, repeatability, zoom evaluation, interruption."""
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -133,7 +134,7 @@ def test_only_the_newest_checkpoints_are_kept(finished: Path) -> None:
     assert len(list((finished / "checkpoints").glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "no sidecar data", "schema"])
+@pytest.mark.parametrize("damage", ["truncate", "flip", "no sidecar data", "schema", "head", "views", "order"])
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -146,13 +147,20 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
         newest.write_bytes(data[: len(data) // 2])
     elif damage == "flip":
         newest.write_bytes(data[:-5] + bytes([data[-5] ^ 1]) + data[-4:])
+    elif damage == "head":  # by somebody who gave it the right digest
+        newest.write_bytes(data[:8] + b"\xff" + data[9:])
+        digest = hashlib.sha256(newest.read_bytes()).hexdigest()
+        sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | {"sha256": digest}))
+    elif damage in ("views", "order"):
+        changed = {"views": {"train": None}} if damage == "views" else {"sampler": [6]}  # of views 0 to 5
+        sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | changed))
     elif damage == "schema":
         sidecar.write_text(sidecar.read_text().replace('"schema": 1', '"schema": 99'))
     else:
         sidecar.write_text("{")
     run, _ = open_run(folder, plugins())
     assert run.step == 3
-    assert str(newest) in caplog.text
+    assert str(newest.with_suffix("")) in caplog.text
 
 
 def test_without_any_usable_checkpoint_the_error_says_so(tmp_path: Path) -> None:
@@ -173,9 +181,8 @@ def test_a_used_folder_is_refused(tmp_path: Path) -> None:
 
 def test_zero_iterations_and_unknown_devices_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     for override, pattern in (("iterations=0", "iterations is 0"), ("device=tpu", "device is 'tpu'")):
-        settings = tiny_settings(tmp_path / "run", override)
         with pytest.raises(ConfigError, match=pattern):
-            start(settings, plugins())
+            start(tiny_settings(tmp_path / "run", override), plugins())
         assert not (tmp_path / "run").exists()
 
 

@@ -58,12 +58,17 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     rows = np.empty(next(iter(counts)), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
     for name, column in columns.items():
         rows[name] = column
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
     header += [f"element vertex {len(rows)}", *(f"property {names[code]} {name}" for name, code in codes.items())]
     try:
-        replace_file(path, "\n".join([*header, "end_header", ""]).encode("latin-1") + rows.tobytes())
+        replace_file(path, "\n".join([*header, "end_header", ""]).encode("ascii") + rows.tobytes())
     except OSError as problem:
         raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space.") from None
+
+
+def plain(comment: str) -> str:
+    """In one line of ASCII, all that headers may hold; other characters become escapes."""
+    return " ".join(comment.split()).encode("ascii", "backslashreplace").decode()
 
 
 def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:

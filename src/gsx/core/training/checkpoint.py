@@ -90,6 +90,7 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     Raises:
         CheckpointError: it is missing, truncated, altered, or of another schema.
     """
+    from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
 
     path = sidecar.with_suffix(".safetensors")
@@ -106,7 +107,27 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
         raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
-    return meta, from_bytes(data)
+    if not sound(meta):
+        raise CheckpointError(f"checkpoint {sidecar} is not what gsx writes: remove it to use an older one")
+    try:
+        return meta, from_bytes(data)
+    except SafetensorError as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+
+
+def sound(meta: dict[str, Any]) -> bool:
+    """Whether a sidecar has the form that `write` gives it."""
+    views, order = meta.get("views"), meta.get("sampler")
+    if not (isinstance(views, dict) and isinstance(order, list)):
+        return False
+    named = all(is_list_of(str, views.get(part)) for part in ("train", "test"))
+    numbers = isinstance(meta.get("step"), int) and isinstance(meta.get("seconds"), int | float)
+    return named and numbers and is_list_of(int, order) and all(0 <= view < len(views["train"]) for view in order)
+
+
+def is_list_of(kind: type, value: Any) -> bool:
+    """Whether it is a list of such values alone."""
+    return isinstance(value, list) and all(isinstance(one, kind) for one in value)
 
 
 def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]:
@@ -136,7 +157,10 @@ def restore(run: Run, training: bool = False) -> None:
     """
     meta, tensors, damaged = newest(run.folder)
     refuse_other_views(run, meta["views"])
-    run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
+    try:
+        run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

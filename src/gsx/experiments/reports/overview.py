@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from gsx import __version__
 from gsx.core.errors import InputError
-from gsx.core.files import csv_text, replace_file
+from gsx.core.files import csv_text, remove_partial, replace_text
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
@@ -49,7 +49,8 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
     rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
-    replace_file(folder / "report.csv", csv_text(FIELDS, rows).encode())
+    remove_partial(folder, below=False)
+    replace_text(folder / "report.csv", csv_text(FIELDS, rows))
     context = {
         "title": title_of(folder, runs),
         "version": __version__,
@@ -63,7 +64,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "any_lpips": any(is_number(row["lpips"]) for row in rows),
     }
     path = folder / "report.html"
-    replace_file(path, template("reports/overview.html").render(context).encode())
+    replace_text(path, template("reports/overview.html").render(context))
     return path
 
 

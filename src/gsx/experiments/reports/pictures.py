@@ -16,10 +16,11 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.files import read_json, write_json
+from gsx.core.files import write_json
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
 from gsx.experiments.evaluation.evaluator import Zoomed
+from gsx.experiments.run_folder.files import part, read_mapping, sound_pictures
 
 SHOWN = 6
 """Test views that are drawn."""
@@ -115,13 +116,10 @@ def forget(folder: Path) -> None:
     index = folder / "index.json"
     if not index.is_file():
         return
-    try:
-        content = read_json(index)
-    except ValueError:
-        content = {"views": [], "zoom": []}
+    content = read_mapping(folder, index.name, {}, sound_pictures)
     index.unlink()
-    for entry in [*content["views"], *content["zoom"]]:
-        for file in entry["files"].values():
+    for entry in [*content.get("views", []), *content.get("zoom", [])]:
+        for file in part(entry, "files").values():
             (folder / Path(file).name).unlink(missing_ok=True)
 
 

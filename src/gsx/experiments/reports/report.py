@@ -13,7 +13,7 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.errors import InputError
-from gsx.core.files import replace_file
+from gsx.core.files import remove_partial, replace_text
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
@@ -52,7 +52,8 @@ def write_report(folder: Path) -> Path:
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
     path = folder / "report.html"
-    replace_file(path, template("reports/report.html").render(report_context(read_run(folder))).encode())
+    remove_partial(folder, below=False)
+    replace_text(path, template("reports/report.html").render(report_context(read_run(folder))))
     return path
 
 
@@ -349,8 +350,8 @@ def plan_rows(plan: dict[str, Any], iterations: int) -> list[dict[str, Any]]:
     rows = []
     for name, values in plan.items():
         values = values if isinstance(values, dict) else {"value": values}
-        bounded = iterations > 0 and is_number(values.get("until"))
-        first = values.get("from", 0) if bounded else 0
+        first = values.get("from", 0)
+        bounded = iterations > 0 and is_number(values.get("until")) and is_number(first)
         rows.append(
             {
                 "name": name.replace("_", " "),

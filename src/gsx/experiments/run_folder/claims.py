@@ -1,4 +1,4 @@
-"""One process at a time trains in a run folder: a lock in it, which says who holds it."""
+"""One process at a time trains in a run folder or evaluates it: a lock in it, which says who holds it."""
 
 import json
 import logging
@@ -16,14 +16,14 @@ from gsx.core.locks import lock
 logger = logging.getLogger(__name__)
 
 LOCK = ".lock"
-"""Of a run folder that is being trained in."""
+"""Of a run folder in which somebody works."""
 TRIES = 20
 """Times that a lock file is opened which its holder removes meanwhile."""
 
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """This process alone trains in a folder as long as the context lasts; the claim of a killed one is void.
+    """This process alone works in a folder as long as the context lasts; the claim of a killed one is void.
 
     On a file system without locks nobody can know, which is told.
 
@@ -75,7 +75,7 @@ def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
         stream = opened(path, folder)
         try:
             if not lock(stream):
-                raise InputError(f"{folder} is being trained by {holder(stream)}: wait for it, or stop it")
+                raise InputError(f"{folder} is in use by {holder(stream)}: wait for it, or stop it")
             if same_file(stream, path):
                 return stream
             problem = "its lock files do not stay"

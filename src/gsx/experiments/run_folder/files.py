@@ -126,7 +126,20 @@ def sound_evaluation(content: dict[str, Any]) -> bool:
     zoom, groups = content.get("zoom", {}), content.get("groups", {})
     named = all(isinstance(node, dict) and rows(list(node.values())) for node in (zoom, groups))
     sound = sound_step(content) and named and all(map(is_decimal, zoom)) and rows(content.get("views", []))
-    return sound and sound_incidents(content)
+    return sound and sound_incidents(content) and sound_protocol(content.get("protocol", {}))
+
+
+def sound_protocol(protocol: Any) -> bool:
+    """Whether what an evaluation tells of its protocol has the form that gsx gives it."""
+    if not isinstance(protocol, dict):
+        return False
+    sized = "size" not in protocol or is_size(protocol["size"])
+    return sized and isinstance(protocol.get("scene", {}), dict) and isinstance(protocol.get("test_views", []), list)
+
+
+def is_size(value: Any) -> bool:
+    """Whether it is a width and a height."""
+    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
 
 
 def sound_incidents(content: dict[str, Any]) -> bool:
@@ -149,7 +162,11 @@ def sound_environment(content: dict[str, Any]) -> bool:
 def sound_pictures(content: dict[str, Any]) -> bool:
     """Whether the lists of a renders/index.json have the form that gsx gives them."""
     views, crops = content.get("views", []), content.get("zoom", [])
-    return rows(views) and rows(crops) and all(is_number(crop.get("factor")) for crop in crops)
+    if not (rows(views) and rows(crops) and all(is_number(crop.get("factor")) for crop in crops)):
+        return False
+    sized = all(is_size(view.get("size")) for view in views)
+    names = [name for one in (*views, *crops) for name in part(one, "files").values()]
+    return sized and all(isinstance(name, str) and Path(name).name not in ("", "..") for name in names)
 
 
 def sound_step(content: dict[str, Any]) -> bool:

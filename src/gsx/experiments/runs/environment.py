@@ -1,5 +1,6 @@
 """What a run is trained on and with: environment.json, and the first lines of the log."""
 
+import hashlib
 import logging
 import os
 import platform
@@ -10,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from gsx import __version__
-from gsx.core.cache import content_key, source_revision
+from gsx.core.cache import source_revision
 from gsx.core.data.scene import View
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
@@ -61,16 +61,15 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
 
 def camera_digest(views: Sequence[View]) -> str:
     """Of names, sizes, intrinsics and poses of views, in order."""
+    content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
     cameras = [view.camera for view in views]
-    intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
-    poses = (torch.stack([getattr(c, name).double() for c in cameras]) for name in ("rotation", "translation"))
-    return content_key([(view.name, view.camera.size) for view in views], *map(in_digits, (intrinsics, *poses)))
-
-
-def in_digits(values: Tensor) -> list[Any]:
-    """Values in units of the last digit that counts."""
-    largest = values.abs().max().clamp_min(1e-300)
-    return (values / largest * 10**POSE_DIGITS).round().add(0.0).tolist()  # -0 becomes 0
+    numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
+    numbers += [torch.stack([c.rotation.double().flatten() for c in cameras])]
+    numbers += [torch.stack([c.translation.double() for c in cameras])]
+    for values in numbers:
+        largest = values.abs().max().clamp_min(1e-300)
+        content.update((values / largest * 10**POSE_DIGITS).round().add(0.0).numpy().tobytes())  # -0 becomes 0
+    return content.hexdigest()[:16]
 
 
 def installed_version(package: str) -> str:

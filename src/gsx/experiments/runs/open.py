@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsx.core.cache import source_revision
 from gsx.core.data.scene import Scene
-from gsx.core.errors import CheckpointError, ConfigError, InputError
+from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -77,8 +77,6 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         ConfigError, InputError: something is wrong; no folder was made.
     """
     ranks = ranks_here()
-    if settings.general.iterations < 1:
-        raise ConfigError(f"iterations is {settings.general.iterations}; give at least 1")
     choose_device(settings.general.device)
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from gsx import __version__
-from gsx.core.files import replace_file, write_json
+from gsx.core.files import replace_text, write_json
 from gsx.experiments.reports.charts import Dot, scatter
 from gsx.experiments.reports.page import NONE, fixed, template
 from gsx.experiments.run_folder.files import is_number
@@ -31,7 +31,7 @@ def write_trade(trade: Trade, folder: Path, budget: float) -> Path:
     """Write trade.json and trade.html into an existing folder; returns the page."""
     write_json(folder / "trade.json", content(trade, budget))
     page = folder / "trade.html"
-    replace_file(page, template("trade/trade.html").render(context(trade, budget)).encode())
+    replace_text(page, template("trade/trade.html").render(context(trade, budget)))
     return page
 
 
