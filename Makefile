@@ -14,7 +14,7 @@ ANSWERS := $(BIN)/python -c 'from urllib.request import urlopen; urlopen("$(CPU_
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow test-faults test-times lint wheel clean
+.PHONY: demo test test-slow test-faults test-faults-short test-times lint wheel clean
 
 demo: $(READY)
 	$(BIN)/gsx -m backbone=gs3d,gs3d_zoom 'eval.zoom=[1,2,4]'
@@ -31,6 +31,13 @@ test-faults: $(READY_DEV)
 	rm -rf build/faults
 	$(PYTEST) -m faults --dist load
 	$(BIN)/python tests/faults/record.py
+
+# Some two minutes of them, for CI.
+test-faults-short: $(READY_DEV)
+	GSX_FAULTS=0.02 $(PYTEST) -m faults --dist load $(addprefix tests/faults/, test_readers.py test_pages.py test_keys.py \
+	  'test_disks.py::test_killed_at_every_change[0]' 'test_signals.py::test_signals_at_random_moments[0]' \
+	  'test_options.py::test_every_number[0]' 'test_verbs.py::test_killed_at_every_change[resume]' \
+	  'test_together.py::test_two_at_once[resume-resume-0]')
 
 test-times: $(READY_DEV)
 	$(PYTEST) --file-times

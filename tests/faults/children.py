@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsx.core.cache import IN_USE
+
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 CHANGING = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.truncate", "os.link", "os.symlink")
 """Events of Python's audit hooks (PEP 578) that change what is on a disk; os.replace tells of os.rename."""
@@ -52,8 +54,13 @@ class Disk:
             return  # what a full disk still allows
         if not self.error:
             os.kill(os.getpid(), signal.SIGKILL)
-        self.failed += not (event == "os.remove" and str(given[0]).endswith(".lock"))  # void without its process
+        self.failed += not self.void(event, str(given[0]))
         raise OSError(self.error, os.strerror(self.error), str(given[0]))
+
+    @staticmethod
+    def void(event: str, path: str) -> bool:
+        """Whether nothing is lost: a lock, or a sign that the cache is used, that is void without its process."""
+        return (event == "os.remove" and path.endswith(".lock")) or Path(path).parent.name == IN_USE
 
     def writes(self, given: tuple[Any, ...]) -> bool:
         """Whether a file is opened for more than reading."""
@@ -80,11 +87,11 @@ def preload(words: list[str], place: Path) -> None:
             importlib.import_module(name)
 
 
-def run_in_child(words: list[str], place: Path, *, at: int = 0, error: int = 0) -> Ended:
+def run_in_child(words: list[str], place: Path, *, at: int = 0, error: int = 0, told_in: Path | None = None) -> Ended:
     """`gsx WORDS` in `place`, which is also where its cache lies; its `at`-th change of a file kills it, or fails with
-    an error as all later ones do. 0: nothing happens to it.
+    an error as all later ones do. 0: nothing happens to it. What it says goes to files that begin with `told_in`.
     """
-    return in_child(lambda: command(words), place, at, error)
+    return in_child(lambda: command(words), place, at, error, told_in)
 
 
 def command(words: list[str]) -> int:
@@ -94,9 +101,9 @@ def command(words: list[str]) -> int:
     return main(words)
 
 
-def in_child(job: Callable[[], int], place: Path, at: int = 0, error: int = 0) -> Ended:
+def in_child(job: Callable[[], int], place: Path, at: int = 0, error: int = 0, told_in: Path | None = None) -> Ended:
     """A job in a forked process; see `run_in_child`."""
-    said, counted = place.parent / f"{place.name}.stderr", place.parent / f"{place.name}.changes"
+    said, counted = (Path(f"{told_in or place}.{kind}") for kind in ("stderr", "changes"))
     child = os.fork()
     if child == 0:
         os._exit(carried_out(job, place, Disk(str(place), at, error), said, counted))

@@ -3,13 +3,15 @@
 import errno
 import hashlib
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 from tiny import OVERRIDES
 
 from faults.children import Ended, preload, run_in_child
-from faults.record import record
+from faults.record import record, some
+from faults.verbs import orphans
 
 pytestmark = pytest.mark.faults
 
@@ -27,11 +29,6 @@ def digest(place: Path) -> str:
     return hashlib.sha256(last.read_bytes()).hexdigest()
 
 
-def orphans(place: Path) -> list[str]:
-    """Temporary files and locks that are left."""
-    return [str(path) for path in place.rglob(".*") if "partial" in path.name or path.name.endswith(".lock")]
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ended, str]:
     """How the command ends that nothing happens to, and the digest of its model."""
@@ -43,9 +40,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ended, str]:
     return ended, digest(place)
 
 
-def places(ended: Ended, part: int, every: int = 1) -> range:
+def places(ended: Ended, part: int, every: int = 1) -> Sequence[int]:
     """Numbers of changes, from the first to the last."""
-    return range(1 + part, ended.changes + 1, PARTS * every)
+    return some(range(1 + part, ended.changes + 1, PARTS * every))
 
 
 @pytest.mark.parametrize("part", range(PARTS))

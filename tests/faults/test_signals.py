@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from faults.children import command, in_child, preload, run_in_child
-from faults.record import record
-from faults.test_disks import RUN, digest, orphans
+from faults.record import record, some
+from faults.test_disks import RUN, digest
+from faults.verbs import orphans
 
 pytestmark = pytest.mark.faults
 
-PARTS, RUNS = 4, 20
+PARTS, RUNS = 15, 20
 """Shares of the suite, and runs of each."""
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
 LONGEST = 2.5
@@ -66,7 +67,7 @@ def test_signals_at_random_moments(tmp_path: Path, part: int) -> None:
     assert run_in_child(RUN, tmp_path / "whole").code == 0
     expected = digest(tmp_path / "whole")
     with record("signals (KILL, TERM, INT, HUP; one or two) at random moments", part, seed=part) as counts:
-        for number in range(RUNS):
+        for number in some(range(RUNS)):
             place = tmp_path / f"run_{number}"
             sent, code = interrupted(place, choice)
             assert code in (0, 2, 130, 128 + signal.SIGTERM, *(-name for name in SIGNALS)), (number, sent, code)
