@@ -511,8 +511,8 @@ def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbo
     ("override", "message"),
     [
         ("backbone.filter=mop", r"backbone\.filter is 'mop'; choose one of none, mip, magnified, resampled"),
-        ("backbone.mip.kernel=0", r"backbone\.mip\.variance and kernel are 0\.2 and 0\.0; give positive numbers"),
-        ("backbone.mip.variance=-1", "give positive numbers"),
+        ("backbone.mip.kernel=0", r"backbone\.mip\.kernel is 0\.0; give a number from 1e-06"),
+        ("backbone.mip.variance=-1", r"backbone\.mip\.variance is -1\.0; give a number from 1e-06"),
         ("backbone.mip.rate=best", r"backbone\.mip\.rate is 'best'; choose release or paper"),
     ],
 )

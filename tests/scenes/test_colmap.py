@@ -1,8 +1,10 @@
 """COLMAP scenes: every layout that is around, every way in which they are broken, against pycolmap's own projection."""
 
 import json
+import math
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,14 @@ from synthetic_colmap import HEIGHT, WIDTH, colmap_options, synthesize, write_ph
 from torch import Tensor
 
 from gsx.core.cache import enlist
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import read_image, write_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.scenes.colmap import load
 from gsx.scenes.colmap_model import check_binary, count_images
+from gsx.scenes.posed import Shot
 from gsx.scenes.undistort import pinhole_of, sample, undistort, undistort_points
 
 CAPTURES = Path(__file__).parents[3] / "shared" / "scenes"  # real ones, where a developer has them
@@ -488,6 +492,15 @@ def test_lens_without_distortion_leaves_photos_alone(tmp_path: Path, cache: Path
 def test_fisheye_without_coefficients_is_no_pinhole() -> None:
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 300.0, 320, 240)
     assert pinhole_of(camera).model_name == "PINHOLE"
+
+
+@pytest.mark.parametrize("field", ["rotation", "translation"])
+def test_a_pose_that_is_no_number_is_refused(field: str) -> None:
+    good = Camera(rotation=torch.eye(3), translation=torch.zeros(3), fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)
+    Shot(name="a", photo=Path("a.png"), whole=good, expected_size=(2, 2))
+    bad = replace(good, **{field: getattr(good, field) * math.nan})
+    with pytest.raises(InputError, match=r"camera of 'a\.png' is .* turned by no number"):
+        Shot(name="a", photo=Path("a.png"), whole=bad, expected_size=(2, 2))
 
 
 def test_panorama_is_refused() -> None:

@@ -188,7 +188,7 @@ def test_a_photo_that_is_listed_twice_is_refused(tmp_path: Path, name: str) -> N
         load(options(tmp_path))
 
 
-@pytest.mark.parametrize("name", ["/", ".", "..", ""])
+@pytest.mark.parametrize("name", ["/", ".", "..", "", "n" * 300])
 def test_a_name_that_is_no_photo_is_a_missing_photo(tmp_path: Path, name: str) -> None:
     write(tmp_path, frames=frame_changes(file_path=name))
     with pytest.raises(InputError, match=r"1 of the 3 images of .* are not on disk"):

@@ -53,11 +53,6 @@ class MipOptions:
     def __post_init__(self) -> None:
         if self.rate not in RATES:
             raise ValueError(f"backbone.mip.rate is '{self.rate}'; choose {' or '.join(RATES)}")
-        if not (self.variance > 0 and self.kernel > 0):
-            raise ValueError(
-                f"backbone.mip.variance and kernel are {self.variance} and {self.kernel}; give positive numbers of "
-                "px^2, or do without the filters by backbone.filter=none"
-            )
 
 
 @runtime_checkable

@@ -125,6 +125,11 @@ def finite(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that none can have, as too long a one, is that of none."""
+    return os.path.isfile(path)
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON; numbers that are not finite become null, unknown objects text."""
     replace_file(path, json.dumps(finite(content), indent=2, default=str).encode())

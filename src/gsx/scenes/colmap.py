@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
+from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
@@ -89,7 +90,7 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     Raises:
         InputError: none or only one exists, or more than the share `missing` does not.
     """
-    present = [image for image in model.images if (photos / image.name).is_file()]
+    present = [image for image in model.images if is_file(photos / image.name)]
     if not present and model.images:
         raise InputError(
             f"None of the {len(model.images)} images of {model.folder} is in {photos} (looked for "
@@ -198,7 +199,7 @@ def facts(path: Path) -> Iterator[str]:
     for (name, width, height), count in sorted(kinds.items()):
         yield f"camera    {name} {width}x{height}, {count} images"
     images = image_folder(path, model)
-    present = {image.name for image in model.images if (path / images / image.name).is_file()}
+    present = {image.name for image in model.images if is_file(path / images / image.name)}
     absent = sorted({image.name for image in model.images} - present)
     missing = f", absent: {named(absent)}" if absent else ""
     yield f"images    {len(present)} of {len(model.images)} in {images}{missing}"
@@ -214,7 +215,7 @@ def image_folder(path: Path, model: Model) -> str:
     """The folder below `path` with most of the model's images; `images` unless another has more."""
     others = sorted(folder.name for folder in path.iterdir() if folder.is_dir() and folder.name != IMAGES)
     return max(
-        (IMAGES, *others, "."), key=lambda folder: sum((path / folder / image.name).is_file() for image in model.images)
+        (IMAGES, *others, "."), key=lambda folder: sum(is_file(path / folder / image.name) for image in model.images)
     )
 
 

@@ -15,6 +15,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.files import is_file
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.options import SceneOptions
@@ -44,9 +45,10 @@ class Shot:
     remap: StoredUndistortion | None = None
 
     def __post_init__(self) -> None:
-        if self.whole.translation.abs().max() > FARTHEST:
+        if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):
             raise InputError(
-                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away: correct or remove its pose."
+                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away, or turned by no number: correct or "
+                "remove its pose."
             )
 
 
@@ -125,7 +127,7 @@ def find_photo(folder: Path, file_path: str) -> Path | None:
     if not photo.name:
         return None
     candidates = (photo, photo.with_name(f"{photo.name}.png"))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def refuse_partial(missing: Sequence[str], count: int, place: Path, allowed: float) -> None:

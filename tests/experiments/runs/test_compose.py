@@ -161,7 +161,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["training.log_every=0"], "training.log_every is 0"),
         (["training.checkpoints_kept=0"], "training.checkpoints_kept is 0"),
         (["backbone.sh_degree=4"], "backbone.sh_degree is 4; give a number from 0 to 3"),
-        (["backbone.initial_opacity=1"], "between 0 and 1"),
+        (["backbone.initial_opacity=1"], "backbone.initial_opacity is 1.0; give a number from 1e-06 to 0.999999"),
         (["backbone.rates.means_first=0"], "must be positive"),
         (["backbone.rates.shortened=2"], "backbone.rates.shortened is 2.0; give a number from 0 to 1"),
         (["backbone.rates.opacity_logits=nan"], "backbone.rates.opacity_logits is nan; give a finite number"),

@@ -13,7 +13,7 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.errors import InputError
-from gsx.core.files import remove_partial, replace_text
+from gsx.core.files import is_file, remove_partial, replace_text
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
@@ -320,7 +320,7 @@ def with_pseudo_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:
 def embedded(path: Path) -> str | None:
     """A picture as a data URI."""
     kind = IMAGE_KINDS.get(path.suffix.lower())
-    if kind is None or not path.is_file():
+    if kind is None or not is_file(path):
         return None
     return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
