@@ -47,8 +47,8 @@ class Shot:
     def __post_init__(self) -> None:
         if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):
             raise InputError(
-                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away, or turned by no number: correct or "
-                "remove its pose."
+                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away, or turned by no number: correct "
+                "or remove its pose."
             )
 
 
