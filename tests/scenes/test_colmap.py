@@ -503,6 +503,13 @@ def test_a_pose_that_is_no_number_is_refused(field: str) -> None:
         Shot(name="a", photo=Path("a.png"), whole=bad, expected_size=(2, 2))
 
 
+@pytest.mark.parametrize("change", [{"fx": 8e50}, {"fy": 0.0}, {"fx": math.nan}, {"cx": 1e40}, {"cy": math.nan}])
+def test_intrinsics_that_no_camera_has_are_refused(change: dict[str, float]) -> None:
+    good = Camera(rotation=torch.eye(3), translation=torch.zeros(3), fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)
+    with pytest.raises(InputError, match=r"camera of 'a\.png' has .*: correct its intrinsics"):
+        Shot(name="a", photo=Path("a.png"), whole=replace(good, **change), expected_size=(2, 2))
+
+
 def test_panorama_is_refused() -> None:
     with pytest.raises(InputError, match=r"EQUIRECTANGULAR.*perspective views"):
         pinhole_of(pycolmap.Camera.create_from_model_name(1, "EQUIRECTANGULAR", 1.0, 400, 200))

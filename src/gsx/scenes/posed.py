@@ -50,6 +50,12 @@ class Shot:
                 f"The camera of '{self.photo}' is more than {FARTHEST:g} units away, or turned by no number: correct "
                 "or remove its pose."
             )
+        focal, principal = (self.whole.fx, self.whole.fy), (self.whole.cx, self.whole.cy)
+        if not (all(0 < f <= FARTHEST for f in focal) and all(abs(c) <= FARTHEST for c in principal)):
+            raise InputError(
+                f"The camera of '{self.photo}' has focal lengths {focal} and principal point {principal} px: correct "
+                "its intrinsics."
+            )
 
 
 def shot_through(

@@ -187,7 +187,7 @@ def _open(path: Path) -> Any:
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
     if reader is None:
-        raise InputError(f"Image '{path}' cannot be read ({oiio.geterror()}), convert it to PNG or JPEG.")
+        raise InputError(f"Image '{path}' cannot be read ({in_one_line(oiio.geterror())}), convert it to PNG or JPEG.")
     return reader
 
 
@@ -201,13 +201,18 @@ def _decode(path: Path) -> tuple[np.ndarray, Any]:
     if _is_cmyk(spec):
         raise InputError(f"Image '{path}' is CMYK, whose colours need a printing profile: convert it to sRGB.")
     if pixels is None or error:
-        raise InputError(f"Image '{path}' is damaged ({error}), copy or export it anew.")
+        raise InputError(f"Image '{path}' is damaged ({in_one_line(error)}), copy or export it anew.")
     if (spec.width, spec.height) != (spec.full_width, spec.full_height):
         raise InputError(
             f"Image '{path}' stores only a {spec.width} x {spec.height} window of its {spec.full_width} x"
             f" {spec.full_height} pixels, write it whole."
         )
     return pixels, spec
+
+
+def in_one_line(text: str) -> str:
+    """What a library says in several."""
+    return "; ".join(line.strip() for line in text.splitlines())
 
 
 def _is_cmyk(spec: Any) -> bool:

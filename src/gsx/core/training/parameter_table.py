@@ -147,8 +147,20 @@ def restore_adam(
 ) -> None:
     """Take back what `adam_tensors` gave."""
     if f"adam.{name}.step" in tensors:
-        state = {key: tensors[f"adam.{name}.{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+        shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+        state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
         optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
+
+
+def saved(name: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
+    """A tensor of a checkpoint.
+
+    Raises:
+        CheckpointError: there is none of that shape.
+    """
+    if name not in tensors or tensors[name].shape != shape:
+        raise CheckpointError(f"the checkpoint holds no {name} of shape {list(shape)}: remove it to use an older one")
+    return tensors[name]
 
 
 def named_parameters(table: ParameterTable) -> list[tuple[str, Parameter]]:
@@ -221,7 +233,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
         restore_adam(name, parameter, table.optimiser, tensors, device)
     if (networks := table.networks) is not None:
         for name, parameter in networks.named():
-            parameter.data.copy_(tensors[name])
+            parameter.data.copy_(saved(name, parameter.shape, tensors))
             restore_adam(name, parameter, networks.optimiser, tensors, device)
     return table
 
