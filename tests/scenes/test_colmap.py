@@ -494,6 +494,14 @@ def test_fisheye_without_coefficients_is_no_pinhole() -> None:
     assert pinhole_of(camera).model_name == "PINHOLE"
 
 
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    model = write_scene(synthesize(), tmp_path)
+    content = (model / "images.bin").read_bytes()
+    (model / "images.bin").write_bytes(content.replace(b"camera000001_frame000000", b"camera000001_frame00000\xff", 1))
+    with pytest.raises(InputError, match=r"names an image by bytes that are no UTF-8 .*rename the photo"):
+        load(colmap_options(tmp_path))
+
+
 @pytest.mark.parametrize("field", ["rotation", "translation"])
 def test_a_pose_that_is_no_number_is_refused(field: str) -> None:
     good = Camera(rotation=torch.eye(3), translation=torch.zeros(3), fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)

@@ -258,7 +258,7 @@ def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
 
 def _images(reconstruction: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> list[ModelImage]:
     images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
-    return [_image(image, positions, file) for image in sorted(images, key=lambda image: image.name)]
+    return [_image(image, positions, file) for image in sorted(images, key=lambda image: _name(image, file))]
 
 
 def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> ModelImage:
@@ -267,18 +267,34 @@ def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) 
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
     seen = [image.point2D(index) for index in indices[::step]]
     lost = next((point.point3D_id for point in seen if point.point3D_id not in positions), None)
+    name = _name(image, file)
     if lost is not None:
-        raise InputError(f"{file} is truncated: {image.name} observes its point {lost}; copy or make the model again.")
+        raise InputError(f"{file} is truncated: {name} observes its point {lost}; copy or make the model again.")
     observed = _stack([positions[point.point3D_id] for point in seen], 3)
     usable, pose = _usable(observed), image.cam_from_world()
     return ModelImage(
-        name=image.name,
+        name=name,
         camera_id=image.camera_id,
         rotation=torch.from_numpy(pose.rotation.matrix().copy()),
         translation=torch.from_numpy(pose.translation.copy()),
         keypoints=_stack([point.xy for point in seen], 2)[usable],
         observed=observed[usable],
     )
+
+
+def _name(image: Any, file: Path) -> str:
+    """Of the photo of an image.
+
+    Raises:
+        InputError: it is no text.
+    """
+    try:
+        return str(image.name)
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"The model {file.parent} names an image by bytes that are no UTF-8 ({error.object!r}): rename the photo, "
+            "and reconstruct again."
+        ) from None
 
 
 def _stack(rows: Sequence[Any], width: int) -> Float[Tensor, "K W"]:
