@@ -32,6 +32,11 @@ class Ended:
     failed: int
     """Those of them that failed, but for removing a lock."""
 
+    @property
+    def sentences(self) -> list[str]:
+        """What it said to whoever gave the command."""
+        return [line for line in self.said.splitlines() if line.startswith("gsx: ")]
+
 
 @dataclass
 class Disk:

@@ -79,11 +79,10 @@ def problem(ended: Ended, folder: Path, value: str) -> str:
         sound = all(bool(torch.isfinite(one.double()).all()) for one in tensors.values())
         sound = sound and len(read_ply(folder / "point_cloud.ply")["x"]) > 0
         return "" if sound else "the model is not finite"
-    sentences = [line for line in ended.said.splitlines() if line.startswith("gsx: ")]
-    if ended.code != 2 or len(sentences) != 1 or "Traceback" in ended.said:
+    if ended.code != 2 or len(ended.sentences) != 1 or "Traceback" in ended.said:
         last = (ended.said.strip().splitlines() or [""])[-1]
         return f"code {ended.code}: {last[:200]}"
-    return f"refused when there was a folder: {sentences[0][:200]}" if folder.exists() else ""
+    return f"refused when there was a folder: {ended.sentences[0][:200]}" if folder.exists() else ""
 
 
 @pytest.mark.parametrize("part", range(PARTS))

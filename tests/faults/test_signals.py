@@ -11,8 +11,8 @@ import pytest
 
 from faults.children import command, in_child, preload, run_in_child
 from faults.record import record, some
-from faults.test_disks import RUN, digest
-from faults.verbs import orphans
+from faults.test_disks import RUN
+from faults.verbs import model_by_name, orphans
 
 pytestmark = pytest.mark.faults
 
@@ -65,7 +65,7 @@ def test_signals_at_random_moments(tmp_path: Path, part: int) -> None:
     choice = random.Random(part)
     preload(RUN, tmp_path / "first")
     assert run_in_child(RUN, tmp_path / "whole").code == 0
-    expected = digest(tmp_path / "whole")
+    expected = model_by_name(tmp_path / "whole")
     with record("signals (KILL, TERM, INT, HUP; one or two) at random moments", part, seed=part) as counts:
         for number in some(range(RUNS)):
             place = tmp_path / f"run_{number}"
@@ -73,7 +73,7 @@ def test_signals_at_random_moments(tmp_path: Path, part: int) -> None:
             assert code in (0, 2, 130, 128 + signal.SIGTERM, *(-name for name in SIGNALS)), (number, sent, code)
             again = run_in_child(RUN, place)
             assert again.code == 0, (number, sent, again.said)
-            assert digest(place) == expected, (number, sent)
+            assert model_by_name(place) == expected, (number, sent)
             assert orphans(place) == [], (number, sent)
             counts.cases += 1
             shutil.rmtree(place)

@@ -56,7 +56,12 @@ def finished() -> None:
 
 def model(place: Path) -> str:
     """The newest checkpoint, which is of the last step."""
-    last = sorted((place / "run" / "checkpoints").glob("*.safetensors"))[-1]
+    return newest(place / "run" / "checkpoints")
+
+
+def newest(folder: Path) -> str:
+    """The last of some checkpoints."""
+    last = sorted(folder.glob("*.safetensors"))[-1]
     assert last.stem == "step_0000006"
     return digest_of(last.read_bytes())
 
@@ -88,7 +93,7 @@ def timeless(value: Any) -> Any:
 def model_by_name(place: Path) -> str:
     """The newest checkpoint of the only run, which is named by its composition."""
     (folder,) = place.glob("outputs/demo/gs3d/*/checkpoints")
-    return digest_of(sorted(folder.glob("*.safetensors"))[-1].read_bytes())
+    return newest(folder)
 
 
 def models(place: Path) -> str:

@@ -222,23 +222,14 @@ def trim(gigabytes: float) -> list[Path]:
 
 def entries() -> tuple[dict[Path, float], dict[Path, int]]:
     """When each entry of the cache was last used, seconds since 1970, and its bytes."""
-    used, sizes = {}, {}
-    for entry in folders_in(cache_root(), 2):
-        with suppress(OSError):  # no entry, or removed meanwhile
-            used[entry] = (entry / MANIFEST).stat().st_mtime
-            sizes[entry] = sum(path.stat().st_size for path in entry.rglob("*"))
-    return {entry: used[entry] for entry in sizes}, sizes
-
-
-def folders_in(folder: Path, depth: int) -> list[Path]:
-    """Folders so far below another; none where it cannot be looked at."""
-    if depth == 0:
-        return [folder]
-    try:
-        inner = [path for path in folder.iterdir() if path.is_dir()]
-    except OSError:
-        return []
-    return [found for path in inner for found in folders_in(path, depth - 1)]
+    used, sizes, manifests = {}, {}, list[Path]()
+    with suppress(OSError):  # somebody removes the cache meanwhile
+        manifests += cache_root().glob(f"*/*/{MANIFEST}")
+    for manifest in manifests:
+        with suppress(OSError):  # or this entry
+            size = sum(path.stat().st_size for path in manifest.parent.rglob("*"))
+            used[manifest.parent], sizes[manifest.parent] = manifest.stat().st_mtime, size
+    return used, sizes
 
 
 def remove_entry(entry: Path, used: float) -> bool:

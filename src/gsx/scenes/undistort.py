@@ -144,12 +144,13 @@ class StoredUndistortion:
     """(width, height) of the result."""
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
-        stored = kept_image(self.stored())
-        if stored is not None:
-            return stored
-        make_folder(self.stored().parent)  # without it every photo would be undistorted many times
+        stored = self.stored()
+        kept = kept_image(stored)
+        if kept is not None:
+            return kept
+        make_folder(stored.parent)  # without it every photo would be undistorted many times
         result = undistort(image, self.intrinsics, self.pinhole, self.size)
-        keep_image(self.stored(), result)
+        keep_image(stored, result)
         return result
 
     def stored(self) -> Path:

@@ -56,7 +56,7 @@ def adapter_bytes(pipe: Any) -> bytes:
 
 def adopted(shared: Path, own: Path) -> bool:
     """Whether the cache had the adapter; it is then in the run's folder too."""
-    if not (whole(shared / FACTS) and whole(shared / WEIGHTS)):
+    if not whole(shared / FACTS):
         return False
     try:
         read_facts(shared)
@@ -71,7 +71,7 @@ def share(own: Path, shared: Path) -> None:
     """Let later runs have the adapter; a cache that cannot be written is no error."""
     try:
         copy_adapter(own, make_folder(shared))
-        enlist(shared / WEIGHTS, shared / FACTS)
+        enlist(shared / FACTS)  # which have the digest of the weights
     except (OSError, InputError) as error:
         logger.warning("%s: later runs will learn again", error)
 
