@@ -186,6 +186,24 @@ def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None
     assert "complete " in capsys.readouterr().out
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("asked", ["--help", "--cfg job", "plugins"])
+def test_text_that_cannot_be_written_is_one_sentence(asked: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run([*GSX, *asked.split()], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.returncode == 2
+    assert [line[:8] for line in ended.stderr.splitlines()] == ["gsx: No "], ended.stderr
+
+
+@pytest.mark.parametrize("asked", ["--help", "--cfg job"])
+def test_a_reader_that_has_seen_enough_is_no_error(asked: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run([*GSX, *asked.split()], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
 def test_multirun_makes_a_run_for_every_combination(tmp_path: Path) -> None:
     command = [*GSX, "-m", *OVERRIDES, "iterations=1", "seed=0,1", f"output={tmp_path / 'out'}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)

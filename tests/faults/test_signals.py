@@ -11,11 +11,11 @@ import pytest
 
 from faults.children import command, in_child, preload, run_in_child
 from faults.record import record, some
-from faults.test_disks import RUN
-from faults.verbs import model_by_name, orphans
+from faults.verbs import VERBS, model_by_name, orphans
 
 pytestmark = pytest.mark.faults
 
+RUN = VERBS["reuse"].words
 PARTS, RUNS = 15, 20
 """Shares of the suite, and runs of each."""
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP]

@@ -18,7 +18,7 @@ EVENT = [f"augmenter.upscale.timing.{key}=10000" for key in ("start", "every", "
 STEPS = ["iterations=6", "training.checkpoint_every=2", "training.log_every=1", "rasterizer=eager", "eval.zoom=[1,2]",
          "augmenter=[upscale]", "regenerator/upscale=lanczos", *EVENT]  # fmt: skip
 TABLE = ["+experiment=table_frameworks", "dataset=demo", "budget=smoke", "experiment.only=[3D-GS,3D-GS-UP]",
-         "iterations=6", "training.checkpoint_every=2", "scene.width=48", "scene.height=36", "scene.train_views=6",
+         "iterations=2", "training.checkpoint_every=2", "scene.width=48", "scene.height=36", "scene.train_views=6",
          "scene.test_views=2", "scene.points=300", "scene.samples=1", "training.test_points=0", "device=cpu",
          "rasterizer=eager", "regenerator/upscale=lanczos"]  # fmt: skip
 TIMES = ("seconds", "peak_memory_mb", "render_seconds", "evaluate_seconds", "render_fps", "steps_per_second")
@@ -36,8 +36,6 @@ class Verb:
     """Digest of what it leaves, by that folder."""
     sentences: int = 1
     """That it may say when it fails: a table tells of each of its runs."""
-    every: int = 1
-    """Of its changes of files one in so many is tried."""
 
 
 def nothing() -> None:
@@ -118,7 +116,7 @@ VERBS = {
     "render": Verb(["render", "run"], finished, pictures),
     "train": Verb([*OVERRIDES, *STEPS, "folder=run"], nothing, model),
     "reuse": Verb([*OVERRIDES, *STEPS, "reuse=true"], nothing, model_by_name),
-    "table": Verb(TABLE, nothing, models, sentences=3, every=9),
+    "table": Verb(TABLE, nothing, models, sentences=3),
     "page": Verb(["report", "run", "--to", "page"], finished, file("page/report.html")),
 }
 """By name."""

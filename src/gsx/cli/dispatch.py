@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
-from gsx.cli.messages import explained, set_up_logging
+from gsx.cli.messages import explained, set_up_logging, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_render
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
@@ -44,7 +44,8 @@ Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted."""
+    """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
+    141 nobody reads on (`| head`)."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files as they are, whatever their bytes
@@ -53,7 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return as_one(lambda: dispatch_together(arguments), explained)
     try:
-        return dispatch(arguments)
+        code = dispatch(arguments)
+        sys.stdout.flush()  # what nobody takes is noticed here, not when Python ends
+        return code
+    except BrokenPipeError:
+        return unheard()
     except BaseException as error:
         return explained(error)
 

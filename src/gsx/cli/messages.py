@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import os
 import sys
 
 from gsx.core.errors import GsxError
@@ -25,6 +26,17 @@ def complain(sentence: str) -> int:
     """Show an error as one sentence."""
     say(f"gsx: {sentence}\n", as_error=True)
     return 2
+
+
+UNHEARD = 128 + 13
+"""Exit code where standard output is a pipe that nobody reads any more, as shells tell SIGPIPE."""
+
+
+def unheard() -> int:
+    """Say nothing more on standard output, which nobody reads any more (`gsx plugins | head -3`)."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    return UNHEARD
 
 
 def os_sentence(error: OSError) -> str:

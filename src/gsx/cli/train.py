@@ -2,8 +2,9 @@
 
 import logging
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,9 @@ def hand_to_hydra(arguments: list[str]) -> int:
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
     loaded = plugins()
     if not {"-m", "--multirun"} & set(arguments):
-        hydra_main(arguments, loaded, sweep_job)
+        with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
+            hydra_main(arguments, loaded, sweep_job)
+        sys.stdout.write(text.getvalue())
         return 0
     given = [word for word in arguments if not word.startswith("-")]
     sweep = new_sweep(check_overrides(given, loaded))

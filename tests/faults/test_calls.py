@@ -1,0 +1,74 @@
+"""Killed, or failing, at every system call that changes a file: the same command again leaves what it should."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from faults.calls import STRACE, Call, failed, killed, listed
+from faults.children import Ended, run_in_child
+from faults.record import record, some
+from faults.verbs import VERBS, Prepared, orphans, prepared
+
+pytestmark = [pytest.mark.faults, pytest.mark.skipif(STRACE is None, reason="strace is not installed")]
+
+PARTS = 4
+"""Shares of the calls, so that processes can take one each."""
+NAMES = [name for name in VERBS if name != "train"]
+"""Commands that can be given again; `train` is `reuse` in a named folder."""
+ERRORS = ["ENOSPC", "EIO", "EDQUOT"]
+
+
+def calls_of(case: Prepared) -> list[Call]:
+    """All calls of the command that change something."""
+    case.put_back()
+    ended, calls = listed(case.verb.words, case.place)
+    assert ended.code == 0, ended.said
+    assert len(calls) > 2, "the test needs changes to be seen"
+    return calls
+
+
+def again(case: Prepared, at: object) -> None:
+    """The same command again ends well, or says that all is done, and leaves what it should and nothing else."""
+    ended = run_in_child(case.verb.words, case.place)
+    assert ended.code == 0 or (ended.code == 2 and "is complete" in ended.said), (at, ended.said)
+    assert case.verb.result(case.place) == case.expected, at
+    assert orphans(case.place) == [], at
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("name", NAMES)
+def test_killed_at_every_call(tmp_path: Path, name: str, part: int) -> None:
+    case = prepared(VERBS[name], tmp_path)
+    calls = [call for call in calls_of(case) if not call.failed]  # which changed nothing
+    with record(f"gsx {name}: killed at a call, then again", part) as counts:
+        for call in some(calls[part::PARTS]):
+            case.put_back()
+            assert killed(case.verb.words, case.place, call).code == -9, call
+            again(case, call)
+            counts.cases += 1
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_call_fails_once(tmp_path: Path, name: str, error: str, part: int) -> None:
+    case = prepared(VERBS[name], tmp_path)
+    calls: Sequence[Call] = calls_of(case)
+    with record(f"gsx {name}: {error} from a call, then again", part) as counts:
+        for call in some(calls[part::PARTS]):
+            case.put_back()
+            told(failed(case.verb.words, case.place, call, error), case, call)
+            again(case, call)
+            counts.cases += 1
+
+
+def told(ended: Ended, case: Prepared, call: Call) -> None:
+    """A call that failed is told in a sentence, or its loss is none."""
+    assert "Traceback" not in ended.said, (call, ended.said)
+    if ended.code == 0:
+        assert ended.sentences == [], (call, ended.said)
+        assert case.verb.result(case.place) == case.expected, call
+    else:
+        assert ended.code == 2, (call, ended.said)
+        assert 0 < len(ended.sentences) <= case.verb.sentences, (call, ended.said)
