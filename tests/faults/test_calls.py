@@ -23,12 +23,12 @@ TITLES = {"reuse": "a run", "table": "a table of two runs", "page": "a page over
 
 
 def calls_of(case: Prepared) -> list[Call]:
-    """All calls of the command that change something."""
+    """Calls of the command that change something."""
     case.put_back()
     ended, calls = listed(case.verb.words, case.place)
     assert ended.code == 0, ended.said
     assert len(calls) > 2, "the test needs changes to be seen"
-    return calls
+    return calls[:: case.verb.every]
 
 
 def again(case: Prepared, at: object) -> None:

@@ -202,17 +202,17 @@ def describe_folder(folder: Path) -> None:
 
 READERS = {
     "PLY": Reader(cloud, read_clouds, PURE),
-    "splat file": Reader(splats, read_splats, NATIVE * 10),
-    "transforms.json": Reader(scene_files("transforms"), load("transforms"), NATIVE * 10),
-    "transforms of NeRF-synthetic": Reader(scene_files("blender"), load("blender"), NATIVE * 10),
+    "splat file": Reader(splats, read_splats, PURE),
+    "transforms.json": Reader(scene_files("transforms"), load("transforms"), PURE),
+    "transforms of NeRF-synthetic": Reader(scene_files("blender"), load("blender"), PURE),
     "COLMAP binary": Reader(scene_files("bin"), load("colmap"), NATIVE * 5),
     "COLMAP text": Reader(scene_files("txt"), load("colmap"), NATIVE * 5),
     "a COLMAP folder, described": Reader(scene_files("bin"), describe_folder, NATIVE),
     "images": Reader(images, read_images, NATIVE * 5),
-    "checkpoint": Reader(checkpoint_files, read_checkpoint, PURE // 10),
-    "checkpoint of the right digest": Reader(checkpoint_files, read_checkpoint, PURE // 10, settle_checkpoint),
+    "checkpoint": Reader(checkpoint_files, read_checkpoint, PURE),
+    "checkpoint of the right digest": Reader(checkpoint_files, read_checkpoint, PURE, settle_checkpoint),
     "checkpoint of the right digest, restored": Reader(checkpoint_files, restore, SLOW, settle_checkpoint),
-    "files of a run": Reader(run_files, read_state, PURE // 10),
+    "files of a run": Reader(run_files, read_state, PURE),
     "files of a run, reported": Reader(run_files, report, SLOW),
     "files of a run, opened": Reader(run_files, restore, SLOW),
 }

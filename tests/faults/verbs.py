@@ -36,6 +36,8 @@ class Verb:
     """Digest of what it leaves, by that folder."""
     sentences: int = 1
     """That it may say when it fails: a table tells of each of its runs."""
+    every: int = 1
+    """Of its calls one in so many is tried."""
 
 
 def nothing() -> None:
@@ -116,7 +118,7 @@ VERBS = {
     "render": Verb(["render", "run"], finished, pictures),
     "train": Verb([*OVERRIDES, *STEPS, "folder=run"], nothing, model),
     "reuse": Verb([*OVERRIDES, *STEPS, "reuse=true"], nothing, model_by_name),
-    "table": Verb(TABLE, nothing, models, sentences=3),
+    "table": Verb(TABLE, nothing, models, sentences=3, every=8),
     "page": Verb(["report", "run", "--to", "page"], finished, file("page/report.html")),
 }
 """By name."""
