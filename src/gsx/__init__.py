@@ -1,3 +1,27 @@
-"""gsx: experiments with 3D Gaussian Splatting and pseudo details. Importing this module does not import torch."""
+"""gsx: experiments with 3D Gaussian Splatting and pseudo details, from the command line and from Python (`gsx.api`).
+
+Importing this module does not import torch; the first use of `gsx.train` or `gsx.load` does.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsx.api import SplatFile as SplatFile
+    from gsx.api import TrainedRun as TrainedRun
+    from gsx.api import load as load
+    from gsx.api import show_messages as show_messages
+    from gsx.api import train as train
+    from gsx.api import write_image as write_image
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """What `gsx.api` offers."""
+    if name.startswith("_"):
+        raise AttributeError(f"module 'gsx' has no attribute '{name}'")
+    api = import_module("gsx.api")
+    if name not in api.__all__:
+        raise AttributeError(f"module 'gsx' has no attribute '{name}'; it has {', '.join(api.__all__)}")
+    return getattr(api, name)

@@ -404,15 +404,17 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_partial_file(
 
 
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(tmp_path: Path) -> None:
-    command = [*GSX, *words(tmp_path / "run", "iterations=100000")]
+    command = [*GSX, *words(tmp_path / "run", "iterations=100000", "rasterizer=eager")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    metrics = tmp_path / "run" / "metrics.jsonl"
-    deadline = time.monotonic() + 120
-    while not (metrics.exists() and metrics.read_text().count("\n") >= 2):
-        assert time.monotonic() < deadline, "training did not begin"
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    try:
+        metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 120
+        while not (metrics.exists() and metrics.read_text().count("\n") >= 2):
+            assert time.monotonic() < deadline, "training did not begin"
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert process.returncode == 130
     found = re.search(r"stopped at step (\d+); go on with: gsx resume (\S+)", err)
     assert found

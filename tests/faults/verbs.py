@@ -59,6 +59,11 @@ def model(place: Path) -> str:
     return newest(place / "run" / "checkpoints")
 
 
+def all_of_run(place: Path) -> str:
+    """The same with all results."""
+    return model(place) + everything(place / "run")
+
+
 def newest(folder: Path) -> str:
     """The last of some checkpoints."""
     last = sorted(folder.glob("*.safetensors"))[-1]
@@ -79,8 +84,8 @@ def pictures(place: Path) -> str:
 
 
 def figures(place: Path) -> str:
-    """What an evaluation tells but for times."""
-    return digest_of(repr(timeless(json.loads((place / "run" / "evaluation.json").read_text()))).encode())
+    """What an evaluation leaves."""
+    return everything(place / "run")
 
 
 def timeless(value: Any) -> Any:
@@ -94,6 +99,21 @@ def model_by_name(place: Path) -> str:
     """The newest checkpoint of the only run, which is named by its composition."""
     (folder,) = place.glob("outputs/demo/gs3d/*/checkpoints")
     return newest(folder)
+
+
+def all_by_name(place: Path) -> str:
+    """The same with pictures, splat file, figures and a report that complains of nothing."""
+    (run,) = place.glob("outputs/demo/gs3d/*")
+    return newest(run / "checkpoints") + everything(run)
+
+
+def everything(run: Path) -> str:
+    """Results of a finished run beside its checkpoints."""
+    pictures = sorted(path for path in run.rglob("*.png") if "/renders/" in str(path) or "/pseudo/" in str(path))
+    assert len(pictures) > 3
+    assert 'class="notice' not in (run / "report.html").read_text()
+    figures = repr(timeless(json.loads((run / "evaluation.json").read_text()))).encode()
+    return digest_of(b"".join(path.read_bytes() for path in [*pictures, run / "point_cloud.ply"]) + figures)
 
 
 def models(place: Path) -> str:
@@ -111,13 +131,13 @@ def digest_of(content: bytes) -> str:
 
 
 VERBS = {
-    "resume": Verb(["resume", "run"], stopped, model),
+    "resume": Verb(["resume", "run"], stopped, all_of_run),
     "eval": Verb(["eval", "run", "eval.zoom=[1]"], finished, figures),
     "report": Verb(["report", "run"], finished, file("run/report.html")),
     "export": Verb(["export", "run", "model.ply"], finished, file("model.ply")),
     "render": Verb(["render", "run"], finished, pictures),
     "train": Verb([*OVERRIDES, *STEPS, "folder=run"], nothing, model),
-    "reuse": Verb([*OVERRIDES, *STEPS, "reuse=true"], nothing, model_by_name),
+    "reuse": Verb([*OVERRIDES, *STEPS, "reuse=true"], nothing, all_by_name),
     "table": Verb(TABLE, nothing, models, sentences=3, every=8),
     "page": Verb(["report", "run", "--to", "page"], finished, file("page/report.html")),
 }

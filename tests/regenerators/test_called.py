@@ -80,7 +80,7 @@ def test_code_that_a_folder_names_runs_only_where_it_is_trusted(
     named = "regenerator.upscale.function=theirs:blocks"
     loaded, settings = plugins(), tiny_settings(tmp_path / "run", *words_, named)
     with loaded.listening([StopAfter(3)]):
-        train(settings, loaded)
+        train(settings, loaded, [])
     assert f"gsx resume {tmp_path / 'run'} --trust" in capsys.readouterr().err
     for name in ("once", "twice"):
         shutil.copytree(tmp_path / "run", tmp_path / name)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
-from gsx.cli.look import verb_datasets, verb_plugins, verb_report, verb_scenes
+from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_render
 from gsx.cli.trade import verb_trade
@@ -30,6 +30,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
+  gsx explain KEY           a key or group of the configuration: value, range, comment, and the file that sets it
   gsx plugins               what is installed, from where, and what failed to load
 
   gsx --cfg job --resolve   print the configuration instead of training
@@ -107,5 +108,6 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "trade": verb_trade,
     "scenes": verb_scenes,
     "datasets": verb_datasets,
+    "explain": verb_explain,
     "plugins": verb_plugins,
 }

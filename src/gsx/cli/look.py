@@ -1,4 +1,4 @@
-"""Verbs that look: report, scenes, datasets, plugins."""
+"""Verbs that look: report, scenes, datasets, explain, plugins."""
 
 import sys
 from pathlib import Path
@@ -54,6 +54,19 @@ def verb_datasets(arguments: list[str]) -> int:
             asked = [f"dataset={name}", *overrides]
             root = Path(str(compositions.value(asked, "data_root")))
             sys.stdout.write("\n".join(described(compositions.node(asked, "dataset"), root)) + "\n")
+    return 0
+
+
+def verb_explain(arguments: list[str]) -> int:
+    """gsx explain KEY [KEY=VALUE ...]"""
+    told = "What a key of the configuration is, or a group: its value, what else it may be, who says so, and why."
+    parser = Parser(prog="gsx explain", usage="%(prog)s KEY [KEY=VALUE ...]", description=told)
+    parser.add_argument("key", metavar="KEY", help="for example training.supersample, backbone, backbone=scaffold")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="in this composition instead of the default")
+    given = parser.parse_args(arguments)
+    from gsx.experiments.runs.explain import explain
+
+    sys.stdout.write("\n".join(explain(given.key, given.overrides, plugins())) + "\n")
     return 0
 
 

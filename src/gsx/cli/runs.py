@@ -16,26 +16,9 @@ def verb_eval(arguments: list[str]) -> int:
     """gsx eval RUN [KEY=VALUE ...]"""
     told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
     folder, overrides = run_arguments("eval", arguments, told)
-    from gsx.core.files import remove_partial
-    from gsx.experiments.reports.report import write_report
-    from gsx.experiments.run_folder.claims import claimed
-    from gsx.experiments.runs.evaluate import evaluate
-    from gsx.experiments.runs.execute import finish
-    from gsx.experiments.runs.open import as_trained, open_run, refuse_other
-    from gsx.experiments.runs.rasterizer_path import warm
+    from gsx.experiments.runs.again import evaluate_again
 
-    loaded = plugins()
-    refuse_other(folder)
-    with claimed(folder):
-        remove_partial(folder)
-        run, settings = open_run(folder, loaded, overrides)
-        run.raster = as_trained(run)
-        warm(run.raster, run.device)
-        if run.complete:
-            finish(run, settings, loaded)
-        else:
-            loaded.emit.gsx_evaluated(run=run, evaluation=evaluate(run, settings))
-            write_report(folder)
+    evaluate_again(folder, plugins(), overrides)
     sys.stdout.write(f"{folder / 'report.html'}\n")
     return 0
 

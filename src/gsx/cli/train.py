@@ -12,7 +12,7 @@ from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
-from gsx.core.processes import speaks
+from gsx.core.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
 
 logger = logging.getLogger("gsx.cli")
@@ -48,7 +48,16 @@ def verb_train(arguments: list[str]) -> int:
         return fill_table(arguments)
     from gsx.experiments.runs.compose import compose
 
-    return train(compose(arguments, loaded := plugins()), loaded)
+    folders: list[Path] = []
+    code = train(compose(arguments, loaded := plugins()), loaded, folders)
+    return tell_report(code, folders[0])
+
+
+def tell_report(code: int, folder: Path) -> int:
+    """Say where the report of a run is that has come to its end; returns the exit code."""
+    if code == 0:
+        say(f"{folder / 'report.html'}\n")
+    return code
 
 
 def fill_table(arguments: list[str]) -> int:
@@ -118,6 +127,7 @@ def sweep_job(config: Any) -> int:
     folders: list[Path] = []
     try:
         code = train(settings_from(config, loaded := plugins()), loaded, folders)
+        tell_report(code, folders[0])
     except GsxError as error:
         code = complain(str(error))
     except OSError as error:
@@ -161,4 +171,4 @@ def verb_resume(arguments: list[str]) -> int:
             go_on(run, loaded, changed="--changed" in arguments)
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
-        return carry_out(run, settings, loaded)
+        return tell_report(carry_out(run, settings, loaded), folder)

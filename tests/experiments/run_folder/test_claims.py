@@ -128,7 +128,7 @@ def test_a_run_under_way_is_neither_resumed_nor_begun_again(tmp_path: Path, caps
     folder, loaded = tmp_path / "run", plugins()
     second = Meanwhile(folder)
     with loaded.listening([second]):
-        assert train(tiny_settings(folder, "iterations=4"), loaded) == 0
+        assert train(tiny_settings(folder, "iterations=4"), loaded, []) == 0
     assert second.codes == [2, 2]
     said = capsys.readouterr().err
     assert f"{folder} is in use by process {os.getpid()} on " in said

@@ -162,7 +162,7 @@ def test_signals_of_a_jobs_end_keep_its_last_step(tmp_path: Path, name: str) -> 
     loaded = plugins()
     try:
         with loaded.listening([Sending(number)]), pytest.raises(SystemExit) as ended:
-            train(tiny_settings(tmp_path / "run", *SHORT), loaded)
+            train(tiny_settings(tmp_path / "run", *SHORT), loaded, [])
     finally:
         signal.signal(number, before)
     assert received == [name]  # once stopped, it goes to whoever waited for it before
@@ -175,7 +175,7 @@ def test_a_signal_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
     loaded = plugins()
     try:
         with loaded.listening([Sending(signal.SIGHUP)]):
-            assert train(tiny_settings(tmp_path / "run", "iterations=4"), loaded) == 0
+            assert train(tiny_settings(tmp_path / "run", "iterations=4"), loaded, []) == 0
     finally:
         signal.signal(signal.SIGHUP, before)
 

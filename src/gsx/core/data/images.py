@@ -3,6 +3,7 @@
 Images are uint8 display values [C, H, W], red first, alpha (if any) straight and last.
 """
 
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -97,8 +98,33 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
         with replacing(path) as partial:
             if not buffer.write(str(partial)):
                 raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder's space.")
+            refuse_cut(partial, path)
     except OSError as problem:
         raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), remove what is in its way.") from None
+
+
+ENDINGS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".gif": b";"}
+"""Last bytes of whole files, by suffix."""
+
+
+def refuse_cut(file: Path, path: Path) -> None:
+    """Raise InputError if parts of a file that OpenImageIO has just written are lost: it takes no notice of a disk that
+    fails. `path`: what the file is going to be."""
+    content, suffix = file.read_bytes(), file.suffix.lower()
+    if not (whole_png(content) if suffix == ".png" else content.endswith(ENDINGS[suffix])):
+        raise InputError(f"Image '{path}' cannot be written (parts are lost), check the folder's space and disk.")
+
+
+def whole_png(content: bytes) -> bool:
+    """Whether all chunks have their checksums, and the last is the end (PNG, ISO/IEC 15948, 5.3)."""
+    at, kind = 8, b""
+    while at < len(content) and kind != b"IEND":
+        end = at + 12 + int.from_bytes(content[at : at + 4], "big")
+        kind, checksum = content[at + 4 : at + 8], int.from_bytes(content[end - 4 : end], "big")
+        if end > len(content) or zlib.crc32(content[at + 4 : end - 4]) != checksum:
+            return False
+        at = end
+    return kind == b"IEND"
 
 
 class ImageCache:

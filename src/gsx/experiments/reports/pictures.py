@@ -20,7 +20,6 @@ from gsx.core.files import write_json
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
 from gsx.experiments.evaluation.evaluator import Zoomed
-from gsx.experiments.run_folder.files import part, read_mapping, sound_pictures
 
 SHOWN = 6
 """Test views that are drawn."""
@@ -34,6 +33,8 @@ WINDOW_STEP = 8
 """Crops are looked for on a grid of this many px."""
 ERROR_FULL = 0.2
 """Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
+DRAWN = re.compile(r".+\.(truth|render|error|enlarged)\.(png|jpg)")
+"""Names of pictures."""
 ERROR_COLOURS = (
     (0.00, (0, 0, 4)),
     (0.15, (55, 14, 92)),
@@ -112,15 +113,11 @@ class Pictures:
 
 
 def forget(folder: Path) -> None:
-    """Remove the pictures that an earlier index lists, and first the index itself."""
-    index = folder / "index.json"
-    if not index.is_file():
-        return
-    content = read_mapping(folder, index.name, {}, sound_pictures)
-    index.unlink()
-    for entry in [*content.get("views", []), *content.get("zoom", [])]:
-        for file in part(entry, "files").values():
-            (folder / Path(file).name).unlink(missing_ok=True)
+    """Remove the pictures of an earlier evaluation, be it one that did not come to its end; first their index."""
+    (folder / "index.json").unlink(missing_ok=True)
+    for path in folder.iterdir():
+        if DRAWN.fullmatch(path.name):
+            path.unlink()
 
 
 def extremes(qualities: Sequence[float | None]) -> tuple[int, int]:

@@ -189,7 +189,7 @@ def is_decimal(word: str) -> bool:
 
 def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str]:
     """Mapping and text of a YAML file."""
-    import yaml  # type: ignore[import-untyped]
+    import yaml
 
     try:
         text = path.read_text(encoding="utf-8")

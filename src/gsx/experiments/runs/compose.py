@@ -3,6 +3,8 @@
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,17 @@ def register_search_paths(plugins: Plugins) -> None:
         HydraPlugins.instance().register(PluginPaths)
 
 
+@dataclass(frozen=True)
+class Source:
+    """A file of the configuration."""
+
+    name: str
+    """As people are told it."""
+    file: Path
+    package: str
+    """Dotted key below which its keys lie; empty: at the top."""
+
+
 class Compositions:
     """Many compositions in one session of Hydra: `with Compositions(plugins) as compositions`."""
 
@@ -90,6 +103,26 @@ class Compositions:
         """Options of a group."""
         return listed(group)
 
+    def groups(self) -> list[str]:
+        """Configuration groups, nested ones included."""
+        return known_groups()
+
+    def sources(self, overrides: Sequence[str]) -> list["Source"]:
+        """Files of gsx and of plugins that a composition is made of, in the order in which they are merged."""
+        from hydra.core.global_hydra import GlobalHydra
+        from hydra.types import RunMode
+
+        loader = GlobalHydra.instance().config_loader()
+        merged = loader.compute_defaults_list("config", list(overrides), RunMode.RUN).defaults
+        files = [(str(one.config_path), str(one.package), self.file(str(one.config_path))) for one in merged]
+        return [Source(place_of(name, file), file, package) for name, package, file in files if file.is_file()]
+
+    def file(self, name: str) -> Path:
+        """The file of an option `GROUP/NAME`, in gsx's configuration or in a plugin's; it may not exist."""
+        modules = [MODULE, *(path.removeprefix("pkg://") for path in self.plugins.config_paths)]
+        files = [Path(str(resources.files(module))) / f"{name}.yaml" for module in modules]
+        return next((file for file in files if file.is_file()), files[0])
+
     def launch(
         self,
         overrides: Sequence[str],
@@ -116,9 +149,20 @@ class Compositions:
             _ = result.return_value  # raises what a job raised
 
 
+def place_of(name: str, file: Path) -> str:
+    """What people are told a file of the configuration is called: `conf/...` for gsx's own."""
+    own = file.is_relative_to(str(resources.files(MODULE)))
+    return f"conf/{name}.yaml" if own else str(file)
+
+
 def quoted(text: str) -> str:
-    """A text as the value of an override, whatever characters it has."""
-    return "'" + text.replace("'", "\\'") + "'"
+    """A text as the value of an override, whatever characters it has.
+
+    A backslash stands for itself, unless it is before a quote or an interpolation, where each must be doubled (Hydra's
+    override grammar, OmegaConf's escapes).
+    """
+    escaped = re.sub(r"(\\*)('|\$\{)", lambda found: f"{found[1] * 2}\\{found[2]}", text)
+    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:

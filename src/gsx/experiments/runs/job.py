@@ -2,7 +2,7 @@
 
 import logging
 import signal
-import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -52,7 +52,7 @@ def interruptible(run: "Run") -> Iterator[object]:
     So do the signals by which a cluster takes a machine back (STOPPING): with a checkpoint at hand they are sent again,
     to whoever waited for them before.
 
-    Yields a listener that takes the handlers away when training is over.
+    Yields a listener that takes the handlers away when training is over. Threads but the main one hear no signals.
     """
     from gsx.core.plugins import hookimpl
 
@@ -72,7 +72,8 @@ def interruptible(run: "Run") -> Iterator[object]:
         def gsx_training_finished(self) -> None:
             give_back()
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *heeded())}
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *heeded()) if main}
     try:
         yield UntilTrained()
     finally:
@@ -88,16 +89,18 @@ def heeded() -> list[signal.Signals]:
     return [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]
 
 
-def train(settings: "Settings", loaded: "Plugins", folders: list[Path] | None = None) -> int:
-    """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which."""
+def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
+    """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which.
+
+    Returns 0, or INTERRUPTED where it was stopped before its end.
+    """
     from gsx.experiments.runs.open import start
 
     if settings.general.reuse:
-        return reused(settings, loaded, [] if folders is None else folders)
+        return reused(settings, loaded, folders)
     with in_use(), ExitStack() as claims:
         run = start(settings, loaded, claims)
-        if folders is not None:
-            folders.append(run.folder)
+        folders.append(run.folder)
         return carry_out(run, settings, loaded)
 
 
@@ -121,13 +124,12 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
                 remove_partial(folder)
                 if not reported(folder):
                     write_report(folder)
-            sys.stdout.write(f"{folder / 'report.html'}\n")
             return 0
         return carry_out(run, settings, loaded)
 
 
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
-    """Train to the end or to Ctrl-C, and say where things are."""
+    """Train to the end or to Ctrl-C, and say then how to go on."""
     from gsx.experiments.runs.execute import execute
 
     onwards = way_on(run, settings)
@@ -140,7 +142,6 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
     if not run.complete:
         say(f"gsx: stopped at step {run.step}; go on with: {onwards}\n", as_error=True)
         return INTERRUPTED
-    say(f"{run.folder / 'report.html'}\n")
     return 0
 
 

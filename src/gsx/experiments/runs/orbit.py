@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.images import refuse_cut
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError, nearest
@@ -209,6 +210,8 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         writer(partial, checked(path, frames), fps)
+        if writer is write_gif:
+            refuse_cut(partial, path)
 
 
 def writer_for(path: Path) -> Callable[[Path, Iterator[Tensor], float], None]:

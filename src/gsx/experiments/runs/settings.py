@@ -116,6 +116,9 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     except OmegaConfBaseException as error:
         raise ConfigError(f"a value cannot be resolved: {first_line(error)}") from error
     assert isinstance(raw, dict)
+    for key, text in texts(raw):
+        if "${" in text:  # an escaped one; it would be looked up when the run's configuration is read
+            raise ConfigError(f"{key} is '{text}'; a run's configuration holds no ${{...}}: name it otherwise")
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}

@@ -1,0 +1,176 @@
+"""gsx from Python: what the command line does, with pictures as tensors and figures as dictionaries.
+
+    import gsx
+
+    run = gsx.train("scene=demo", iterations=300)
+    picture = run.render(run.scene.test[0], zoom=4)
+    print(run.evaluate(zoom=[1, 2, 4])["psnr"])
+
+What the command line tells while it works goes to the logger `gsx`; `gsx.show_messages()` shows it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.cli.messages import set_up_logging as show_messages
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import write_image
+from gsx.core.data.scene import Scene, View
+from gsx.core.errors import InputError
+from gsx.core.gaussians.splat_files import read_gaussians, refuse_suffix, splats_of
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.shapes import Float
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.runs.again import evaluate_again
+from gsx.experiments.runs.compose import compose, quoted
+from gsx.experiments.runs.export import export
+from gsx.experiments.runs.job import train as train_job
+from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.render import view_named
+from gsx.experiments.runs.settings import Settings
+
+__all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedRun:
+    """A run folder, opened: its scene, its model, and what can be done with them."""
+
+    run: Run
+    """Everything: backbone, rasterizer rules, curves (`gsx.core.training.run`)."""
+    settings: Settings
+
+    @property
+    def folder(self) -> Path:
+        """Where config.yaml, metrics.jsonl, evaluation.json, checkpoints, point_cloud.ply and report.html are."""
+        return self.run.folder
+
+    @property
+    def report(self) -> Path:
+        """The page to open."""
+        return self.folder / "report.html"
+
+    @property
+    def step(self) -> int:
+        """Steps trained."""
+        return self.run.step
+
+    @property
+    def scene(self) -> Scene:
+        """Training and test views with their cameras: `scene.test[0].camera`, `scene.test[0].image()`."""
+        return self.run.scene
+
+    def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
+        """The model seen by a camera, or by a view or the camera of the view of that name; colours in [0, 1].
+
+        zoom: times the raster and the focal length.
+
+        Raises:
+            InputError: there is no view of that name; the nearest is told.
+        """
+        view = view_named(self.run, seen) if isinstance(seen, str) else seen
+        camera = view.camera if isinstance(view, View) else view
+        return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image
+
+    def evaluate(self, **options: Any) -> dict[str, Any]:
+        """Judge the run on its test views, as `gsx eval` does: evaluation.json, pictures and report are written anew.
+
+        Options are those of the group eval, for example zoom=[1, 2, 4].
+
+        Raises:
+            ConfigError: there is no such option, or not with that value.
+        """
+        return evaluate_again(self.folder, plugins(), overrides({"eval": options}))
+
+    def export(self, path: str | Path, seen: View | str | None = None) -> Path:
+        """Write the model as a splat file, by suffix; `seen`: only what is drawn for that view.
+
+        Raises:
+            InputError: the suffix is that of no format that is written, or there is no such view.
+        """
+        refuse_suffix(path := Path(path))
+        view = view_named(self.run, seen) if isinstance(seen, str) else seen
+        export(self.run, path, view.camera if view else None)
+        return path
+
+
+@dataclass(eq=False)
+class SplatFile:
+    """The Gaussians of a splat file, by whatever program it was written."""
+
+    path: Path
+    gaussians: Gaussians
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    """Rules it is drawn by: as published for 3D-GS. Files of Mip-Splatting want dilation=0.1, compensate=True."""
+
+    @torch.no_grad()
+    def render(self, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> Float[Tensor, "3 H W"]:
+        """The splats seen by a camera, over a colour; colours in [0, 1]."""
+        splats = splats_of(self.gaussians, camera.centre)
+        over = torch.tensor(background, dtype=torch.float32)
+        return rasterize_tiled(splats, camera, self.raster, background=over).image.clamp_(0, 1)
+
+
+def train(*given: str, **values: Any) -> TrainedRun:
+    """Train, evaluate and report: `gsx GIVEN... KEY=VALUE...`.
+
+    What has dots or a slash in its name is given as on the command line, or as a dictionary:
+    `gsx.train("backbone=mip_splatting", "eval.zoom=[1,2]", training={"supersample": 2}, iterations=900)`.
+
+    Raises:
+        ConfigError, InputError: something is wrong with the configuration or the scene; nothing was made.
+        TrainingError: training went wrong; the run folder holds the last step.
+        KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
+    """
+    folders: list[Path] = []
+    if train_job(compose([*given, *overrides(values)], loaded := plugins()), loaded, folders):
+        raise KeyboardInterrupt(f"gsx resume {folders[0]} goes on")
+    return load_run(folders[0])
+
+
+def load(path: str | Path) -> TrainedRun | SplatFile:
+    """A run folder, or a splat file.
+
+    Raises:
+        InputError: it is neither, or damaged.
+        CheckpointError: the run has no usable checkpoint.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return load_run(path)
+    if not path.exists():
+        raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
+    return SplatFile(path, read_gaussians(path))
+
+
+def load_run(folder: Path) -> TrainedRun:
+    """A run folder; errors as `load`."""
+    return TrainedRun(*open_run(folder, plugins()))
+
+
+def overrides(values: Mapping[str, Any], below: str = "") -> list[str]:
+    """Values by name, nested ones too, as words of the command line."""
+    words = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            words += overrides(value, f"{below}{name}.")
+        else:
+            words.append(f"{below}{name}={text_of(value)}")
+    return words
+
+
+def text_of(value: Any) -> str:
+    """A value as the command line has it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(text_of, value))}]"
+    return quoted(str(value)) if isinstance(value, str | Path) else repr(value)

@@ -1,0 +1,123 @@
+"""gsx from Python: the same as from the command line, as values."""
+
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny import OVERRIDES, final_tensors, tiny_run
+
+import gsx
+from gsx.api import overrides
+from gsx.builtin import plugins
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.files import read_json
+from gsx.experiments.runs.compose import compose
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> gsx.TrainedRun:
+    """A run of three steps, trained in a thread, where signals cannot be heard."""
+    folder = tmp_path_factory.mktemp("api") / "it's a run"
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(gsx.train, *OVERRIDES, iterations=3, folder=folder, eval={"zoom": [1, 2]}).result()
+
+
+def test_training_is_that_of_the_command_line(run: gsx.TrainedRun, tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", ["iterations=3"])
+    expected, found = final_tensors(tmp_path / "run"), final_tensors(run.folder)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    assert run.step == 3
+    assert run.report.is_file()
+
+
+def test_a_view_is_rendered_by_itself_its_name_and_its_camera(run: gsx.TrainedRun) -> None:
+    view = run.scene.test[1]
+    pictures = [run.render(seen, zoom=2) for seen in (view, view.name, view.camera)]
+    assert pictures[0].shape == (3, 72, 96)
+    assert all(torch.equal(pictures[0], other) for other in pictures[1:])
+    assert torch.equal(pictures[0], run.render(view.camera.zoom(2)))
+    with pytest.raises(InputError, match=f"Did you mean '{view.name}'"):
+        run.render(view.name + "x")
+
+
+def test_an_evaluation_is_that_of_the_folder(run: gsx.TrainedRun) -> None:
+    told = run.evaluate(zoom=[1, 4])
+    assert list(told["zoom"]) == ["1", "4"]
+    assert read_json(run.folder / "evaluation.json")["psnr"] == told["psnr"]
+    with pytest.raises(ConfigError, match=r"Did you mean 'eval\.zoom'"):
+        run.evaluate(zom=[1])
+
+
+def test_a_splat_file_draws_what_its_run_does(run: gsx.TrainedRun, tmp_path: Path) -> None:
+    camera, background = run.scene.test[0].camera, tuple(run.scene.background.tolist())
+    splats = gsx.load(run.export(tmp_path / "model.ply"))
+    assert isinstance(splats, gsx.SplatFile)
+    torch.testing.assert_close(splats.render(camera, background), run.render(camera), rtol=0, atol=1e-5)
+    with pytest.raises(InputError, match=r"gsx writes .*\.ply"):
+        run.export(tmp_path / "model.obj")
+
+
+def test_a_folder_is_opened_as_it_was_left(run: gsx.TrainedRun) -> None:
+    opened = gsx.load(run.folder)
+    assert isinstance(opened, gsx.TrainedRun)
+    assert torch.equal(opened.render(opened.scene.test[0]), run.render(run.scene.test[0]))
+    with pytest.raises(InputError, match="does not exist"):
+        gsx.load(run.folder / "nothing")
+
+
+def test_values_become_words_of_the_command_line() -> None:
+    given = {"seed": 3, "eval": {"zoom": [1, 2.5], "quantise": True}, "augmenter": ["upscale"], "folder": None}
+    assert overrides(given) == [
+        "seed=3",
+        "eval.zoom=[1,2.5]",
+        "eval.quantise=true",
+        "augmenter=['upscale']",
+        "folder=null",
+    ]
+
+
+@pytest.mark.parametrize("name", ["it's", "a, b", "[x]", "back\\slash", "q\\'", 'two "', "é=ü", "end\\", "\\\\$a'\\\\"])
+def test_texts_arrive_as_they_are(name: str) -> None:
+    settings = compose([*OVERRIDES, *overrides({"folder": name})], plugins())
+    assert settings.general.folder == name
+
+
+@pytest.mark.parametrize("name", ["${oc.env:HOME}", "x\\${seed}", "\\\\${a}'"])
+def test_texts_are_looked_up_nowhere(name: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(f"folder is '{name}'; a run's configuration holds no")):
+        compose([*OVERRIDES, *overrides({"folder": name})], plugins())
+
+
+@pytest.mark.parametrize("wrong", [{"iteration": 3}, {"eval": {"zoom": "x"}}, {"backbone": "gs4d"}])
+def test_what_is_wrong_is_told_before_there_is_a_folder(wrong: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        gsx.train(*OVERRIDES, folder=tmp_path / "run", **wrong)
+    assert not (tmp_path / "run").exists()
+
+
+def test_names_are_there_before_torch_is() -> None:
+    code = "import sys, gsx; assert 'torch' not in sys.modules; assert gsx.train; assert 'torch' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="it has SplatFile, TrainedRun, load"):
+        gsx.trian  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_page_does_what_it_says(
+    run: gsx.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gsx, "train", lambda *_, **__: run, raising=False)  # trained above
+    exec(page.split("```python\n")[1].split("```")[0], names := {})
+    assert names["picture"].shape == (3, 144, 192)
+    assert names["beside"].shape == (3, 16, 16)
+    assert torch.equal(names["again"].render(names["view"], zoom=4), names["picture"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["four_times.png", "model.ply", "photograph.png"]
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"{run.folder} 3 {run.folder / 'report.html'}"
