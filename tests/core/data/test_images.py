@@ -228,6 +228,36 @@ def test_unwritable_images_leave_nothing_behind(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["folder.png"]
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_a_disk_that_takes_only_a_part_is_noticed(tmp_path: Path, name: str) -> None:
+    picture = torch.rand(3, 100, 100, generator=torch.Generator().manual_seed(0))
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
+        with pytest.raises(InputError, match="cannot be written"):
+            write_image(tmp_path / name, picture)
+
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        try:
+            limited()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert not list(tmp_path.iterdir())
+    write_image(tmp_path / name, picture)
+
+
+def test_no_part_of_a_png_can_be_missed(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", photo((3, 20, 30)))
+    content = (tmp_path / "a.png").read_bytes()
+    assert whole_png(content)
+    assert not any(whole_png(content[:end]) for end in range(len(content)))
+    assert not any(whole_png(content[:at] + content[at + 16 :]) for at in range(8, len(content)))
+
+
 # --- resizing ---
 
 

@@ -275,6 +275,14 @@ def test_pictures_of_an_earlier_evaluation_are_removed_and_others_left(run: Run)
     assert len(list((run.folder / "renders").glob("*.x2.*"))) == 9
 
 
+def test_pictures_of_an_evaluation_that_broke_off_are_removed(run: Run) -> None:
+    (run.folder / "renders" / "index.json").unlink()
+    left = run.folder / "renders" / "gone.x8.enlarged.png"
+    left.write_bytes(b"")
+    write_pictures(run, OPTIONS, figures(run))
+    assert not left.exists()
+
+
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"views": [{"files": {"render": null}}], "zoom": []}'])
 def test_an_index_that_is_none_is_replaced(run: Run, content: str) -> None:
     (run.folder / "renders" / "index.json").write_text(content)

@@ -1,0 +1,80 @@
+"""gsx explain: what is told is what the files say and what is composed."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
+from gsx.core.errors import ConfigError
+from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.explain import entries, explain, parsed
+
+CONF = Path(__file__).parents[3] / "conf"
+
+
+def test_a_value_with_its_range_and_every_file_that_sets_it() -> None:
+    lines = explain("training.supersample", [], plugins())
+    assert lines[:2] == ["training.supersample = 2", "  whole number from 1 to 16"]
+    places = [re.fullmatch(r"  conf/(\S+):(\d+)  (\S+)", line) for line in lines]
+    told = {found[1]: (int(found[2]), found[3]) for found in places if found}
+    assert list(told) == ["preset/zoom.yaml", "config.yaml"]
+    for name, (number, value) in told.items():
+        assert (CONF / name).read_text().splitlines()[number - 1].split("#")[0].strip() == f"supersample: {value}"
+    assert "      through a raster twice as fine, reduced as the photographs were" in lines
+
+
+def test_values_told_are_values_composed() -> None:
+    overrides = [
+        "backbone=octree_scaffold",
+        "preset=octree_zoom",
+        "augmenter=[upscale]",
+        "scene=transforms",
+        "scene.path=x",
+    ]
+    with Compositions(plugins()) as compositions:
+        files = parsed(compositions.sources(overrides))
+        keys, missing = compositions.keys(overrides), []
+        for key in keys:
+            value = compositions.value(overrides[:-1], key)
+            if OmegaConf.is_config(value) and not OmegaConf.is_list(value):
+                continue
+            found = entries(files, key)
+            if not found:
+                missing.append(key)
+            elif "${" not in found[-1].value and found[-1].value != "???":
+                expected = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+                assert yaml.safe_load(found[-1].value) == expected or str(expected) in found[-1].value, key
+    assert len(keys) > 150
+    assert missing == []
+
+
+def test_a_group_has_its_options_and_what_is_below() -> None:
+    lines = explain("backbone=scaffold", [], plugins())
+    assert lines[0] == "backbone"
+    assert any(re.match(r"  mip_splatting +Mip-Splatting \(Yu et al\. 2024\): 3D-GS with a 3D", line) for line in lines)
+    assert any(re.match(r"  growth\.success: 0\.8 +success_threshold$", line) for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("key", "kind"),
+    [
+        ("seed", "whole number from 0 to"),
+        ("eval.zoom", "list of numbers from 0.015625 to 64"),
+        ("rasterizer.compensate", "true or false"),
+        ("backbone.rates.quats", "number from 0 to 1"),
+        ("scene.width", "whole number from"),
+    ],
+)
+def test_kinds(key: str, kind: str) -> None:
+    assert explain(key, [], plugins())[1].strip().startswith(kind)
+
+
+def test_an_unknown_key_gets_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ConfigError, match=r"'trainin\.batch' is no configuration key\. Did you mean 'training\.batch'"):
+        explain("trainin.batch", [], plugins())
+    assert main(["explain", "training.batch", "training.batch=2"]) == 0
+    assert capsys.readouterr().out.startswith("training.batch = 2\n")
