@@ -212,7 +212,7 @@ READERS = {
     "checkpoint": Reader(checkpoint_files, read_checkpoint, PURE),
     "checkpoint of the right digest": Reader(checkpoint_files, read_checkpoint, PURE, settle_checkpoint),
     "checkpoint of the right digest, restored": Reader(checkpoint_files, restore, SLOW, settle_checkpoint),
-    "files of a run": Reader(run_files, read_state, PURE),
+    "files of a run": Reader(run_files, read_state, PURE // 10),
     "files of a run, reported": Reader(run_files, report, SLOW),
     "files of a run, opened": Reader(run_files, restore, SLOW),
 }

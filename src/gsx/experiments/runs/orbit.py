@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import refuse_cut
+from gsx.core.data.images import in_memory
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError, nearest
@@ -210,8 +210,6 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         writer(partial, checked(path, frames), fps)
-        if writer is write_gif:
-            refuse_cut(partial, path)
 
 
 def writer_for(path: Path) -> Callable[[Path, Iterator[Tensor], float], None]:
@@ -262,20 +260,21 @@ def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) 
     """An endless GIF; the delay is rounded to hundredths of a second."""
     import OpenImageIO as oiio
 
-    output = oiio.ImageOutput.create(str(path))
+    output = oiio.ImageOutput.create("gif")
     if output is None:
         raise InputError(f"{path} cannot be written, this OpenImageIO has no GIF writer: use .mp4 instead")
     delay = max(1, round(100 / fps))
     mode = "Create"
-    try:
-        for frame in frames:
-            spec = oiio.ImageSpec(frame.shape[1], frame.shape[0], 3, "uint8")
-            spec.attribute("FramesPerSecond", "rational", (100, delay))
-            if not (output.open(str(path), spec, mode) and output.write_image(frame.numpy())):
-                raise InputError(f"{path} cannot be written ({output.geterror()}): check the folder and its space")
-            mode = "AppendSubimage"
-    finally:
-        output.close()
+    with in_memory(path) as name:
+        try:
+            for frame in frames:
+                spec = oiio.ImageSpec(frame.shape[1], frame.shape[0], 3, "uint8")
+                spec.attribute("FramesPerSecond", "rational", (100, delay))
+                if not (output.open(name, spec, mode) and output.write_image(frame.numpy())):
+                    raise InputError(f"{path} cannot be written ({output.geterror()}): check the folder and its space")
+                mode = "AppendSubimage"
+        finally:
+            output.close()
 
 
 def write_webp(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
