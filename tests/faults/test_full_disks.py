@@ -11,7 +11,7 @@ import pytest
 
 from faults.children import preload, run_in_child
 from faults.record import record, some
-from faults.verbs import VERBS, model_by_name, orphans
+from faults.verbs import VERBS, orphans
 
 pytestmark = pytest.mark.faults
 
@@ -92,7 +92,7 @@ def test_disks_that_are_too_small(tmp_path: Path, part: int) -> None:
         assert run_in_child(RUN, place, tmp_path / "whole").code == 0
         pages = disk.used() // PAGE
         assert pages > 100
-        expected.append(model_by_name(place))
+        expected.append(VERBS["reuse"].result(place))
         shutil.rmtree(place)
         return range(1, pages, max(1, pages // CASES))
 
@@ -111,7 +111,7 @@ def test_disks_that_are_too_small(tmp_path: Path, part: int) -> None:
         disk.resize(LARGE)
         again = run_in_child(RUN, place, tmp_path / "large")
         assert again.code == 0, (pages, again.said)
-        assert model_by_name(place) == expected[0], pages
+        assert VERBS["reuse"].result(place) == expected[0], pages
         assert orphans(place) == [], pages
         shutil.rmtree(place)
 
