@@ -1,5 +1,6 @@
 """gsx from Python: the same as from the command line, as values."""
 
+import math
 import re
 import subprocess
 import sys
@@ -7,11 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tiny import OVERRIDES, final_tensors, tiny_run
 
 import gsx
+import gsx.api
 from gsx.api import overrides
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError, InputError
@@ -71,14 +74,47 @@ def test_a_folder_is_opened_as_it_was_left(run: gsx.TrainedRun) -> None:
         gsx.load(run.folder / "nothing")
 
 
+def test_a_zoom_that_is_none_is_refused(run: gsx.TrainedRun) -> None:
+    for zoom in (0, -1, math.nan):
+        with pytest.raises(InputError, match="give a number above 0"):
+            run.render(run.scene.test[0], zoom)
+
+
+def test_messages_of_a_run_are_kept(run: gsx.TrainedRun) -> None:
+    assert "held-out PSNR" in (run.folder / "log.txt").read_text()
+
+
+def test_an_option_of_any_text_is_judged_by(run: gsx.TrainedRun) -> None:
+    run.evaluate(remedy="it's a \\ 'text'", zoom=np.array([1, 2]))
+    with pytest.raises(ConfigError, match="zoom is a set; give a number"):
+        run.evaluate(zoom={1})
+
+
+def test_what_is_for_the_command_line_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="tables and torchrun are for the command line"):
+        gsx.train("+experiment=table_frameworks", output=tmp_path)
+
+
+def test_names_are_those_of_the_api() -> None:
+    assert list(gsx.OFFERED) == gsx.api.__all__
+    assert {*gsx.OFFERED} <= {*dir(gsx)}
+
+
 def test_values_become_words_of_the_command_line() -> None:
-    given = {"seed": 3, "eval": {"zoom": [1, 2.5], "quantise": True}, "augmenter": ["upscale"], "folder": None}
+    given = {
+        "seed": 3,
+        "eval": {"zoom": [1, 2.5], "quantise": True},
+        "augmenter": ["upscale"],
+        "folder": None,
+        "x": np.int64(3),
+    }
     assert overrides(given) == [
         "seed=3",
         "eval.zoom=[1,2.5]",
         "eval.quantise=true",
         "augmenter=['upscale']",
         "folder=null",
+        "x=3",
     ]
 
 

@@ -16,12 +16,16 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+OFFERED = ("SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image")
+"""Names of `gsx.api`."""
+
 
 def __getattr__(name: str) -> Any:
     """What `gsx.api` offers."""
-    if name.startswith("_"):
-        raise AttributeError(f"module 'gsx' has no attribute '{name}'")
-    api = import_module("gsx.api")
-    if name not in api.__all__:
-        raise AttributeError(f"module 'gsx' has no attribute '{name}'; it has {', '.join(api.__all__)}")
-    return getattr(api, name)
+    if name not in OFFERED:
+        raise AttributeError(f"module 'gsx' has no attribute '{name}'; it has {', '.join(OFFERED)}")
+    return getattr(import_module("gsx.api"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *OFFERED})

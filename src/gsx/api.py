@@ -9,8 +9,10 @@
 What the command line tells while it works goes to the logger `gsx`; `gsx.show_messages()` shows it.
 """
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,10 @@ from gsx.cli.messages import set_up_logging as show_messages
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians, refuse_suffix, splats_of
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Float
 from gsx.core.training.render import render
@@ -36,6 +39,7 @@ from gsx.experiments.runs.job import train as train_job
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.tables.sweep import is_table
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
 
@@ -74,8 +78,10 @@ class TrainedRun:
         zoom: times the raster and the focal length.
 
         Raises:
-            InputError: there is no view of that name; the nearest is told.
+            InputError: there is no view of that name, the nearest is told; or zoom is not above 0.
         """
+        if not 0 < zoom < math.inf:
+            raise InputError(f"zoom is {zoom}; give a number above 0")
         view = view_named(self.run, seen) if isinstance(seen, str) else seen
         camera = view.camera if isinstance(view, View) else view
         return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image
@@ -87,8 +93,10 @@ class TrainedRun:
 
         Raises:
             ConfigError: there is no such option, or not with that value.
+            InputError: somebody trains in the folder, or evaluates it.
         """
-        return evaluate_again(self.folder, plugins(), overrides({"eval": options}))
+        words = [f"eval.{name}={json.dumps(plain(name, value))}" for name, value in options.items()]
+        return evaluate_again(self.folder, plugins(), words)
 
     def export(self, path: str | Path, seen: View | str | None = None) -> Path:
         """Write the model as a splat file, by suffix; `seen`: only what is drawn for that view.
@@ -108,8 +116,8 @@ class SplatFile:
 
     path: Path
     gaussians: Gaussians
-    raster: RasterSettings = field(default_factory=RasterSettings)
-    """Rules it is drawn by: as published for 3D-GS. Files of Mip-Splatting want dilation=0.1, compensate=True."""
+    raster: RasterSettings
+    """Rules it is drawn by; files of Mip-Splatting want dilation=0.1, compensate=True."""
 
     @torch.no_grad()
     def render(self, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> Float[Tensor, "3 H W"]:
@@ -122,22 +130,24 @@ class SplatFile:
 def train(*given: str, **values: Any) -> TrainedRun:
     """Train, evaluate and report: `gsx GIVEN... KEY=VALUE...`.
 
-    What has dots or a slash in its name is given as on the command line, or as a dictionary:
-    `gsx.train("backbone=mip_splatting", "eval.zoom=[1,2]", training={"supersample": 2}, iterations=900)`.
+    What has dots or a slash in its name is given as on the command line, what has dots also as a dictionary:
+    `gsx.train("regenerator/upscale=lanczos", "eval.zoom=[1,2]", training={"supersample": 2}, iterations=900)`.
 
     Raises:
         ConfigError, InputError: something is wrong with the configuration or the scene; nothing was made.
         TrainingError: training went wrong; the run folder holds the last step.
         KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
     """
-    folders: list[Path] = []
-    if train_job(compose([*given, *overrides(values)], loaded := plugins()), loaded, folders):
+    words, folders = [*given, *overrides(values)], list[Path]()
+    if is_table(words) or processes() > 1:
+        raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
+    if train_job(compose(words, loaded := plugins()), loaded, folders):
         raise KeyboardInterrupt(f"gsx resume {folders[0]} goes on")
     return load_run(folders[0])
 
 
-def load(path: str | Path) -> TrainedRun | SplatFile:
-    """A run folder, or a splat file.
+def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
+    """A run folder, or a splat file of any kind that is written; raster: what the latter is drawn by, if not as 3D-GS.
 
     Raises:
         InputError: it is neither, or damaged.
@@ -148,12 +158,12 @@ def load(path: str | Path) -> TrainedRun | SplatFile:
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
-    return SplatFile(path, read_gaussians(path))
+    return SplatFile(path, read_gaussians(path), raster or RasterSettings())
 
 
 def load_run(folder: Path) -> TrainedRun:
     """A run folder; errors as `load`."""
-    return TrainedRun(*open_run(folder, plugins()))
+    return TrainedRun(*open_run(folder.resolve(), plugins()))
 
 
 def overrides(values: Mapping[str, Any], below: str = "") -> list[str]:
@@ -163,14 +173,28 @@ def overrides(values: Mapping[str, Any], below: str = "") -> list[str]:
         if isinstance(value, Mapping):
             words += overrides(value, f"{below}{name}.")
         else:
-            words.append(f"{below}{name}={text_of(value)}")
+            words.append(f"{below}{name}={text_of(plain(name, value))}")
     return words
 
 
 def text_of(value: Any) -> str:
-    """A value as the command line has it."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list | tuple):
+    """A plain value as the command line has it."""
+    if isinstance(value, list):
         return f"[{','.join(map(text_of, value))}]"
-    return quoted(str(value)) if isinstance(value, str | Path) else repr(value)
+    return quoted(value) if isinstance(value, str) else json.dumps(value)
+
+
+def plain(name: str, value: Any) -> Any:
+    """A value as JSON has it: numbers of numpy and torch are those of Python, paths texts.
+
+    Raises:
+        ConfigError: it is of no kind that a configuration holds.
+    """
+    if isinstance(value, list | tuple):
+        return [plain(name, inner) for inner in value]
+    if isinstance(value, Path):
+        return str(value)
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if not (value is None or isinstance(value, bool | int | float | str | list)):
+        raise ConfigError(f"{name} is a {type(value).__name__}; give a number, a text, a list of them, or null")
+    return value

@@ -181,6 +181,12 @@ def test_values_that_follow_from_others_can_be_printed(capsys: pytest.CaptureFix
     assert "iterations: 2000" in printed
 
 
+def test_hydra_s_own_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--hydra-help"])
+    assert "Hydra" in capsys.readouterr().out
+
+
 def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["-sc", "install=bash"]) == 0
     assert "complete " in capsys.readouterr().out

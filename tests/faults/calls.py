@@ -10,6 +10,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from faults.children import Ended, carried_out, command, ended_as
 
 STRACE = shutil.which("strace")
@@ -18,7 +20,6 @@ CHANGING = ("openat", "creat", "write", "pwrite64", "writev", "pwritev", "sendfi
             "mkdir", "mkdirat", "rmdir", "link", "linkat", "symlink", "symlinkat", "chmod", "fchmod", "fchmodat",
             "utimensat")  # fmt: skip
 """System calls that can change what is on a disk."""
-CALL = re.compile(r"^(?P<thread>\d+) +(?P<name>\w+)\((?P<given>.*)$")
 CALL = re.compile(r"^(?P<thread>\d+) +(?P<name>\w+)\((?P<given>.*)$")
 WRITING = re.compile(r"O_WRONLY|O_RDWR|O_CREAT|O_TRUNC")
 NAMED = re.compile(r'(?:\w+<(?P<folder>[^>]*)>, )?"(?P<name>[^"]*)"')
@@ -83,13 +84,17 @@ def traced(words: list[str], place: Path, given: list[str], log: Path | None = N
         os._exit(carried_out(job, place, said))
     os.waitpid(child, os.WUNTRACED)
     options = ["-qq", "-s0", "-y", "-o", str(log or os.devnull), "-p", str(child)]
-    tracer = subprocess.Popen([str(STRACE), *options, *given], stderr=subprocess.DEVNULL)
+    tracer = subprocess.Popen([str(STRACE), *options, *given], stderr=subprocess.PIPE, text=True)
     status = Path(f"/proc/{child}/status")
     while "TracerPid:\t0" in status.read_text():
+        if tracer.poll() is not None:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            pytest.skip(f"strace cannot attach to processes here: {tracer.stderr and tracer.stderr.read()}")
         time.sleep(0.002)
     os.kill(child, signal.SIGCONT)
     ended = ended_as(child, said)
-    tracer.wait()
+    tracer.communicate()
     return ended
 
 
@@ -107,7 +112,10 @@ def killed(words: list[str], place: Path, call: Call) -> Ended:
 
 def failed(words: list[str], place: Path, call: Call, error: str) -> Ended:
     """The command, one of whose calls fails."""
-    return traced(words, place, injected(call, f"error={error}"))
+    log = Path(f"{place}.strace")
+    ended = traced(words, place, injected(call, f"error={error}"), log)
+    assert "(INJECTED)" in log.read_text(errors="replace"), call
+    return ended
 
 
 def injected(call: Call, what: str) -> list[str]:

@@ -14,6 +14,7 @@ with atheris.instrument_imports(include=["gsx"]):
 
 
 def main(name: str, number: str, place: str, runs: str, seed: str) -> None:
+    """Let atheris try so many cases; words of the command line."""
     reader, folder, corpus = READERS[name], Path(place) / "folder", Path(place) / "corpus"
     folder.mkdir()
     corpus.mkdir()

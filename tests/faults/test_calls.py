@@ -16,8 +16,8 @@ PARTS = 4
 NAMES = [name for name in VERBS if name != "train"]
 """Commands that can be given again; `train` is `reuse` in a named folder."""
 ERRORS = ["ENOSPC", "EIO", "EDQUOT"]
-"""In turn; FIRST says with which of them: a run's calls fail with each."""
-FIRST = {True: (0, 1, 2), False: (0,)}
+"""In turn, beginning with each of them for a run, whose calls so fail in all ways."""
+FIRST = [(name, first) for name in NAMES for first in range(3 if name == "reuse" else 1)]
 TITLES = {"reuse": "a run", "table": "a table of two runs", "page": "a page over runs"}
 """What the page says in place of `gsx NAME`."""
 
@@ -53,7 +53,7 @@ def test_killed_at_every_call(tmp_path: Path, name: str, part: int) -> None:
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-@pytest.mark.parametrize(("name", "first"), [(name, first) for name in NAMES for first in FIRST[name == "reuse"]])
+@pytest.mark.parametrize(("name", "first"), FIRST)
 def test_every_call_fails_once(tmp_path: Path, name: str, first: int, part: int) -> None:
     case = prepared(VERBS[name], tmp_path)
     calls = list(enumerate(calls_of(case), first))

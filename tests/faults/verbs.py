@@ -10,7 +10,7 @@ from typing import Any
 
 from tiny import OVERRIDES, tiny_run
 
-from faults.children import Ended, in_child, preload, run_in_child
+from faults.children import in_child, preload, run_in_child
 from gsx.core.cache import IN_USE, released
 
 EVENT = [f"augmenter.upscale.timing.{key}=10000" for key in ("start", "every", "span")]
@@ -68,7 +68,7 @@ def model(place: Path) -> str:
 
 
 def all_of_run(place: Path) -> str:
-    """The same with all results."""
+    """`model` with all other results."""
     return model(place) + everything(place / "run")
 
 
@@ -110,13 +110,13 @@ def model_by_name(place: Path) -> str:
 
 
 def all_by_name(place: Path) -> str:
-    """The same with pictures, splat file, figures and a report that complains of nothing."""
+    """`model_by_name` with all other results."""
     (run,) = place.glob("outputs/demo/gs3d/*")
     return newest(run / "checkpoints") + everything(run)
 
 
 def everything(run: Path) -> str:
-    """Results of a finished run beside its checkpoints."""
+    """Results of a finished run beside its checkpoints: pictures, splat file, figures, a report without complaints."""
     pictures = sorted(path for path in run.rglob("*.png") if "/renders/" in str(path) or "/pseudo/" in str(path))
     assert len(pictures) > 3
     assert 'class="notice' not in (run / "report.html").read_text()
@@ -159,8 +159,6 @@ class Prepared:
     verb: Verb
     place: Path
     template: Path
-    whole: Ended
-    """How it ends when nothing happens to it."""
     expected: str
 
     def put_back(self) -> None:
@@ -183,7 +181,7 @@ def prepared(verb: Verb, folder: Path) -> Prepared:
     shutil.copytree(place, template)
     whole = run_in_child(verb.words, place)
     assert whole.code == 0, whole.said
-    return Prepared(verb=verb, place=place, template=template, whole=whole, expected=verb.result(place))
+    return Prepared(verb=verb, place=place, template=template, expected=verb.result(place))
 
 
 def orphans(place: Path) -> list[str]:

@@ -58,8 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = dispatch(arguments)
         sys.stdout.flush()  # what nobody takes is noticed here, not when Python ends
         return code
-    except BrokenPipeError:
-        return unheard()
+    except BrokenPipeError as error:
+        return unheard(error)
     except BaseException as error:
         return explained(error)
 

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import select
 import sys
 
 from gsx.core.errors import GsxError
@@ -32,11 +33,23 @@ UNHEARD = 128 + 13
 """Exit code where standard output is a pipe that nobody reads any more, as shells tell SIGPIPE."""
 
 
-def unheard() -> int:
-    """Say nothing more on standard output, which nobody reads any more (`gsx plugins | head -3`)."""
+def unheard(error: BrokenPipeError) -> int:
+    """Say nothing more on standard output, if it is that which nobody reads any more (`gsx plugins | head -3`)."""
+    if not unread():
+        return explained(error)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
     return UNHEARD
+
+
+def unread() -> bool:
+    """Whether standard output is a pipe without a reader."""
+    try:
+        watched = select.poll()
+        watched.register(sys.stdout.fileno(), 0)
+    except (AttributeError, OSError, ValueError):  # Windows has no poll, notebooks no number of the file
+        return False
+    return any(event & select.POLLERR for _, event in watched.poll(0))
 
 
 def os_sentence(error: OSError) -> str:

@@ -50,11 +50,14 @@ def verb_render(arguments: list[str]) -> int:
 
 
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN [FILE.ply] [--view NAME]"""
-    parser = argparse.ArgumentParser(prog="gsx export", description="Write a splat file (PLY), read back and compared.")
+    """gsx export RUN [FILE] [--view NAME] [--axes rub|rdf]"""
+    told = "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .glb."
+    parser = argparse.ArgumentParser(prog="gsx export", description=told)
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
+    parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
+                        "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
     given = parser.parse_args(arguments)
     from gsx.core.files import remove_partial
     from gsx.core.gaussians.splat_files import refuse_suffix
@@ -68,8 +71,8 @@ def verb_export(arguments: list[str]) -> int:
     view = view_named(run, given.view) if given.view else None
     path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
     remove_partial(path.parent, below=False)
-    if export(run, path, view.camera if view else None):
+    if export(run, path, view.camera if view else None, given.axes):
         views = [view] if view else run.scene.test
-        logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views))
+        logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views, given.axes))
     sys.stdout.write(f"{path}\n")
     return 0

@@ -53,10 +53,10 @@ def verb_train(arguments: list[str]) -> int:
     return tell_report(code, folders[0])
 
 
-def tell_report(code: int, folder: Path) -> int:
+def tell_report(code: int, *folders: Path) -> int:
     """Say where the report of a run is that has come to its end; returns the exit code."""
     if code == 0:
-        say(f"{folder / 'report.html'}\n")
+        say("".join(f"{folder / 'report.html'}\n" for folder in folders))
     return code
 
 
@@ -78,9 +78,11 @@ def hand_to_hydra(arguments: list[str]) -> int:
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
     loaded = plugins()
     if not {"-m", "--multirun"} & set(arguments):
-        with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
-            hydra_main(arguments, loaded, sweep_job)
-        sys.stdout.write(text.getvalue())
+        try:
+            with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
+                hydra_main(arguments, loaded, sweep_job)
+        finally:  # it may end the program
+            sys.stdout.write(text.getvalue())
         return 0
     given = [word for word in arguments if not word.startswith("-")]
     sweep = new_sweep(check_overrides(given, loaded))
@@ -127,7 +129,6 @@ def sweep_job(config: Any) -> int:
     folders: list[Path] = []
     try:
         code = train(settings_from(config, loaded := plugins()), loaded, folders)
-        tell_report(code, folders[0])
     except GsxError as error:
         code = complain(str(error))
     except OSError as error:
@@ -142,7 +143,7 @@ def sweep_job(config: Any) -> int:
         write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
     if code == INTERRUPTED:
         raise KeyboardInterrupt
-    return code
+    return tell_report(code, *folders)
 
 
 def verb_resume(arguments: list[str]) -> int:

@@ -235,7 +235,7 @@ def test_unwritable_images_leave_nothing_behind(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
 def test_a_disk_that_takes_nothing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(images, "replacing", lambda path: nullcontext(Path("/dev/full")))
-    with pytest.raises(InputError, match=f"{name}' cannot be written .No space left"):
+    with pytest.raises(InputError, match=f"{name}' cannot be written .No space left on device., free some space"):
         write_image(tmp_path / name, photo((3, 200, 200)))
 
 

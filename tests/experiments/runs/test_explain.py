@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from omegaconf import OmegaConf
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.runs.explain import entries, explain, parsed
+from gsx.experiments.runs.explain import entries, explain, parsed, value_at
+from gsx.experiments.runs.settings import dotted
 
 CONF = Path(__file__).parents[3] / "conf"
 
@@ -36,18 +36,15 @@ def test_values_told_are_values_composed() -> None:
         "scene.path=x",
     ]
     with Compositions(plugins()) as compositions:
-        files = parsed(compositions.sources(overrides))
-        keys, missing = compositions.keys(overrides), []
-        for key in keys:
-            value = compositions.value(overrides[:-1], key)
-            if OmegaConf.is_config(value) and not OmegaConf.is_list(value):
-                continue
-            found = entries(files, key)
-            if not found:
-                missing.append(key)
-            elif "${" not in found[-1].value and found[-1].value != "???":
-                expected = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
-                assert yaml.safe_load(found[-1].value) == expected or str(expected) in found[-1].value, key
+        files, values = parsed(compositions.sources(overrides)), compositions.values(overrides)
+    keys, missing = [key for key in dotted(values) if not isinstance(value_at(key, values), dict)], []
+    for key in keys:
+        value, found = value_at(key, values), entries(files, key)
+        if not found:
+            missing.append(key)
+        elif "${" not in found[-1].value and value != "x":
+            told = yaml.safe_load(found[-1].value)
+            assert told == value or float(told) == value, key  # YAML takes 1e-4 for a text
     assert len(keys) > 150
     assert missing == []
 

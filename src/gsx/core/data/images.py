@@ -3,6 +3,7 @@
 Images are uint8 display values [C, H, W], red first, alpha (if any) straight and last.
 """
 
+import errno
 import os
 import shutil
 from collections import OrderedDict
@@ -101,7 +102,8 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
             if not buffer.write(name, fileformat=path.suffix[1:].lower()):
                 raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder's space.")
     except OSError as problem:
-        raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), remove what is in its way.") from None
+        remedy = "free some space" if problem.errno in (errno.ENOSPC, errno.EDQUOT) else "remove what is in its way"
+        raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), {remedy}.") from None
 
 
 @contextmanager
@@ -114,7 +116,7 @@ def in_memory(place: Path) -> Iterator[str]:
     if not hasattr(os, "memfd_create") or not os.path.isdir("/proc/self/fd"):
         yield str(place)
         return
-    with open(os.memfd_create(place.name), "rb") as memory:
+    with open(os.memfd_create("gsx"), "rb") as memory:
         yield f"/proc/self/fd/{memory.fileno()}"
         with place.open("wb") as file:
             shutil.copyfileobj(memory, file)

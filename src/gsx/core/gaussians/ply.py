@@ -58,12 +58,56 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     rows = np.empty(next(iter(counts)), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
     for name, column in columns.items():
         rows[name] = column
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
-    header += [f"element vertex {len(rows)}", *(f"property {names[code]} {name}" for name, code in codes.items())]
+    header = header_of({"vertex": (len(rows), {name: names[code] for name, code in codes.items()})}, comments)
     try:
-        replace_file(path, "\n".join([*header, "end_header", ""]).encode("ascii") + rows.tobytes())
+        replace_file(path, header + rows.tobytes())
     except OSError as problem:
         raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space.") from None
+
+
+def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: Iterable[str] = ()) -> bytes:
+    """The header of a binary file; elements: how many there are of each name, and their properties with PLY's types."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
+    for name, (count, properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {kind} {inner}" for inner, kind in properties.items())]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def elements_of(content: bytes) -> dict[str, np.ndarray]:
+    """All elements of a binary file by name, as structured arrays.
+
+    Raises:
+        InputError: it is no binary PLY of scalar properties, or ends early.
+    """
+    body = content.find(b"\n", content.find(b"end_header")) + 1
+    lines = [line.split() for line in content[:body].decode("latin-1").splitlines()]
+    if not content.startswith(b"ply") or not body or ["format", "binary_little_endian", "1.0"] not in lines:
+        raise InputError("it is no binary PLY with a complete header: export it anew")
+    found: dict[str, np.ndarray] = {}
+    for name, count, kinds in _elements(lines):
+        if len(content) - body < count * kinds.itemsize:
+            raise InputError(f"it ends within its element '{name}': copy or export it anew")
+        found[name] = np.frombuffer(content, kinds, count, body)
+        body += count * kinds.itemsize
+    return found
+
+
+def _elements(lines: list[list[str]]) -> list[tuple[str, int, np.dtype]]:
+    """Name, number and type of the elements that a header tells."""
+    starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
+    found = []
+    for start, stop in zip(starts, [*starts[1:], len(lines)], strict=True):
+        words = lines[start]
+        properties = [line for line in lines[start:stop] if line[:1] == ["property"]]
+        if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MOST_DIGITS:
+            raise InputError(f"'{' '.join(words)}' names no element with its number: export it anew")
+        if not properties or any(len(one) != 3 or one[1] not in TYPES for one in properties):
+            raise InputError(f"its element '{words[1]}' has not only scalar properties: export it anew")
+        if len({name for _, _, name in properties}) < len(properties):
+            raise InputError(f"its element '{words[1]}' names a property twice: export it anew")
+        kinds = np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
+        found.append((words[1], int(words[2]), kinds))
+    return found
 
 
 def plain(comment: str) -> str:

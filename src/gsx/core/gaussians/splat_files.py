@@ -1,4 +1,4 @@
-"""Splat files: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), written and read back."""
+"""Splat files by suffix: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), and compact ones."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,19 +9,31 @@ from torch import Tensor
 
 from gsx.core.data.camera import offsets_from
 from gsx.core.errors import InputError
+from gsx.core.files import replace_file
+from gsx.core.gaussians.arrays import Arrays, arrays_of, gaussians_from
+from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.core.gaussians.glb import decode_glb, encode_glb
 from gsx.core.gaussians.ply import read_ply, write_ply
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.gaussians.spz import decode_spz, encode_spz
 from gsx.core.shapes import Float
 
-SUFFIXES = (".ply",)
-"""Of the files that are written."""
+SUFFIXES = (".compressed.ply", ".ply", ".spz", ".glb")
+"""Of the files that are written and read; the longer of two that fit first."""
+STANDARD = ".ply"
+"""Nothing is lost in it, and a backbone's own file is one."""
+
+
+def suffix_of(path: Path) -> str:
+    """Which of SUFFIXES a name has; empty: none."""
+    return next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), "")
 
 
 def refuse_suffix(path: Path) -> None:
     """Raise InputError if the name promises a format that is not written."""
-    if path.suffix.lower() not in SUFFIXES:
-        better = path.parent / f"{path.stem or 'model'}{SUFFIXES[0]}"
+    if not suffix_of(path):
+        better = path.parent / f"{path.stem or 'model'}{STANDARD}"
         raise InputError(f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {better}")
 
 
@@ -39,13 +51,34 @@ def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
     return columns
 
 
-def write_gaussians(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
-    """Write a splat file.
+def write_gaussians(
+    path: Path, gaussians: Gaussians, comments: Sequence[str] = (), compensated: bool = False, axes: str = "rub"
+) -> None:
+    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; axes: of SPZ.
 
     Raises:
-        InputError: a value is not finite; the property and the number of rows are named.
+        InputError: a value is not finite; the property and the number of rows are named. Or the format cannot hold
+            the splats.
     """
-    write_columns(path, columns_of(gaussians), comments)
+    suffix = suffix_of(path)
+    if suffix in (STANDARD, ""):
+        write_columns(path, columns_of(gaussians), comments)
+    else:
+        write_compact(path, suffix, arrays_of(gaussians), comments, compensated, axes)
+
+
+def write_compact(
+    path: Path, suffix: str, arrays: Arrays, comments: Sequence[str], compensated: bool, axes: str
+) -> None:
+    """Write a splat file that is no standard PLY; errors as `write_gaussians`."""
+    if suffix == ".spz":
+        content = encode_spz(arrays, compensated, axes)
+    else:
+        content = (encode_glb if suffix == ".glb" else encode_compressed_ply)(arrays, comments)
+    try:
+        replace_file(path, content)
+    except OSError as problem:
+        raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space") from None
 
 
 def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = ()) -> None:
@@ -58,12 +91,29 @@ def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: S
     write_ply(path, columns, comments)
 
 
-def read_gaussians(path: Path) -> Gaussians:
-    """Read a splat file of any SH degree.
+def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
+    """Read a splat file of any SH degree, of the kind that its suffix says. axes: of SPZ, which does not tell.
 
     Raises:
-        InputError: a property is missing.
+        InputError: it is damaged, or lacks a property.
     """
+    suffix = suffix_of(path)
+    return read_standard(path) if suffix in (STANDARD, "") else gaussians_from(read_compact(path, suffix, axes))
+
+
+def read_compact(path: Path, suffix: str, axes: str) -> Arrays:
+    """Read a splat file that is no standard PLY; errors as `read_gaussians`."""
+    try:
+        content = path.read_bytes()
+        if suffix == ".spz":
+            return decode_spz(content, axes)
+        return decode_glb(content) if suffix == ".glb" else decode_compressed_ply(content)
+    except (OSError, InputError) as problem:
+        raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
+
+
+def read_standard(path: Path) -> Gaussians:
+    """Read a standard PLY; errors as `read_gaussians`."""
     columns = {name: torch.from_numpy(value.astype(np.float32)) for name, value in read_ply(path).items()}
 
     def column(name: str) -> Tensor:

@@ -116,8 +116,8 @@ def forget(folder: Path) -> None:
     """Remove the pictures of an earlier evaluation, be it one that did not come to its end; first their index."""
     (folder / "index.json").unlink(missing_ok=True)
     for path in folder.iterdir():
-        if DRAWN.fullmatch(path.name):
-            path.unlink()
+        if DRAWN.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def extremes(qualities: Sequence[float | None]) -> tuple[int, int]:

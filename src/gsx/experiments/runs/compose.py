@@ -103,11 +103,15 @@ class Compositions:
         """Options of a group."""
         return listed(group)
 
+    def values(self, overrides: Sequence[str]) -> Any:
+        """A whole composition as plain values, unchecked."""
+        return OmegaConf.to_container(compose_raw(overrides), resolve=True)
+
     def groups(self) -> list[str]:
         """Configuration groups, nested ones included."""
         return known_groups()
 
-    def sources(self, overrides: Sequence[str]) -> list["Source"]:
+    def sources(self, overrides: Sequence[str]) -> list[Source]:
         """Files of gsx and of plugins that a composition is made of, in the order in which they are merged."""
         from hydra.core.global_hydra import GlobalHydra
         from hydra.types import RunMode
@@ -119,7 +123,8 @@ class Compositions:
 
     def file(self, name: str) -> Path:
         """The file of an option `GROUP/NAME`, in gsx's configuration or in a plugin's; it may not exist."""
-        modules = [MODULE, *(path.removeprefix("pkg://") for path in self.plugins.config_paths)]
+        paths = [path for path in self.plugins.config_paths if path.startswith("pkg://")]
+        modules = [MODULE, *(path.removeprefix("pkg://") for path in paths)]
         files = [Path(str(resources.files(module))) / f"{name}.yaml" for module in modules]
         return next((file for file in files if file.is_file()), files[0])
 
@@ -162,7 +167,7 @@ def quoted(text: str) -> str:
     override grammar, OmegaConf's escapes).
     """
     escaped = re.sub(r"(\\*)('|\$\{)", lambda found: f"{found[1] * 2}\\{found[2]}", text)
-    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
+    return "'" + re.sub(r"(\\+)\Z", r"\1\1", escaped) + "'"
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
@@ -263,7 +268,7 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
     """Dotted keys of the composition made from the group choices alone."""
     from hydra import compose as hydra_compose
 
-    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],]+$", o) and o.split("=")[0] in known_groups()]
+    choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],']+$", o) and o.split("=")[0] in known_groups()]
     return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
 
 

@@ -19,7 +19,7 @@ from gsx.experiments.runs.settings import Settings, dotted
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
 WIDTH = 110
-"""Characters of a comment where it shares a line."""
+"""Characters of a comment where it shares a line with a key or an option."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +54,35 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
     with Compositions(plugins) as compositions:
         if option:
             overrides, key = [*overrides, key], group
-        settings, groups = compositions.settings(overrides), compositions.groups()
-        known = dict.fromkeys([*compositions.keys(overrides), *groups])
+        values, groups = compositions.values(overrides), compositions.groups()
+        known = dict.fromkeys([*dotted(values), *groups])
         if key not in known:
             raise ConfigError(f"'{key}' is no configuration key.{nearest(key, known)} `gsx --cfg job` lists all keys")
-        sources, node = parsed(compositions.sources(overrides)), settings.resolved
-        lines = [headline(key, node)]
-        lines += [f"  {text}" for text in (kind_of(key, settings),) if text]
-        lines += [f"  {line}" for entry in reversed(entries(sources, key)) for line in told(entry)]
+        settings, files = compositions.settings(overrides), parsed(compositions.sources(overrides))
+        dotted_key = key.replace("/", ".")  # where what a nested group holds is
+        lines = [headline(key, values), *indented(kind_of(key, settings))]
+        lines += indented(
+            *(f"command line  {word.partition('=')[2]}" for word in overrides if word.startswith(f"{key}="))
+        )
+        lines += indented(*(line for entry in reversed(entries(files, dotted_key)) for line in told(entry)))
         if key in groups:
-            lines += ["", f"{key}=NAME, one of"] + [
-                f"  {name:24} {head_of(compositions.file(f'{key}/{name}'))}" for name in compositions.choices(key)
-            ]
-        return lines + below(key, node, sources)
+            lines += ["", f"{key}=NAME, one of (* chosen)", *options_of(key, compositions, files)]
+        return lines + below(dotted_key, values, files)
+
+
+def indented(*texts: str) -> list[str]:
+    """Those that are not empty, below a headline."""
+    return [f"  {text}" for text in texts if text]
+
+
+def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) -> list[str]:
+    """Options of a group, a line each; those of the composition are marked."""
+    chosen = {file.source.file for file in files}
+    lines = []
+    for name in compositions.choices(group):
+        file = compositions.file(f"{group}/{name}")
+        lines.append(f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip())
+    return lines
 
 
 def headline(key: str, node: dict[str, Any]) -> str:
@@ -86,7 +102,8 @@ def value_at(key: str, node: Any) -> Any:
 
 def written(value: Any) -> str:
     """A value as the command line has it."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1 << 20).removesuffix("\n...\n").strip()
+    text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20, allow_unicode=True)
+    return text.removesuffix("\n...\n").strip()
 
 
 def told(entry: Entry) -> list[str]:
@@ -106,7 +123,7 @@ def below(key: str, node: dict[str, Any], sources: Sequence[Parsed]) -> list[str
         if not isinstance(value, dict):
             found = entries(sources, f"{key}.{name}")
             comment = next((entry.comment for entry in reversed(found) if entry.comment), "")
-            lines.append(f"  {f'{name}: {written(value)}':34} {comment}"[: WIDTH + 40].rstrip())
+            lines.append(f"  {f'{name}: {written(value)}':34} {comment[:WIDTH]}".rstrip())
     return lines
 
 

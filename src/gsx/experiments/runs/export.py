@@ -6,7 +6,15 @@ from pathlib import Path
 from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.errors import InputError
+from gsx.core.gaussians.splat_files import (
+    STANDARD,
+    read_gaussians,
+    splats_of,
+    suffix_of,
+    write_columns,
+    write_gaussians,
+)
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
@@ -17,13 +25,19 @@ from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 
 
-def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
+def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub") -> bool:
     """Write the backbone's splat file, or what it draws for one camera as a standard one; returns whether it is one.
 
-    The comments hold the conventions that a viewer must know.
+    The comments hold the conventions that a viewer must know. axes: of SPZ.
+
+    Raises:
+        InputError: the model has no standard form, and the suffix is that of a format that holds no other; or the
+            format cannot hold the splats.
     """
     own = run.backbone if isinstance(run.backbone, WithOwnFile) else None
     columns = own.file_columns() if own and camera is None else None
+    if columns is not None and suffix_of(path) != STANDARD:
+        raise InputError(f"{path}: this model has splats for one view alone: add --view NAME, or write a .ply")
     comments = [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
@@ -34,7 +48,8 @@ def export(run: Run, path: Path, camera: Camera | None = None) -> bool:
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
     if columns is None:
-        write_gaussians(path, run.backbone.explicit(camera, run.model_step), comments)
+        explicit = run.backbone.explicit(camera, run.model_step)
+        write_gaussians(path, explicit, comments, run.raster.compensate, axes)
     else:
         write_columns(path, columns, comments)
     return columns is None
@@ -66,11 +81,12 @@ def render_mode(raster: RasterSettings) -> str:
     return "mip" if raster.compensate else "default"
 
 
-def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View]) -> str:
+def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View], axes: str = "rub") -> str:
     """PSNR between the model and its exported standard file, both rendered from up to five views."""
-    gaussians, pixels = read_gaussians(path), settings.evaluation.tile_pixels
+    gaussians, pixels = read_gaussians(path, axes), settings.evaluation.tile_pixels
     figures = []
     for view in views[:5]:
         again = render(run, view.camera, pixels, splats=splats_of(gaussians, view.camera.centre))
         figures.append(psnr(again.image, render(run, view.camera, pixels).image))
-    return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical)"
+    size = path.stat().st_size / 1e6
+    return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical), {size:,.2f} MB"

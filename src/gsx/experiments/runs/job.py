@@ -37,11 +37,14 @@ def logged_to(folder: Path) -> Iterator[None]:
     handler = logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
-    logging.getLogger("gsx").addHandler(handler)
+    root = logging.getLogger("gsx")
+    if root.level == logging.NOTSET:  # from Python, where nobody has asked for messages
+        root.setLevel(logging.INFO)
+    root.addHandler(handler)
     try:
         yield
     finally:
-        logging.getLogger("gsx").removeHandler(handler)
+        root.removeHandler(handler)
         handler.close()
 
 

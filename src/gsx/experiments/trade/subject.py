@@ -13,7 +13,7 @@ from gsx.core.data.camera import NEAR, Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.neighbours import mean_square_distance
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of
+from gsx.core.gaussians.splat_files import SUFFIXES, read_gaussians, splats_of, suffix_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -72,8 +72,9 @@ def open_subject(target: Path | None, overrides: Sequence[str], views: int, plug
         raise InputError(
             f"'{target}' does not exist: give a run folder, a splat file, or nothing for the built-in scene"
         )
-    if target.suffix.lower() != ".ply":
-        raise InputError(f"'{target}' is neither a run folder nor a splat file (.ply): `gsx export RUN` writes one")
+    if not suffix_of(target):
+        kinds = ", ".join(SUFFIXES)
+        raise InputError(f"'{target}' is neither a run folder nor a splat file ({kinds}): `gsx export RUN` writes one")
     return subject_of_file(target, overrides, views, plugins)
 
 

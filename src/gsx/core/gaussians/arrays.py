@@ -1,0 +1,92 @@
+"""Gaussians as arrays of numpy in the units that compact files hold, and what their formats share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsx.core.errors import InputError
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.shapes import Float, Int
+
+SMALLEST_OPACITY = 1e-6
+"""Opacities read as 0 or 1 are this far from it: their logits are finite."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Arrays:
+    """N Gaussians, float64."""
+
+    means: Float[np.ndarray, "N 3"]
+    log_scales: Float[np.ndarray, "N 3"]
+    quats: Float[np.ndarray, "N 4"]
+    """(w, x, y, z), unit."""
+    opacities: Float[np.ndarray, "N"]
+    """In [0, 1]."""
+    sh_dc: Float[np.ndarray, "N 3"]
+    sh_rest: Float[np.ndarray, "N B 3"]
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return degree_of(self.sh_rest.shape[1])
+
+
+def degree_of(coefficients: int) -> int:
+    """Degree of spherical harmonics with so many coefficients beside the constant one."""
+    return round((coefficients + 1) ** 0.5) - 1
+
+
+def arrays_of(gaussians: Gaussians) -> Arrays:
+    """Arrays of Gaussians; a zero quaternion is the identity.
+
+    Raises:
+        InputError: a value is not finite; which, and in how many rows, is told.
+    """
+    raw = {name: value.detach().double().cpu().numpy() for name, value in vars(gaussians).items()}
+    for name, value in raw.items():
+        bad = int((~np.isfinite(value)).sum())
+        if bad:
+            raise InputError(f"no splat file is written: {bad} of {value.size} values of '{name}' are not finite")
+    quats = raw["quats"]
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0])
+    return Arrays(
+        means=raw["means"],
+        log_scales=raw["log_scales"],
+        quats=unit,
+        opacities=1 / (1 + np.exp(-raw["opacity_logits"].clip(-700, 700))),
+        sh_dc=raw["sh_dc"],
+        sh_rest=raw["sh_rest"],
+    )
+
+
+def gaussians_from(arrays: Arrays) -> Gaussians:
+    """Gaussians of arrays, float32."""
+    inner = arrays.opacities.clip(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
+    raw = vars(arrays) | {"opacity_logits": np.log(inner / (1 - inner))}
+    raw.pop("opacities")
+    return Gaussians(**{name: torch.from_numpy(value.astype(np.float32)) for name, value in raw.items()})
+
+
+def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """The nearest whole numbers, halves away from zero."""
+    return np.copysign(np.floor(np.abs(values) + 0.5), values)
+
+
+def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    """(index of the largest component, the others in their order, signed so that the largest is positive)."""
+    largest = np.abs(quats).argmax(1)
+    rows = np.arange(len(quats))
+    signs = np.where(quats[rows, largest] < 0, -1.0, 1.0)
+    others = np.stack([np.delete(np.arange(4), index) for index in range(4)])[largest]
+    return largest, quats[rows[:, None], others] * signs[:, None]
+
+
+def from_smallest_three(largest: Int[np.ndarray, "N"], three: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
+    """Unit quaternions of `smallest_three`."""
+    others = np.stack([np.delete(np.arange(4), index) for index in range(4)])[largest]
+    quats, rows = np.empty((len(three), 4)), np.arange(len(three))
+    quats[rows[:, None], others] = three
+    quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
