@@ -25,7 +25,8 @@ from gsx.core.data.images import read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import GsxError
 from gsx.core.gaussians.ply import read_ply, write_ply
-from gsx.core.gaussians.splat_files import read_gaussians
+from gsx.core.gaussians.splat_files import read_gaussians, write_gaussians
+from gsx.core.gaussians.splats import Gaussians
 from gsx.core.training import checkpoint
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
@@ -184,6 +185,25 @@ def read_splats(folder: Path) -> None:
     read_gaussians(folder / "run" / "point_cloud.ply")
 
 
+COMPACT = ("a.compressed.ply", "a.spz", "a.glb")
+
+
+def compact(folder: Path) -> list[Path]:
+    values = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
+    made = Gaussians(means=values, log_scales=values - 4, quats=values[:, [0, 1, 2, 0]], opacity_logits=values[:, 0],
+                     sh_dc=values, sh_rest=values[:, None].repeat(1, 3, 1))  # fmt: skip
+    for name in COMPACT:
+        write_gaussians(folder / name, made)
+    return [folder / name for name in COMPACT]
+
+
+def read_compact(folder: Path) -> None:
+    for name in COMPACT:
+        read = read_gaussians(folder / name)
+        assert len({len(column) for column in vars(read).values()}) == 1
+        assert all(bool(torch.isfinite(column).all()) for column in vars(read).values()), name
+
+
 def images(folder: Path) -> list[Path]:
     picture = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
     for suffix in ("png", "jpg"):
@@ -203,6 +223,7 @@ def describe_folder(folder: Path) -> None:
 READERS = {
     "PLY": Reader(cloud, read_clouds, PURE),
     "splat file": Reader(splats, read_splats, PURE),
+    "compact splat file": Reader(compact, read_compact, PURE // 10),
     "transforms.json": Reader(scene_files("transforms"), load("transforms"), PURE),
     "transforms of NeRF-synthetic": Reader(scene_files("blender"), load("blender"), PURE),
     "COLMAP binary": Reader(scene_files("bin"), load("colmap"), NATIVE * 5),

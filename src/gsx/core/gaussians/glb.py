@@ -138,7 +138,8 @@ def accessed(document: Any, body: bytes, index: int) -> Float[np.ndarray, "N k"]
         raise ValueError("its attributes are no floats side by side")
     if not (isinstance(count, int) and count >= 1 and isinstance(start, int) and start >= 0):
         raise ValueError("an accessor is of nothing")
-    return np.frombuffer(body, "<f4", count * width, start).reshape(count, width).astype(float)
+    with np.errstate(invalid="ignore"):  # nan of any kind, refused later
+        return np.frombuffer(body, "<f4", count * width, start).reshape(count, width).astype(float)
 
 
 def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
