@@ -35,7 +35,8 @@ test-faults: $(READY_DEV)
 # Some two minutes of them, for CI.
 test-faults-short: $(READY_DEV)
 	GSX_FAULTS=0.02 $(PYTEST) -m faults --dist load $(addprefix tests/faults/, test_readers.py test_pages.py test_keys.py \
-	  'test_calls.py::test_killed_at_every_call[reuse-0]' 'test_calls.py::test_every_call_fails_once[eval-0-0]' 'test_signals.py::test_signals_at_random_moments[0]' \
+	  'test_calls.py::test_killed_at_every_call[reuse-0]' 'test_calls.py::test_every_call_fails_once[eval-0-0]' \
+	  'test_signals.py::test_signals_at_random_moments[0]' \
 	  'test_options.py::test_every_number[0]' 'test_full_disks.py::test_disks_that_are_too_small[0]' \
 	  'test_together.py::test_two_at_once[resume-resume-0]')
 

@@ -68,8 +68,13 @@ def model(place: Path) -> str:
 
 
 def all_of_run(place: Path) -> str:
-    """`model` with all other results."""
-    return model(place) + everything(place / "run")
+    """All results of the run `run`."""
+    return all_of(place / "run")
+
+
+def all_of(run: Path) -> str:
+    """The newest checkpoint of a run folder, and all other results."""
+    return newest(run / "checkpoints") + everything(run)
 
 
 def newest(folder: Path) -> str:
@@ -110,9 +115,9 @@ def model_by_name(place: Path) -> str:
 
 
 def all_by_name(place: Path) -> str:
-    """`model_by_name` with all other results."""
+    """All results of the only run, which is named by its composition."""
     (run,) = place.glob("outputs/demo/gs3d/*")
-    return newest(run / "checkpoints") + everything(run)
+    return all_of(run)
 
 
 def everything(run: Path) -> str:

@@ -59,8 +59,17 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     for name, column in columns.items():
         rows[name] = column
     header = header_of({"vertex": (len(rows), {name: names[code] for name, code in codes.items()})}, comments)
+    write_whole(path, header + rows.tobytes())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes a file of points or splats; it appears whole or not at all.
+
+    Raises:
+        InputError: it cannot be written.
+    """
     try:
-        replace_file(path, header + rows.tobytes())
+        replace_file(path, content)
     except OSError as problem:
         raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space.") from None
 

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from gsx.core.data.camera import offsets_from
 from gsx.core.errors import InputError
-from gsx.core.files import replace_file
-from gsx.core.gaussians.arrays import Arrays, arrays_of, gaussians_from
+from gsx.core.gaussians.arrays import Arrays, arrays_of, degree_of, gaussians_from
 from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.core.gaussians.glb import decode_glb, encode_glb
-from gsx.core.gaussians.ply import read_ply, write_ply
+from gsx.core.gaussians.ply import read_ply, write_ply, write_whole
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.gaussians.spz import decode_spz, encode_spz
@@ -75,10 +74,7 @@ def write_compact(
         content = encode_spz(arrays, compensated, axes)
     else:
         content = (encode_glb if suffix == ".glb" else encode_compressed_ply)(arrays, comments)
-    try:
-        replace_file(path, content)
-    except OSError as problem:
-        raise InputError(f"'{path}' cannot be written ({problem.strerror}), check the folder and its space") from None
+    write_whole(path, content)
 
 
 def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = ()) -> None:
@@ -138,7 +134,7 @@ def read_standard(path: Path) -> Gaussians:
 
 def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
     """What a viewer of the file draws: all bands active (3D-GS, sh_utils.py)."""
-    degree = round((gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
+    degree = degree_of(gaussians.sh_rest.shape[1])
     return Splats(
         means=gaussians.means,
         scales=gaussians.log_scales.exp(),

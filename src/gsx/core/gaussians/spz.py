@@ -19,8 +19,6 @@ from gsx.core.gaussians.arrays import (
 )
 from gsx.core.shapes import Float, UInt8
 
-AXES = ("rub", "rdf")
-"""Of the file: the specification's, or those of training worlds."""
 MAGIC, VERSION = 0x5053474E, 3
 HEADER = struct.Struct("<IIIBBBB")
 FRACTION_BITS = 12
