@@ -67,6 +67,13 @@ def run_files(folder: Path) -> list[Path]:
     return [folder / "run" / name for name in names]
 
 
+def json_files(folder: Path) -> list[Path]:
+    """The same beside a configuration that is read at once: YAML takes most of the time."""
+    files = run_files(folder)
+    files[0].write_text("iterations: 2\nscene: {name: demo}\nbackbone: {name: gs3d}\naugmenter: {}\n")
+    return files[1:]
+
+
 def checkpoint_files(folder: Path) -> list[Path]:
     example_run(folder)
     sidecar = checkpoint.sidecars(folder / "run" / "checkpoints")[-1]
@@ -234,6 +241,7 @@ READERS = {
     "checkpoint of the right digest": Reader(checkpoint_files, read_checkpoint, PURE, settle_checkpoint),
     "checkpoint of the right digest, restored": Reader(checkpoint_files, restore, SLOW, settle_checkpoint),
     "files of a run": Reader(run_files, read_state, PURE // 10),
+    "JSON files of a run": Reader(json_files, read_state, PURE),
     "files of a run, reported": Reader(run_files, report, SLOW),
     "files of a run, opened": Reader(run_files, restore, SLOW),
 }
