@@ -25,8 +25,9 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.splat_files import read_gaussians, refuse_suffix, splats_of
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.suffixes import refuse_suffix
 from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Float

@@ -18,13 +18,14 @@ from torch.nn.functional import logsigmoid
 from gsx.backbones import mip
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import candidates
-from gsx.backbones.mip import MipOptions, filter_sizes, logit_of_log, smoothed
+from gsx.backbones.mip import MipOptions, filter_sizes
 from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.ply import read_ply
+from gsx.core.gaussians.smoothing import logit_of_log, smoothed
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric

@@ -16,8 +16,16 @@ pytestmark = [
 ]
 
 RUNS = 10_000
-FILES = [("PLY", 0), ("PLY", 1), ("transforms.json", 0), ("transforms of NeRF-synthetic", 0), ("JSON files of a run", 0),
-         ("JSON files of a run", 2), ("JSON files of a run", 3), ("checkpoint of the right digest", 0)]  # fmt: skip
+FILES = [
+    ("PLY", 0),
+    ("PLY", 1),
+    ("transforms.json", 0),
+    ("transforms of NeRF-synthetic", 0),
+    ("JSON files of a run", 0),
+    ("JSON files of a run", 2),
+    ("JSON files of a run", 3),
+    ("checkpoint of the right digest", 0),
+]
 """Reader, and number of its file."""
 
 

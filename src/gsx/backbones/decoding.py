@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from gsx.backbones.heads import Heads
-from gsx.backbones.mip import Filter, logit_of_log
+from gsx.backbones.mip import Filter
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Float, Int

@@ -8,7 +8,8 @@ from torch.nn.functional import logsigmoid
 
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
-from gsx.backbones.mip import Filter, logit_of_log
+from gsx.backbones.mip import Filter
+from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.density import room_under, zero_statistics
 from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column

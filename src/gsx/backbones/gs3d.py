@@ -11,12 +11,15 @@ from torch.nn.functional import normalize
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
-from gsx.backbones.mip import absorb, filter_named, logit_of_log
+from gsx.backbones.mip import absorb, filter_named
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
+from gsx.core.errors import InputError
+from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering
@@ -41,6 +44,20 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
     }
 
 
+def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
+    """Raw parameters of Gaussians with colours of that degree; bands that they lack are zero.
+
+    Raises:
+        InputError: they have more bands.
+    """
+    rest, bands = gaussians.sh_rest, (sh_degree + 1) ** 2 - 1
+    if rest.shape[1] > bands:
+        degree = degree_of(rest.shape[1])
+        raise InputError(f"init: the file has colours of degree {degree}, backbone.sh_degree is {sh_degree}: raise it")
+    missing = rest.new_zeros(len(rest), bands - rest.shape[1], 3)
+    return vars(gaussians) | {"sh_dc": gaussians.sh_dc[:, None], "sh_rest": torch.cat([rest, missing], 1)}
+
+
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """The backbones gs3d, gs3d_zoom and mip_splatting."""
     return GS3D(options, context, AllVisible(), CloneSplit())
@@ -59,6 +76,7 @@ class GS3D:
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, density.stop)
         self.raster = self.filter.rules(context.raster)
         self.absolute_gradient, self.finer_after = density.absolute, context.finer_after
+        self.first_degree = 0
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
 
@@ -72,11 +90,34 @@ class GS3D:
             gradient_statistics(len(points), device, self.absolute_gradient),
         )
 
+    def go_on_from(self, gaussians: Gaussians) -> None:
+        """Take Gaussians of a file, which are drawn as they are: what the 3D filter adds is taken off them first.
+
+        Raises:
+            InputError: they have more bands of colour than the model, or the model has levels, which no file tells.
+        """
+        if not isinstance(self.visibility, AllVisible):
+            raise InputError("init: a splat file says nothing of levels: choose backbone=gs3d or mip_splatting")
+        raw, device = raw_parameters(gaussians, self.options.sh_degree), self.table["means"].device
+        self.first_degree = self.options.sh_degree
+        self.table = ParameterTable(
+            {name: Parameter(value.to(device)) for name, value in raw.items()},
+            {},
+            gradient_statistics(len(gaussians.means), device, self.absolute_gradient),
+        )
+        self.filter.refresh(self.table, self.table["means"])
+        if "filter" in self.table.columns:
+            with torch.no_grad():
+                before = unsmoothed(raw["log_scales"], raw["opacity_logits"], self.table["filter"].to(raw["means"]))
+                for name, value in zip(("log_scales", "opacity_logits"), before, strict=True):
+                    self.table[name].copy_(value)
+
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def active_degree(self, step: int) -> int:
         """SH degree at a step (3D-GS, sh_utils.py)."""
-        return min(self.options.sh_degree, step // max(1, self.schedule.step(self.options.sh_every)))
+        grown = step // max(1, self.schedule.step(self.options.sh_every))
+        return max(self.first_degree, min(self.options.sh_degree, grown))
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
         """The Gaussians that the camera draws, with their colours as seen from there."""

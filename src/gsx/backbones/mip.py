@@ -14,6 +14,7 @@ from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.gaussians.smoothing import LEAST_SHARE, logit_of_log, smoothed
 from gsx.core.ranges import Interval, Range, Steps
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -25,8 +26,6 @@ FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")
 LEAST_DEPTH = 1e-3
 """Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
-LEAST_SHARE = 1e-30
-"""Of a scale in what the 3D filter makes of it: nothing is seen of a primitive near it, and gradients stay finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,17 +229,6 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
     return torch.where(seen, nearest, farthest) / focal * options.variance**0.5
 
 
-def smoothed(
-    scales: Float[Tensor, "N 3"], log_opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Scales and log-opacities after the 3D filter, differentiable in both (Mip-Splatting, get_scaling_with_3D_filter).
-
-    The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
-    """
-    wide = torch.hypot(scales, sizes[:, None])
-    return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
-
-
 @torch.no_grad()
 def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tensor, "N"]) -> None:
     """Change stored scales and opacities so that what is drawn stays as it is when the 3D filter goes from sizes
@@ -250,9 +238,3 @@ def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tenso
     log_opacities = logsigmoid(table["opacity_logits"]) + (scales / wider).clamp_min(LEAST_SHARE).log().sum(1)
     table["log_scales"].copy_(wider.log())
     table["opacity_logits"].copy_(logit_of_log(log_opacities))
-
-
-def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """ln(o / (1 - o)) from ln o <= 0, accurate at both ends: logsigmoid backwards."""
-    below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).tiny)
-    return below - torch.log(-torch.expm1(below))

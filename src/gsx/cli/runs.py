@@ -3,24 +3,43 @@
 import argparse
 import logging
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import run_arguments
+from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
+from gsx.core.gaussians.suffixes import suffix_of
+from gsx.experiments.runs.job import train
 
 logger = logging.getLogger("gsx.cli")
 
 
 def verb_eval(arguments: list[str]) -> int:
-    """gsx eval RUN [KEY=VALUE ...]"""
-    told = "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it."
+    """gsx eval RUN|FILE [KEY=VALUE ...]"""
+    told = (
+        "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it; or a splat "
+        "file of any program on a scene, in a run folder of its own: gsx eval FILE scene=colmap scene.path=FOLDER"
+    )
     folder, overrides = run_arguments("eval", arguments, told)
+    if suffix_of(folder) and not folder.is_dir():
+        return evaluate_file(folder, overrides)
     from gsx.experiments.runs.again import evaluate_again
 
     evaluate_again(folder, plugins(), overrides)
     sys.stdout.write(f"{folder / 'report.html'}\n")
     return 0
+
+
+def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
+    """gsx eval FILE scene=... [KEY=VALUE ...]"""
+    from gsx.experiments.runs.compose import compose
+    from gsx.experiments.runs.start_file import composition_of
+
+    folders: list[Path] = []
+    code = train(compose(composition_of(path, overrides), loaded := plugins()), loaded, folders)
+    return tell_report(code, *folders)
 
 
 def verb_render(arguments: list[str]) -> int:
@@ -60,7 +79,7 @@ def verb_export(arguments: list[str]) -> int:
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
     given = parser.parse_args(arguments)
     from gsx.core.files import remove_partial
-    from gsx.core.gaussians.splat_files import refuse_suffix
+    from gsx.core.gaussians.suffixes import refuse_suffix
     from gsx.experiments.runs.export import export, reimport_psnr
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.render import view_named

@@ -1,11 +1,13 @@
 """Splat files by suffix: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), and compact ones."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import offsets_from
 from gsx.core.errors import InputError
@@ -13,27 +15,21 @@ from gsx.core.gaussians.arrays import Arrays, arrays_of, degree_of, gaussians_fr
 from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.core.gaussians.glb import decode_glb, encode_glb
 from gsx.core.gaussians.ply import read_ply, write_ply, write_whole
-from gsx.core.gaussians.sh import colours_of
+from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.smoothing import logit_of_log, smoothed
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.gaussians.spz import decode_spz, encode_spz
+from gsx.core.gaussians.spz import decode_spz, encode_spz, is_antialiased
+from gsx.core.gaussians.suffixes import STANDARD, suffix_of
 from gsx.core.shapes import Float
 
-SUFFIXES = (".compressed.ply", ".ply", ".spz", ".glb")
-"""Of the files that are written and read; the longer of two that fit first."""
-STANDARD = ".ply"
-"""Nothing is lost in it, and a backbone's own file is one."""
+logger = logging.getLogger(__name__)
 
-
-def suffix_of(path: Path) -> str:
-    """Which of SUFFIXES a name has; empty: none."""
-    return next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), "")
-
-
-def refuse_suffix(path: Path) -> None:
-    """Raise InputError if the name promises a format that is not written."""
-    if not suffix_of(path):
-        better = path.parent / f"{path.stem or 'model'}{STANDARD}"
-        raise InputError(f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {better}")
+MOST_LOGIT = 30.0
+"""What infinite logits, of opacities 0 and 1, are read as."""
+MOST_COEFFICIENTS = 15
+"""Beside the constant one, of degree 3."""
+MODE_WORDS = ("splatrendermode:", "antialiased")
+"""First words of the comments that say how a file is to be drawn."""
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
@@ -109,27 +105,101 @@ def read_compact(path: Path, suffix: str, axes: str) -> Arrays:
 
 
 def read_standard(path: Path) -> Gaussians:
-    """Read a standard PLY; errors as `read_gaussians`."""
+    """Read a standard PLY, with what programs are known to write otherwise; errors as `read_gaussians`.
+
+    Properties are found by name. Colours may be bytes (nerfstudio) and bands beyond degree 3 are left out; a 3D filter
+    beside the scales is fused (Mip-Splatting, training); rows that are not finite go, as viewers have it.
+    """
     columns = {name: torch.from_numpy(value.astype(np.float32)) for name, value in read_ply(path).items()}
 
     def column(name: str) -> Tensor:
         if name not in columns:
-            raise InputError(f"{path} lacks property '{name}': it is no splat file of 3D-GS")
+            flat = ", it holds flat splats (2DGS)" if name == "scale_2" and "scale_1" in columns else ""
+            raise InputError(f"{path} lacks property '{name}': it is no splat file of 3D-GS{flat}")
         return columns[name]
 
-    def stack(prefix: str, count: int) -> Tensor:
-        return torch.stack([column(f"{prefix}{i}") for i in range(count)], 1)
+    def stack(*names: str) -> Tensor:
+        return torch.stack([column(name) for name in names], 1)
 
-    bands = sum(name.startswith("f_rest_") for name in columns) // 3
-    rest = stack("f_rest_", 3 * bands) if bands else torch.zeros(len(column("x")), 0)
-    return Gaussians(
-        means=torch.stack([column(axis) for axis in "xyz"], 1),
-        log_scales=stack("scale_", 3),
-        quats=stack("rot_", 4),
-        opacity_logits=column("opacity"),
-        sh_dc=stack("f_dc_", 3),
-        sh_rest=rest.view(len(rest), 3, bands).transpose(1, 2),
-    )
+    raw = {
+        "means": stack(*"xyz"),
+        "log_scales": stack(*(f"scale_{i}" for i in range(3))),
+        "quats": stack(*(f"rot_{i}" for i in range(4))),
+        "opacity_logits": column("opacity").nan_to_num(torch.nan, MOST_LOGIT, -MOST_LOGIT),
+        "sh_dc": constant_colours(columns, path)
+        if "f_dc_0" not in columns
+        else stack(*(f"f_dc_{i}" for i in range(3))),
+        "sh_rest": higher_bands(columns, path),
+    }
+    if "filter_3D" in columns:
+        scales, log_opacities = smoothed(
+            raw["log_scales"].exp(), logsigmoid(raw["opacity_logits"]), columns["filter_3D"]
+        )
+        raw |= {"log_scales": scales.log(), "opacity_logits": logit_of_log(log_opacities)}
+    return Gaussians(**finite_rows(raw, path))
+
+
+def constant_colours(columns: dict[str, Float[Tensor, "N"]], path: Path) -> Float[Tensor, "N 3"]:
+    """Coefficients of the constant band from colours in bytes.
+
+    Raises:
+        InputError: there are none.
+    """
+    names = ("red", "green", "blue")
+    if not set(names) <= columns.keys():
+        raise InputError(f"{path} lacks property 'f_dc_0', or red, green and blue: it is no splat file of 3D-GS")
+    return constant_from_colour(torch.stack([columns[name] for name in names], 1) / 255)
+
+
+def higher_bands(columns: dict[str, Float[Tensor, "N"]], path: Path) -> Float[Tensor, "N B 3"]:
+    """Coefficients beside the constant one, up to degree 3; f_rest is channel-major.
+
+    Raises:
+        InputError: there are not as many as any degree has.
+    """
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count not in (3 * ((degree + 1) ** 2 - 1) for degree in range(5)):
+        raise InputError(f"{path} has {count} f_rest properties: degrees 0 to 4 have 0, 9, 24, 45 or 72")
+    rows, names = len(columns["x"]), [f"f_rest_{i}" for i in range(count)]
+    if not set(names) <= columns.keys():
+        raise InputError(f"{path} does not number its f_rest properties from 0 to {count - 1}: export it anew")
+    values = torch.stack([columns[name] for name in names], 1) if names else torch.zeros(rows, 0)
+    return values.view(rows, 3, count // 3).transpose(1, 2)[:, :MOST_COEFFICIENTS]
+
+
+def finite_rows(raw: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """The rows that are finite in everything; how many others there were goes to the log."""
+    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) if value.ndim > 1 else torch.isfinite(value)
+                          for value in raw.values()]).all(0)  # fmt: skip
+    if bool(finite.all()):
+        return raw
+    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", path,
+                   int((~finite).sum()), len(finite))  # fmt: skip
+    return {name: value[finite] for name, value in raw.items()}
+
+
+def compensated(path: Path) -> bool:
+    """Whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
+
+    SPZ has a flag for it; PLY a comment, `SplatRenderMode: mip` (Brush, SuperSplat) or `antialiased 1` (Postshot), of
+    which the last counts.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+    except OSError as problem:
+        raise InputError(f"'{path}' cannot be read: {problem.strerror}") from None
+    if suffix_of(path) == ".spz":
+        return is_antialiased(head)
+    if suffix_of(path) == ".glb":
+        return False
+    lines = head.partition(b"end_header")[0].decode("latin-1").lower().splitlines()
+    words = [line.split()[1:] for line in lines if line.startswith("comment ")]
+    told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
+    return bool(told) and told[-1]
 
 
 def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
@@ -139,7 +209,7 @@ def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats
         means=gaussians.means,
         scales=gaussians.log_scales.exp(),
         quats=gaussians.quats,
-        log_opacities=torch.nn.functional.logsigmoid(gaussians.opacity_logits),
+        log_opacities=logsigmoid(gaussians.opacity_logits),
         colours=colours_of(
             gaussians.sh_dc[:, None],
             gaussians.sh_rest,

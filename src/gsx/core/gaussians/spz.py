@@ -114,6 +114,15 @@ def decode_spz(content: bytes, axes: str = "rub") -> Arrays:
     return flipped(arrays) if axes == "rub" else arrays
 
 
+def is_antialiased(head: bytes) -> bool:
+    """Whether the header says that opacities are compensated; False for what is no SPZ."""
+    try:
+        header = unzipped(head, HEADER.size)
+    except InputError:
+        return False
+    return len(header) == HEADER.size and bool(HEADER.unpack(header)[5] & ANTIALIASED)
+
+
 def unzipped(content: bytes, most: int) -> bytes:
     """So many bytes of a gzip stream, or all that it has.
 

@@ -163,6 +163,19 @@ class WithOwnFile(Protocol):
         ...
 
 
+@runtime_checkable
+class FromGaussians(Protocol):
+    """A backbone that can go on from a standard splat file (`init=FILE`)."""
+
+    def go_on_from(self, gaussians: Gaussians) -> None:
+        """Take these in the place of what it was built with; no band of their colours waits for a later step.
+
+        Raises:
+            InputError: it cannot, as it is composed.
+        """
+        ...
+
+
 @torch.no_grad()
 def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: int) -> int:
     """Remove rows with values that are not finite, or that one of the cameras cannot draw; returns how many.

@@ -25,7 +25,7 @@ class Schedule:
 
     def shortened(self, exponent: float) -> float:
         """How many times fewer steps this run takes than the published one, to a power; 1 for longer runs."""
-        return max(1.0, self.published_iterations / self.iterations) ** exponent
+        return max(1.0, self.published_iterations / max(1, self.iterations)) ** exponent
 
 
 def log_linear(step: int, steps: int, first: float, last: float) -> float:

@@ -1,17 +1,28 @@
 """Options of a run as a whole."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
+from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.options import label, without_effect
-from gsx.core.ranges import MOST_STEPS, Gigabytes, Interval, Range, Seed, Steps
+from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Steps
+
+BEGINNINGS = ("scratch", "warm_start")
+"""Values of `init` that are no file; both train the same."""
+
+
+def splat_file(init: Any) -> Path | None:
+    """The splat file that a value of `init` names; None: it names none."""
+    return None if init is None or init in BEGINNINGS else Path(str(init))
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeneralOptions:
     """Top-level values; conf/config.yaml gives them."""
 
-    iterations: Interval
+    iterations: Steps
+    """0: what a splat file holds is evaluated as it is (`init`)."""
     seed: Seed
     device: str = without_effect()
     output: str = without_effect()
@@ -25,14 +36,19 @@ class GeneralOptions:
     reuse: bool = without_effect(default=False)
     """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
     init: str = without_effect(default="scratch")
-    """scratch, or warm_start: branch from an earlier run that differs in its augmenters alone (`warm_start`)."""
+    """scratch; warm_start: branch from an earlier run that differs in its augmenters alone (`warm_start`); or a splat
+    file that Gaussians go on from, which does count for what is trained (`run_key`)."""
     warm_start_at: Annotated[list[int], Range(1, MOST_STEPS)] = without_effect(default_factory=list)
     """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
     disk_cache_gb: Gigabytes = without_effect(default=20.0)
     """For what runs share: states, reconstructions, undistorted and redrawn pictures, networks."""
 
     def __post_init__(self) -> None:
-        if self.init not in ("scratch", "warm_start"):
-            raise ValueError(f"init is '{self.init}'; choose scratch or warm_start")
+        file = splat_file(self.init)
+        if file is not None and not suffix_of(file):
+            kinds = ", ".join(SUFFIXES)
+            raise ValueError(f"init is '{self.init}'; choose scratch, warm_start, or a splat file ({kinds})")
+        if self.iterations < 1 and file is None:
+            raise ValueError("iterations is 0; give 1 or more steps, or init=FILE, a splat file to evaluate as it is")
         if self.reuse and self.folder:
             raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")

@@ -5,10 +5,10 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import content_key
+from gsx.core.cache import content_key, file_stamp
 from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
-from gsx.experiments.run_folder.general_options import GeneralOptions
+from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.stamps import tree_stamp
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
@@ -26,7 +26,8 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     counts.
     """
     kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *EVALUATION)}
-    return kept | {"regenerator": asked_for(kept)}
+    begun = {"init": "splat file"} if splat_file(config.get("init")) else {}
+    return kept | {"regenerator": asked_for(kept)} | begun
 
 
 def asked_for(config: dict[str, Any]) -> dict[str, Any]:
@@ -44,11 +45,18 @@ def without(node: Any, keys: Collection[str], prefix: str = "") -> Any:
 
 
 def scene_stamp(config: dict[str, Any]) -> str:
-    """What the scene of a composition holds: names, sizes and times of the files in its folder, wherever that lies.
+    """What the scene of a composition holds: names, sizes and times of the files in its folder, wherever that lies;
+    and of the splat file that it begins with, if there is one.
 
     Empty for scenes without a folder; `absent: FOLDER` where it is not there. Files outside of the folder count if an
     option of the scene names them.
     """
+    of_folder, file = folder_stamp(config), splat_file(config.get("init"))
+    return content_key(of_folder, file_stamp(file)) if file is not None and file.is_file() else of_folder
+
+
+def folder_stamp(config: dict[str, Any]) -> str:
+    """See `scene_stamp`."""
     scene = part(config, "scene")
     if not scene.get("path"):
         return ""

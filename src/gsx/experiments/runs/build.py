@@ -2,6 +2,7 @@
 
 import os
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,18 @@ from torch import Tensor
 from gsx.core.cache import cache_root
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
+from gsx.core.gaussians.splats import Gaussians
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
+from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
+from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
 
 
 def choose_device(name: str) -> torch.device:
@@ -59,9 +63,16 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
-def build(settings: Settings, scene: Scene, folder: Path, training: bool = False) -> Run:
+def build(
+    settings: Settings, scene: Scene, folder: Path, training: bool = False, start: Gaussians | None = None
+) -> Run:
     """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
-    rasterizer that suits training. Looking at a run needs none of what its regenerators need."""
+    rasterizer that suits training. Looking at a run needs none of what its regenerators need. start: content of the
+    splat file that it begins with, where it does; None: a checkpoint is to take its place.
+
+    Raises:
+        ConfigError: the backbone cannot begin with a file.
+    """
     general, ranks = settings.general, ranks_here()
     device = placed(choose_device(general.device))
     if training:
@@ -85,7 +96,12 @@ def build(settings: Settings, scene: Scene, folder: Path, training: bool = False
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
 
-    backbone = anew(scene, general.iterations, generator)
+    if splat_file(general.init):
+        only = start or in_front_of(scene.train[0].camera)
+        backbone = anew(replace(scene, points=one_point(only)), general.iterations, generator)
+        go_on_from(backbone, only, settings.backbone.component.name)
+    else:
+        backbone = anew(scene, general.iterations, generator)
     augmenters = build_augmenters(settings, scene) if training else []
     run = Run(
         config=settings.resolved,

@@ -7,14 +7,8 @@ from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
-from gsx.core.gaussians.splat_files import (
-    STANDARD,
-    read_gaussians,
-    splats_of,
-    suffix_of,
-    write_columns,
-    write_gaussians,
-)
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.gaussians.suffixes import STANDARD, suffix_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE

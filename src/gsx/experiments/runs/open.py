@@ -34,6 +34,7 @@ from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
+from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
 
@@ -82,7 +83,9 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
-    run = build(settings, ranks.rank0_first(lambda: verified(load_scene(settings))), Path(), training=True)
+    start = starting_splats(settings)
+    scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
+    run = build(settings, scene, Path(), training=True, start=start)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run, training=True)

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share, beyond_range
@@ -21,7 +22,7 @@ from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
-from gsx.experiments.run_folder.general_options import GeneralOptions
+from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
 
 COMPONENT_KINDS = ("scene", "backbone")
@@ -121,6 +122,8 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
             raise ConfigError(f"{key} is '{text}'; a run's configuration holds no ${{...}}: name it otherwise")
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
+    if (file := splat_file(raw.get("init"))) is not None and suffix_of(file):
+        raw["init"] = str(file.expanduser().resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}
     checks = {r: typed(Checks, n, f"checks.{r}") for r, n in named_nodes(values.pop("checks", None), "checks").items()}
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)

@@ -13,8 +13,9 @@ from gsx.core.data.camera import NEAR, Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.neighbours import mean_square_distance
-from gsx.core.gaussians.splat_files import SUFFIXES, read_gaussians, splats_of, suffix_of
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float

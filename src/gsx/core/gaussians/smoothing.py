@@ -1,0 +1,42 @@
+"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, section 5.1) on scales and opacities."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from gsx.core.shapes import Float
+
+LEAST_SHARE = 1e-30
+"""Of a scale in what the 3D filter makes of it: nothing is seen of a primitive near it, and gradients stay finite."""
+LEAST_BEFORE, MOST_BEFORE = 0.1, 0.999
+"""Scales, of the filter, and opacities that a file's splats are taken to have had before the filter."""
+
+
+def smoothed(
+    scales: Float[Tensor, "N 3"], log_opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Scales and log-opacities after the 3D filter, differentiable in both (Mip-Splatting, get_scaling_with_3D_filter).
+
+    The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
+    """
+    wide = torch.hypot(scales, sizes[:, None])
+    return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
+
+
+def unsmoothed(
+    log_scales: Float[Tensor, "N 3"], opacity_logits: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Log-scales and logits that `smoothed` makes into those given, as far as there are any: scales at least a tenth of
+    the filter, which would have no gradient at 0, and opacities below 1."""
+    scales, sizes = log_scales.exp(), sizes[:, None]
+    narrow = (scales.square() - sizes.square()).clamp_min(0).sqrt().maximum(LEAST_BEFORE * sizes)
+    log_opacities = logsigmoid(opacity_logits) + (scales.maximum(sizes) / narrow).log().sum(1)
+    return narrow.log(), logit_of_log(log_opacities.clamp_max(math.log(MOST_BEFORE)))
+
+
+def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """ln(o / (1 - o)) from ln o <= 0, accurate at both ends: logsigmoid backwards."""
+    below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).tiny)
+    return below - torch.log(-torch.expm1(below))

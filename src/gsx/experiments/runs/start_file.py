@@ -1,0 +1,92 @@
+"""Runs that begin with somebody's splat file (`init=FILE`) instead of a scene's points."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import PointCloud
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.gaussians.sh import constant_from_colour
+from gsx.core.gaussians.splat_files import compensated, read_gaussians
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.training.backbone import Backbone, FromGaussians
+from gsx.experiments.run_folder.general_options import splat_file
+from gsx.experiments.runs.compose import quoted
+from gsx.experiments.runs.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+OWN_KEYS = ("backbone", "augmenter", "init", "iterations", "variant", "preset", "budget", "experiment")
+"""What `gsx eval FILE` sets, or what trains: nothing of it can be overridden."""
+MIP_KERNEL = 0.1
+"""px^2 by which models of Mip-Splatting are dilated, with opacities compensated (Yu et al. 2024)."""
+
+
+def starting_splats(settings: Settings) -> Gaussians | None:
+    """The Gaussians that a run begins with; None: it begins with points.
+
+    Raises:
+        InputError: the file cannot be read, or holds nothing.
+    """
+    path = splat_file(settings.general.init)
+    if path is None:
+        return None
+    gaussians = read_gaussians(path)
+    if not len(gaussians.means):
+        raise InputError(f"init: {path} holds no splats: choose another file")
+    logger.info("beginning with the %d splats of %s", len(gaussians.means), path)
+    return gaussians
+
+
+def go_on_from(backbone: Backbone[Tensor], gaussians: Gaussians, name: str) -> None:
+    """Give Gaussians to a backbone in place of what it was built with.
+
+    Raises:
+        ConfigError: it cannot go on from any.
+        InputError: not from these.
+    """
+    if not isinstance(backbone, FromGaussians):
+        raise ConfigError(f"backbone={name} cannot begin with a splat file: choose backbone=gs3d, or leave out init")
+    backbone.go_on_from(gaussians)
+
+
+def in_front_of(camera: Camera) -> Gaussians:
+    """One splat on the camera's axis: it stands in until a checkpoint is read."""
+    ahead = camera.centre + camera.rotation[2].to(camera.centre)
+    return Gaussians(
+        means=ahead[None].float(),
+        log_scales=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        opacity_logits=torch.zeros(1),
+        sh_dc=constant_from_colour(torch.full((1, 3), 0.5)),
+        sh_rest=torch.zeros(1, 0, 3),
+    )
+
+
+def one_point(gaussians: Gaussians) -> PointCloud:
+    """The first of them as a point: a backbone is built from points, and is given the splats then."""
+    return PointCloud(positions=gaussians.means[:1], colours=torch.full((1, 3), 128, dtype=torch.uint8))
+
+
+def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
+    """Words of the command line that evaluate a splat file on a scene, drawn as it is.
+
+    Raises:
+        ConfigError: an override is about what the file is not, or no scene is given.
+    """
+    for word in overrides:
+        if word.lstrip("+~").partition("=")[0].partition(".")[0].partition("/")[0] in OWN_KEYS:
+            raise ConfigError(f"gsx eval {path} draws the file as it is: leave out '{word}', or train with init={path}")
+    if not any(word.startswith(("scene=", "dataset=")) for word in overrides):
+        raise ConfigError(f"gsx eval {path} needs the photographs to compare with: scene=... scene.path=FOLDER")
+    if not path.is_file():
+        raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
+    words = ["backbone=gs3d", f"init={quoted(str(path))}", "iterations=0"]
+    if compensated(path) and not any(word.startswith("rasterizer.") for word in overrides):
+        words += [f"rasterizer.dilation={MIP_KERNEL}", "rasterizer.compensate=true"]
+        logger.info("%s says that its opacities are compensated: drawn with %s", path, " ".join(words[3:]))
+    return [*words, *overrides]

@@ -1,0 +1,152 @@
+"""PLY files as other programs write them: made here by hand, property by property, and read by name."""
+
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsx.core.errors import InputError
+from gsx.core.gaussians.splat_files import compensated, read_gaussians, write_gaussians
+from gsx.core.gaussians.splats import Gaussians
+
+C0 = 0.28209479177387814
+VALUES = {"x": 1.0, "y": -2.0, "z": 0.5, "opacity": 0.847298, "scale_0": -4.60517, "scale_1": -3.91202,
+          "scale_2": -2.99573, "rot_0": 0.8, "rot_1": 0.0, "rot_2": 0.6, "rot_3": 0.0, "f_dc_0": 1.0, "f_dc_1": 0.0,
+          "f_dc_2": -1.0}  # fmt: skip
+"""Of one splat; f_rest_i is i / 100, zero what else is asked for."""
+XYZ, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
+SCALES, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+
+
+def rest(count: int) -> list[str]:
+    return [f"f_rest_{i}" for i in range(count)]
+
+
+ORDERS = {
+    "INRIA": [*XYZ, *NORMALS, *DC, *rest(45), "opacity", *SCALES, *ROTATION],
+    "gsplat": [*XYZ, *DC, *rest(45), "opacity", *SCALES, *ROTATION],
+    "Brush": [*XYZ, *SCALES, "opacity", *ROTATION, *DC, *rest(45)],
+    "Octree-GS, with a column of its own": [*XYZ, "level", *DC, *rest(45), "opacity", *SCALES, *ROTATION],
+}
+
+
+def value_of(name: str) -> float:
+    return int(name.removeprefix("f_rest_")) / 100 if name.startswith("f_rest_") else VALUES.get(name, 0.0)
+
+
+def written(
+    path: Path, names: Sequence[str], rows: Sequence[dict[str, float]] = ({},), comments: Sequence[str] = (),
+    types: dict[str, str] | None = None,
+) -> Path:  # fmt: skip
+    """A file of these properties; each row says what it has otherwise than VALUES."""
+    types = types or {}
+    kinds = [types.get(name, "float") for name in names]
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment {one}" for one in comments)]
+    head += [f"element vertex {len(rows)}", *(f"property {k} {n}" for k, n in zip(kinds, names, strict=True))]
+    code = "<" + "".join({"float": "f", "uchar": "B", "double": "d"}[kind] for kind in kinds)
+    body = [struct.pack(code, *(row.get(name, value_of(name)) for name in names)) for row in rows]
+    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + b"".join(body))
+    return path
+
+
+@pytest.mark.parametrize("program", ORDERS)
+def test_properties_are_found_by_name_in_any_order(tmp_path: Path, program: str) -> None:
+    read = read_gaussians(written(tmp_path / "a.ply", ORDERS[program]))
+    assert read.means.tolist() == [[1.0, -2.0, 0.5]]
+    assert read.opacity_logits.tolist() == [pytest.approx(0.847298)]
+    assert read.log_scales[0].tolist() == pytest.approx([-4.60517, -3.91202, -2.99573])
+    assert read.quats[0].tolist() == pytest.approx([0.8, 0.0, 0.6, 0.0])
+    assert read.sh_dc.tolist() == [[1.0, 0.0, -1.0]]
+    # all red coefficients, then green, then blue: coefficient k of channel c is f_rest_(15 c + k)
+    assert read.sh_rest.shape == (1, 15, 3)
+    assert read.sh_rest[0, 4].tolist() == pytest.approx([0.04, 0.19, 0.34])
+
+
+@pytest.mark.parametrize(("count", "bands"), [(0, 0), (9, 3), (24, 8), (72, 15)])
+def test_bands_of_other_degrees(tmp_path: Path, count: int, bands: int) -> None:
+    names = [*XYZ, *DC, *rest(count), "opacity", *SCALES, *ROTATION]
+    read = read_gaussians(written(tmp_path / "a.ply", names))
+    assert read.sh_rest.shape == (1, bands, 3)
+    if bands:  # of degree 4, too, the first band is where it was
+        each = count // 3
+        assert read.sh_rest[0, 1].tolist() == pytest.approx([0.01, (each + 1) / 100, (2 * each + 1) / 100])
+
+
+def test_colours_in_bytes_become_the_constant_band(tmp_path: Path) -> None:
+    """nerfstudio, ply_color_mode=rgb."""
+    colours = ["red", "green", "blue"]
+    names = [*XYZ, *NORMALS, *colours, "opacity", *SCALES, *ROTATION]
+    row = {"red": 255, "green": 0, "blue": 51}
+    read = read_gaussians(written(tmp_path / "a.ply", names, [row], types=dict.fromkeys(colours, "uchar")))
+    assert (0.5 + C0 * read.sh_dc[0]).tolist() == pytest.approx([1.0, 0.0, 0.2], abs=1e-6)
+
+
+def test_rotations_of_any_length_draw_the_same(tmp_path: Path) -> None:
+    """OpenSplat does not normalise them."""
+    row = {name: 7 * value_of(name) for name in ROTATION}
+    read = read_gaussians(written(tmp_path / "a.ply", ORDERS["INRIA"], [row]))
+    unit = read.quats[0] / read.quats[0].norm()
+    assert unit.tolist() == pytest.approx([0.8, 0, 0.6, 0])
+
+
+def test_a_3d_filter_beside_the_scales_is_fused(tmp_path: Path) -> None:
+    """Mip-Splatting keeps filter_3D in the files of its training: s' = sqrt(s^2 + f^2), o' = o prod s / s'."""
+    row = {"scale_0": math.log(3.0), "scale_1": math.log(0.75), "scale_2": math.log(4.0), "filter_3D": 1.0}
+    row["opacity"] = math.log(0.6 / 0.4)
+    read = read_gaussians(written(tmp_path / "a.ply", [*ORDERS["INRIA"], "filter_3D"], [row]))
+    wide = [math.sqrt(10), 1.25, math.sqrt(17)]
+    assert read.log_scales.exp()[0].tolist() == pytest.approx(wide, rel=1e-6)
+    expected = 0.6 * 3 / wide[0] * 0.75 / wide[1] * 4 / wide[2]
+    assert float(read.opacity_logits.sigmoid()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_rows_that_are_not_finite_are_left_out_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [{"x": 1.0}, {"x": math.nan}, {"x": 3.0, "f_rest_44": math.inf}, {"x": 4.0, "opacity": math.inf}]
+    read = read_gaussians(written(tmp_path / "a.ply", ORDERS["INRIA"], rows))
+    assert read.means[:, 0].tolist() == [1.0, 4.0]
+    assert float(read.opacity_logits[1].sigmoid()) == 1.0  # an opacity of 1 has no finite logit
+    assert "2 of 4 splats" in caplog.text
+    write_gaussians(tmp_path / "again.ply", read)  # what was read can be written
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ([*XYZ, *DC, "opacity", *SCALES[:2], *ROTATION], "lacks property 'scale_2'.*flat splats"),
+        ([*XYZ, "opacity", *SCALES, *ROTATION], "'f_dc_0', or red, green and blue"),
+        ([*XYZ, *DC, *rest(44), "opacity", *SCALES, *ROTATION], "44 f_rest properties"),
+        ([*XYZ, *DC, *rest(8), "f_rest_9", "opacity", *SCALES, *ROTATION], "from 0 to 8"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path: Path, names: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_gaussians(written(tmp_path / "a.ply", names))
+
+
+@pytest.mark.parametrize(
+    ("comments", "expected"),
+    [
+        ((), False),
+        (["Exported from Brush", "SplatRenderMode: mip"], True),
+        (["splatrendermode: MIP"], True),
+        (["SplatRenderMode: mip", "SplatRenderMode: default"], False),
+        (["antialiased 1"], True),
+        (["antialiased 0"], False),
+        (["made by mip and antialiased 1 tools"], False),
+    ],
+)
+def test_comments_say_whether_opacities_are_compensated(tmp_path: Path, comments: list[str], expected: bool) -> None:
+    assert compensated(written(tmp_path / "a.ply", ORDERS["INRIA"], comments=comments)) is expected
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_spz_has_a_flag_for_it(tmp_path: Path, told: bool) -> None:
+    one = Gaussians(
+        means=torch.zeros(1, 3), log_scales=torch.zeros(1, 3), quats=torch.eye(4)[:1], opacity_logits=torch.zeros(1),
+        sh_dc=torch.zeros(1, 3), sh_rest=torch.zeros(1, 0, 3),
+    )  # fmt: skip
+    write_gaussians(tmp_path / "a.spz", one, compensated=told)
+    assert compensated(tmp_path / "a.spz") is told
