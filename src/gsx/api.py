@@ -27,7 +27,6 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.suffixes import refuse_suffix
 from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Float
@@ -35,7 +34,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose, quoted
-from gsx.experiments.runs.export import export
+from gsx.experiments.runs.export import export, refuse_export
 from gsx.experiments.runs.job import train as train_job
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.render import view_named
@@ -100,12 +99,12 @@ class TrainedRun:
         return evaluate_again(self.folder, plugins(), words)
 
     def export(self, path: str | Path, seen: View | str | None = None) -> Path:
-        """Write the model as a splat file, by suffix; `seen`: only what is drawn for that view.
+        """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view.
 
         Raises:
             InputError: the suffix is that of no format that is written, or there is no such view.
         """
-        refuse_suffix(path := Path(path))
+        refuse_export(path := Path(path))
         view = view_named(self.run, seen) if isinstance(seen, str) else seen
         export(self.run, path, view.camera if view else None)
         return path

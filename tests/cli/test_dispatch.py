@@ -165,7 +165,7 @@ def test_help_of_a_verb_does_not_import_torch() -> None:
 def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path / "no_run"), str(tmp_path / name)]) == 2
     told = capsys.readouterr().err
-    assert f"{name} is not written: gsx writes .compressed.ply, .ply, .spz, .glb alone" in told
+    assert f"{name} is not written: gsx writes .compressed.ply, .ply, .spz, .glb, .html alone" in told
     assert len(told.splitlines()) == 1
 
 

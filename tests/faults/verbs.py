@@ -110,13 +110,13 @@ def timeless(value: Any) -> Any:
 
 def model_by_name(place: Path) -> str:
     """The newest checkpoint of the only run, which is named by its composition."""
-    (folder,) = place.glob("outputs/demo/gs3d/*/checkpoints")
+    (folder,) = place.glob("outputs/demo/gs3d/[!.]*/checkpoints")
     return newest(folder)
 
 
 def all_by_name(place: Path) -> str:
     """All results of the only run, which is named by its composition."""
-    (run,) = place.glob("outputs/demo/gs3d/*")
+    (run,) = place.glob("outputs/demo/gs3d/[!.]*")
     return all_of(run)
 
 

@@ -211,6 +211,16 @@ class Anchors:
             decoded = self.everything() if camera is None else self.draw(camera, step).decoded
         return self.representation.explicit(decoded, self.table)
 
+    def slot_count(self) -> int:
+        """One of each offset."""
+        return len(self.table) * self.representation.offsets
+
+    def slots(self, drawn: DrawnAnchors) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
+        """Anchor row times k plus number of the offset; all offsets of the anchors in view."""
+        k = drawn.decoded.opacities.shape[1]
+        rows = drawn.anchors.rows
+        return drawn.decoded.slots, (rows[:, None] * k + torch.arange(k, device=rows.device)).flatten()
+
     def everything(self) -> Decoded:
         """All anchors of all levels, as seen from anywhere."""
         anchors = self.table["anchors"]

@@ -23,7 +23,7 @@ from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering
-from gsx.core.shapes import Float
+from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
@@ -200,6 +200,15 @@ class GS3D:
         raw["sh_dc"] = raw["sh_dc"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)
         return Gaussians(**raw)
+
+    def slot_count(self) -> int:
+        """One of each Gaussian."""
+        return len(self.table)
+
+    def slots(self, drawn: DrawnSplats) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
+        """Rows of the table."""
+        rows = torch.arange(len(self.table), device=self.table["means"].device) if drawn.rows is None else drawn.rows
+        return rows, rows
 
     def file_columns(self) -> dict[str, Tensor] | None:
         """The standard 62 properties (3D-GS, save_ply) with further columns of visibility where normals would be."""

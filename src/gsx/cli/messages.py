@@ -72,4 +72,5 @@ def set_up_logging() -> None:
     root.propagate = False
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Plain())
+    handler.handleError = lambda record: None  # type: ignore[method-assign]  # a message that nobody can be told is none
     root.handlers = [handler] if speaks() else [logging.NullHandler()]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import run_arguments
+from gsx.cli.arguments import Parser, positive, run_arguments
 from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
@@ -69,29 +69,41 @@ def verb_render(arguments: list[str]) -> int:
 
 
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN [FILE] [--view NAME] [--axes rub|rdf]"""
-    told = "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .glb."
-    parser = argparse.ArgumentParser(prog="gsx export", description=told)
+    """gsx export RUN [FILE] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
+    told = (
+        "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .glb; or "
+        ".html, one page with a viewer in it that opens from disk."
+    )
+    parser = Parser(prog="gsx export", description=told)
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
+    parser.add_argument(
+        "--bake",
+        type=positive(float),
+        metavar="ZOOM",
+        default=0.0,
+        help="one standard file for all "
+        "views of a model that decodes splats for each, as cameras see it at ZOOM times their resolution",
+    )
     parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
     given = parser.parse_args(arguments)
     from gsx.core.files import remove_partial
-    from gsx.core.gaussians.suffixes import refuse_suffix
-    from gsx.experiments.runs.export import export, reimport_psnr
+    from gsx.experiments.runs.export import export, losses, refuse_export
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.render import view_named
 
     if given.file:
-        refuse_suffix(given.file)
+        refuse_export(given.file)
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
     remove_partial(path.parent, below=False)
-    if export(run, path, view.camera if view else None, given.axes):
+    written = export(run, path, view.camera if view else None, given.axes, given.bake)
+    if written:
         views = [view] if view else run.scene.test
-        logger.info("read back and rendered again: %s", reimport_psnr(run, settings, path, views, given.axes))
+        for line in losses(run, settings, path, views, written, given.axes):
+            logger.info("read back and rendered again: %s", line)
     sys.stdout.write(f"{path}\n")
     return 0

@@ -21,3 +21,17 @@ def rotation_matrices(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
         torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
     ]
     return torch.stack(rows, 1)
+
+
+def quaternions_of(rotations: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 4"]:
+    """Unit quaternions (w, x, y, z) of rotation matrices: of four expressions the one without cancellation (Shepperd
+    1978)."""
+    r = rotations.permute(1, 2, 0)
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    squares = torch.stack([1 + trace, *(1 - trace + 2 * r[i, i] for i in range(3))])
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
+    rows = [[squares[0], x, y, z], [x, squares[1], xy, xz], [y, xy, squares[2], yz], [z, xz, yz, squares[3]]]
+    products = torch.stack([torch.stack(row, 1) for row in rows])
+    chosen = products[squares.argmax(0), torch.arange(len(rotations), device=rotations.device)]
+    return chosen / chosen.norm(dim=1, keepdim=True)

@@ -15,8 +15,8 @@ def suffix_of(path: Path) -> str:
     return next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), "")
 
 
-def refuse_suffix(path: Path) -> None:
-    """Raise InputError if the name promises a format that is not written."""
+def refuse_suffix(path: Path, others: tuple[str, ...] = ()) -> None:
+    """Raise InputError if the name promises a format that is not written; `others`: what is written beside splats."""
     if not suffix_of(path):
         better = path.parent / f"{path.stem or 'model'}{STANDARD}"
-        raise InputError(f"{path} is not written: gsx writes {', '.join(SUFFIXES)} alone, name it {better}")
+        raise InputError(f"{path} is not written: gsx writes {', '.join((*SUFFIXES, *others))} alone, name it {better}")

@@ -164,6 +164,22 @@ class WithOwnFile(Protocol):
 
 
 @runtime_checkable
+class Bakeable(Protocol[D]):
+    """A backbone whose splats depend on the camera, and can be followed from one camera to the next."""
+
+    def slot_count(self) -> int:
+        """How many numbers there are."""
+        ...
+
+    def slots(self, drawn: D) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
+        """(a number for each splat drawn, the same from every camera; the numbers of all that could have been).
+
+        What could have been and is not drawn has opacity 0 for this camera.
+        """
+        ...
+
+
+@runtime_checkable
 class FromGaussians(Protocol):
     """A backbone that can go on from a standard splat file (`init=FILE`)."""
 

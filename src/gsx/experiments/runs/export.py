@@ -1,52 +1,111 @@
-"""Splat files of a run."""
+"""Splat files of a run, and pages that show one."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
 
 from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.errors import InputError
+from gsx.core.gaussians.arrays import arrays_of, gaussians_from
+from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.core.gaussians.ply import write_whole
 from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
-from gsx.core.gaussians.suffixes import STANDARD, suffix_of
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.suffixes import STANDARD, refuse_suffix, suffix_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
+from gsx.core.shapes import Float
 from gsx.core.training.backbone import WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.reports.viewer_page import viewer_page
+from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.load_scene import unit_of
+from gsx.experiments.runs.orbit import upright
 from gsx.experiments.runs.settings import Settings
 
+PAGE = ".html"
+"""A page with a viewer and the model in it."""
+PAGE_VIEWS = 6
+"""Test views that a page has as places to go to; it starts at the first."""
+LOOKED_AT = 5
+"""Views by which losses are told."""
 
-def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub") -> bool:
-    """Write the backbone's splat file, or what it draws for one camera as a standard one; returns whether it is one.
 
-    The comments hold the conventions that a viewer must know. axes: of SPZ.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exported:
+    """What was written in a standard form."""
+
+    gaussians: Gaussians
+    baked: bool
+    """They stand for a model that has others for every camera."""
+
+
+def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub", zoom: float = 0) -> Exported | None:
+    """Write the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
+
+    camera: what is drawn for it alone. Without one a model that has no standard form is baked where the file is to hold
+    one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. axes: of SPZ.
 
     Raises:
-        InputError: the model has no standard form, and the suffix is that of a format that holds no other; or the
-            format cannot hold the splats.
+        InputError: the format cannot hold the splats, or the model cannot be baked.
     """
+    columns = own_columns(run) if camera is None else None
+    if columns is not None and suffix_of(path) == STANDARD and not zoom:
+        write_columns(path, columns, notes(run))
+        return None
+    baked = columns is not None or zoom > 0
+    gaussians = bake(run, zoom or 1.0) if baked else run.backbone.explicit(camera, run.model_step)
+    comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
+    if baked:
+        comments.append(f"splats as training cameras see them on average, at {zoom or 1:g} times their resolution")
+    if is_page(path):
+        write_whole(path, page_of(run, gaussians, comments).encode())
+    else:
+        write_gaussians(path, gaussians, comments, run.raster.compensate, axes)
+    return Exported(gaussians=gaussians, baked=baked)
+
+
+def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:
+    """Columns of the file that the published code of the backbone writes; None: the standard ones."""
+    return run.backbone.file_columns() if isinstance(run.backbone, WithOwnFile) else None
+
+
+def is_page(path: Path) -> bool:
+    """Whether a name is that of a page."""
+    return path.suffix.lower() == PAGE
+
+
+def refuse_export(path: Path) -> None:
+    """Raise InputError if the name promises a format that is not written."""
+    if not is_page(path):
+        refuse_suffix(path, (PAGE,))
+
+
+def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
+    """A page that starts at the first test view."""
+    up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
+    views, background = run.scene.test[:PAGE_VIEWS], run.scene.background.tolist()
+    return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
+
+
+def notes(run: Run) -> list[str]:
+    """What a viewer must know of the model."""
     own = run.backbone if isinstance(run.backbone, WithOwnFile) else None
-    columns = own.file_columns() if own and camera is None else None
-    if columns is not None and suffix_of(path) != STANDARD:
-        raise InputError(f"{path}: this model has splats for one view alone: add --view NAME, or write a .ply")
-    comments = [
+    return [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *zoomed_note(run.raster),
         *supersampling_note(run),
         *(own.file_notes() if own else ()),
-        *([f"SplatRenderMode: {render_mode(run.raster)}"] if columns is None else []),
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
-    if columns is None:
-        explicit = run.backbone.explicit(camera, run.model_step)
-        write_gaussians(path, explicit, comments, run.raster.compensate, axes)
-    else:
-        write_columns(path, columns, comments)
-    return columns is None
 
 
 def zoomed_note(raster: RasterSettings) -> list[str]:
@@ -75,12 +134,36 @@ def render_mode(raster: RasterSettings) -> str:
     return "mip" if raster.compensate else "default"
 
 
-def reimport_psnr(run: Run, settings: Settings, path: Path, views: Sequence[View], axes: str = "rub") -> str:
-    """PSNR between the model and its exported standard file, both rendered from up to five views."""
-    gaussians, pixels = read_gaussians(path, axes), settings.evaluation.tile_pixels
-    figures = []
-    for view in views[:5]:
-        again = render(run, view.camera, pixels, splats=splats_of(gaussians, view.camera.centre))
-        figures.append(psnr(again.image, render(run, view.camera, pixels).image))
-    size = path.stat().st_size / 1e6
-    return f"{min(figures):.1f} dB at worst over {len(figures)} views (inf: identical), {size:,.2f} MB"
+def losses(
+    run: Run, settings: Settings, path: Path, views: Sequence[View], written: Exported, axes: str = "rub"
+) -> list[str]:
+    """What a standard file, read again, and baking have lost, in PSNR of renders of some views; in words."""
+    views, inside = views[:LOOKED_AT], written.gaussians
+    again = as_in_page(inside) if is_page(path) else read_gaussians(path, axes)
+
+    def pictures(gaussians: Gaussians) -> list[Float[Tensor, "3 H W"]]:
+        pixels = settings.evaluation.tile_pixels
+        return [render(run, v.camera, pixels, splats=splats_of(gaussians, v.camera.centre)).image for v in views]
+
+    own = [render(run, view.camera, settings.evaluation.tile_pixels).image for view in views]
+    read, before = pictures(again), pictures(inside) if written.baked else own
+    worst = min(psnr(a, b) for a, b in zip(read, before, strict=True))
+    lines = [f"{worst:.1f} dB at worst over {len(views)} views (inf: identical), {path.stat().st_size / 1e6:,.2f} MB"]
+    if written.baked:
+        truth = [view.image().to(own[0]) for view in views]
+        alike, model, baked = (mean_psnr(a, b) for a, b in ((before, own), (own, truth), (before, truth)))
+        lines.append(
+            f"baked for all views: {alike:.1f} dB against the model; against photographs {baked:.2f} dB, where the "
+            f"model has {model:.2f} dB: {model - baked:.2f} dB lost"
+        )
+    return lines
+
+
+def mean_psnr(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float[Tensor, "3 H W"]]) -> float:
+    """Mean over pairs."""
+    return fmean(psnr(a, b) for a, b in zip(pictures, others, strict=True))
+
+
+def as_in_page(gaussians: Gaussians) -> Gaussians:
+    """As a page holds them, but not turned."""
+    return gaussians_from(decode_compressed_ply(encode_compressed_ply(arrays_of(gaussians), ())))

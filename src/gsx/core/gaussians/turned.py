@@ -1,0 +1,68 @@
+"""Gaussians in a frame that is turned: positions, orientations, and colours that depend on the direction."""
+
+import torch
+from torch import Tensor
+
+from gsx.core.gaussians.arrays import degree_of
+from gsx.core.gaussians.quaternions import quaternions_of
+from gsx.core.gaussians.sh import harmonics
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.shapes import Float
+
+DIRECTIONS = 200
+"""At which a turned function of the sphere is sampled: many more than it has coefficients."""
+
+
+def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
+    """The same Gaussians where every point p is `rotation` p."""
+    rotation = rotation.double()
+    quats = product(quaternions_of(rotation[None])[0], torch.nn.functional.normalize(gaussians.quats.double(), dim=1))
+    rest = gaussians.sh_rest
+    if rest.shape[1]:
+        rest = (turned_harmonics(rotation, degree_of(rest.shape[1])) @ rest.double()).to(rest)
+    return Gaussians(
+        means=(gaussians.means.double() @ rotation.T).to(gaussians.means),
+        log_scales=gaussians.log_scales,
+        quats=quats.to(gaussians.quats),
+        opacity_logits=gaussians.opacity_logits,
+        sh_dc=gaussians.sh_dc,
+        sh_rest=rest,
+    )
+
+
+def turned_harmonics(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "B B"]:
+    """M with Y(d) M c = Y(rotation^T d) c for all directions d and coefficients c.
+
+    Bands turn within themselves (Wigner), so that a least-squares fit over many directions is exact.
+    """
+    directions = spread_directions(DIRECTIONS)
+    seen = harmonics(directions @ rotation, degree)
+    return torch.linalg.lstsq(harmonics(directions, degree), seen).solution
+
+
+def spread_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Unit vectors spread evenly over the sphere (a Fibonacci lattice), float64."""
+    step = torch.arange(count, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * step / count, torch.pi * (1 + 5**0.5) * step
+    return torch.stack([(1 - z * z).sqrt() * angle.cos(), (1 - z * z).sqrt() * angle.sin(), z], 1)
+
+
+def product(a: Float[Tensor, "4"], b: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
+    """The rotation b followed by a, as quaternions (w, x, y, z)."""
+    w, x, y, z = a.unbind()
+    left = torch.stack([torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
+                        torch.stack([z, -y, x, w])])  # fmt: skip
+    return b @ left.T
+
+
+def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes unit vector a to unit vector b, float64."""
+    a, b = a.double(), b.double()
+    axis, cosine = torch.linalg.cross(a, b), float(a @ b)
+    if cosine < -1 + 1e-9:  # a half turn about any axis across a
+        axis = torch.linalg.cross(a, torch.eye(3, dtype=torch.float64)[int(a.abs().argmin())])
+        axis = axis / axis.norm()
+        return 2 * torch.outer(axis, axis) - torch.eye(3, dtype=torch.float64)
+    x, y, z = axis.tolist()
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)

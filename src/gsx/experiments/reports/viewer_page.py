@@ -1,0 +1,108 @@
+"""One page to send: a model inside a viewer that opens from disk, without network.
+
+The viewer is npm's @playcanvas/supersplat-viewer (MIT), with its notice in the page; `scripts/viewer_template.py` has
+made the empty page out of it.
+"""
+
+import base64
+import html
+import json
+import lzma
+import math
+from collections.abc import Sequence
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
+from gsx.core.gaussians.arrays import arrays_of
+from gsx.core.gaussians.compressed_ply import encode_compressed_ply
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.turned import rotation_between, turned
+from gsx.core.shapes import Float
+
+TEMPLATE = "viewer_page.html.xz"
+PLACE = '"GSX_BOOTSTRAP"'
+"""Where settings and splats go (scripts/viewer_template.py)."""
+NAME = "model.compressed.ply"
+"""What the viewer takes the splats for."""
+VIEWER_FROM_FILE = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
+"""The viewer turns files by half a turn about z, and has y up."""
+LEAST_LEVEL = 0.97
+"""Cosine of the roll (14 degrees) up to which a camera counts as held level."""
+FIELD_OF_VIEW = (10.0, 120.0)
+"""Degrees that the viewer has for cameras."""
+
+
+def viewer_page(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    up: Float[Tensor, "3"],
+    background: Sequence[float],
+    title: str,
+    comments: Sequence[str] = (),
+) -> str:
+    """The page; it starts at the first of some views, and has the others as places to go to.
+
+    up: of the scene, a unit vector; background: display RGB in [0, 1].
+    """
+    rotation = rotation_between(level(up, views[0].camera), torch.tensor([0.0, -1.0, 0.0]))  # files have y down
+    splats = encode_compressed_ply(arrays_of(turned(gaussians, rotation)), comments)
+    poses = [pose(view.camera, rotation, gaussians.means) for view in views]
+    content = {
+        "contentUrl": f"data:application/octet-stream;base64,{base64.b64encode(splats).decode()}",
+        "contentFilename": NAME,
+        "settings": settings(poses, [view.name for view in views], background),
+    }
+    page = lzma.decompress(files(__package__).joinpath(TEMPLATE).read_bytes()).decode()
+    page = page.replace("<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>", 1)
+    before, _, after = page.partition(PLACE)
+    return before + json.dumps(content).replace("<", "\\u003c") + after
+
+
+def level(up: Float[Tensor, "3"], camera: Camera) -> Float[Tensor, "3"]:
+    """The scene's up direction, turned by the roll of a camera that is held almost level: the viewer knows none."""
+    right = camera.rotation[0].double()
+    across = torch.nn.functional.normalize(up.double() - (up.double() @ right) * right, dim=0)
+    return across if float(across @ up.double()) > LEAST_LEVEL else up
+
+
+def pose(camera: Camera, rotation: Float[Tensor, "3 3"], means: Float[Tensor, "N 3"]) -> dict[str, object]:
+    """A camera as the viewer has it: it looks at the median depth of what is before it, and stands upright."""
+    depths = camera.to_camera(means)[:, 2]
+    ahead = float(depths[depths > camera.near].median()) if bool((depths > camera.near).any()) else 1.0
+    centre = camera.centre.double()
+    places = torch.stack([centre, centre + ahead * camera.rotation[2].double()])
+    position, target = ((places @ rotation.T) * VIEWER_FROM_FILE).tolist()
+    half = max(camera.width / camera.fx, camera.height / camera.fy) / 2  # the viewer's angle is that of the longer side
+    degrees = math.degrees(2 * math.atan(half))
+    return {"position": position, "target": target, "fov": min(max(degrees, FIELD_OF_VIEW[0]), FIELD_OF_VIEW[1])}
+
+
+def settings(
+    poses: Sequence[dict[str, object]], names: Sequence[str], background: Sequence[float]
+) -> dict[str, object]:
+    """Settings of the viewer, version 2 (its docs/api.md): colours as they are, no effects."""
+    off = {"enabled": False}
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": [float(value) for value in background]},
+        "postEffectSettings": {
+            "sharpness": off | {"amount": 0},
+            "bloom": off | {"intensity": 0.1, "blurLevel": 2},
+            "grading": off | {"brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+            "vignette": off | {"intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+            "fringing": off | {"intensity": 0.5},
+        },
+        "animTracks": [],
+        "cameras": [{"initial": poses[0]}],
+        "annotations": [
+            {"position": one["target"], "title": name, "text": "", "extras": {}, "camera": {"initial": one}}
+            for one, name in zip(poses[1:], names[1:], strict=True)
+        ],
+        "startMode": "default",
+    }
