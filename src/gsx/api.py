@@ -39,6 +39,7 @@ from gsx.experiments.runs.job import train as train_job
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
@@ -117,7 +118,7 @@ class SplatFile:
     path: Path
     gaussians: Gaussians
     raster: RasterSettings
-    """Rules it is drawn by; files of Mip-Splatting want dilation=0.1, compensate=True."""
+    """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
 
     @torch.no_grad()
     def render(self, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> Float[Tensor, "3 H W"]:
@@ -147,7 +148,7 @@ def train(*given: str, **values: Any) -> TrainedRun:
 
 
 def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
-    """A run folder, or a splat file of any kind that is written; raster: what the latter is drawn by, if not as 3D-GS.
+    """A run folder, or a splat file of any kind that is written; raster: what the latter is drawn by, if not as it says.
 
     Raises:
         InputError: it is neither, or damaged.
@@ -158,7 +159,7 @@ def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun |
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
-    return SplatFile(path, read_gaussians(path), raster or RasterSettings())
+    return SplatFile(path, read_gaussians(path), raster or rules_of(path))
 
 
 def load_run(folder: Path) -> TrainedRun:

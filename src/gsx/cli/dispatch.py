@@ -8,7 +8,7 @@ from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging, unheard
-from gsx.cli.runs import verb_eval, verb_export, verb_render
+from gsx.cli.runs import verb_eval, verb_export, verb_render, verb_view
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
@@ -23,9 +23,10 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
 
   gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
   gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
-  gsx eval RUN [K=V ...]    evaluate a run again, for example with 'eval.zoom=[1,2,4]'
-  gsx render RUN            test views as PNG, or an orbit: --orbit FILE.gif (.webp, .mp4: gsx[video])
-  gsx export RUN [FILE]     standard splat file (PLY), re-read and compared
+  gsx view RUN|FILE         look around in a browser, also while RUN is trained (gsx[viewer]); or viewer=true
+  gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
+  gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
+  gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .glb), or model.html: one page to send
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
@@ -104,6 +105,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "eval": verb_eval,
     "render": verb_render,
     "export": verb_export,
+    "view": verb_view,
     "report": verb_report,
     "trade": verb_trade,
     "scenes": verb_scenes,

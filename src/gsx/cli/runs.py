@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, positive, run_arguments
+from gsx.cli.arguments import Parser, positive, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
@@ -43,28 +43,72 @@ def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
 
 
 def verb_render(arguments: list[str]) -> int:
-    """gsx render RUN [--orbit FILE] ..."""
-    parser = argparse.ArgumentParser(prog="gsx render", description="Render test views, or an orbit as an animation.")
-    parser.add_argument("run", type=Path, help="run folder")
+    """gsx render RUN|FILE [--orbit FILE | --path CAMERAS.json [--movie FILE]] ..."""
+    parser = Parser(prog="gsx render", description="Render test views, an orbit as an animation, or a camera path.")
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder, or splat file (with --path)")
     parser.add_argument("--orbit", type=Path, metavar="FILE", help="animate a closed orbit: .gif, .webp or .mp4")
     parser.add_argument("--frames", type=int, default=60, help="frames of the orbit (60)")
-    parser.add_argument("--fps", type=float, default=20, help="frames per second (20)")
-    parser.add_argument("--zoom", type=float, default=1, help="times the training resolution (1)")
-    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for test views (RUN/renders/test)")
+    parser.add_argument("--fps", type=positive(float), default=20, help="frames per second of the orbit (20)")
+    parser.add_argument("--path", type=Path, metavar="JSON", help="cameras: saved by gsx view, or nerfstudio's")
+    parser.add_argument("--movie", type=Path, metavar="FILE", help="animate the path, at its own frames per second")
+    parser.add_argument("--zoom", type=float, default=1, help="times the training resolution, or that of the path (1)")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for pictures (RUN/renders/test, or path)")
     given = parser.parse_args(arguments)
-    if given.zoom <= 0 or given.frames < 1:
+    if not 0 < given.zoom < float("inf") or given.frames < 1:
         raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
-    from gsx.experiments.runs.open import open_run
-    from gsx.experiments.runs.render import render_orbit, render_test_views
+    if (given.movie and not given.path) or (given.orbit and given.path):
+        raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
+    sys.stdout.write(f"{rendered(given)}\n")
+    return 0
 
-    run, settings = open_run(given.run, plugins())
+
+def rendered(given: argparse.Namespace) -> Path:
+    """Carry out `gsx render`; returns the file or folder written."""
+    from gsx.experiments.runs.open import open_run
+    from gsx.experiments.runs.render import file_pictures, render_orbit, render_path, render_test_views, run_pictures
+    from gsx.experiments.viewer.camera_path import read_camera_path
+
+    way = read_camera_path(given.path) if given.path else None
+    if given.target.is_file():
+        if way is None:
+            raise InputError(f"gsx render {given.target}: a splat file has no views; give cameras with --path JSON")
+        to = given.movie or given.to or given.target.parent / "path"
+        return render_path(way, file_pictures(given.target), to, bool(given.movie), given.zoom)
+    run, settings = open_run(given.target, plugins())
+    if way is not None:
+        to = given.movie or given.to or given.target / "renders" / "path"
+        return render_path(way, run_pictures(run, settings), to, bool(given.movie), given.zoom)
     if given.orbit:
         render_orbit(run, settings, given.orbit, given.frames, given.fps, given.zoom)
-        sys.stdout.write(f"{given.orbit}\n")
-    else:
-        folder = given.to or given.run / "renders" / "test"
-        render_test_views(run, settings, folder, given.zoom)
-        sys.stdout.write(f"{folder}\n")
+        return Path(given.orbit)
+    folder: Path = given.to or given.target / "renders" / "test"
+    render_test_views(run, settings, folder, given.zoom)
+    return folder
+
+
+def verb_view(arguments: list[str]) -> int:
+    """gsx view RUN|FILE [--host ADDRESS] [--port N]"""
+    parser = Parser(prog="gsx view", description="Look around in a model with a browser, until Ctrl-C.")
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder, also of a run under way; splat file")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
+    parser.add_argument("--port", type=whole, default=8080, help="port (8080); 0: any that is free")
+    given = parser.parse_args(arguments)
+    if not given.target.exists():
+        raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
+    from gsx.experiments.runs.view import view_file, view_run
+
+    def announce(address: str) -> None:
+        logger.info("Ctrl-C ends it")
+        sys.stdout.write(f"{address}\n")
+        sys.stdout.flush()
+
+    try:
+        if given.target.is_dir():
+            view_run(given.target, plugins(), given.host, given.port, announce)
+        else:
+            view_file(given.target, given.host, given.port, announce)
+    except KeyboardInterrupt:
+        return 0
     return 0
 
 

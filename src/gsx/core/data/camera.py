@@ -14,6 +14,8 @@ from torch import Tensor
 from gsx.core.shapes import Float
 
 NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
+UPRIGHT = 0.05
+"""How much the mean image-up counts against level horizons; small: horizons win wherever they say anything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,6 +173,19 @@ def look_at(
         height=height,
         near=near,
     )
+
+
+def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
+    """The scene's up direction: near the mean image-up, and across the images' horizontal axes where those differ.
+
+    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
+    """
+    right, up = rotations[:, 0], -rotations[:, 1]
+    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
+    solved = torch.linalg.solve(level, up.mean(0))
+    if solved.norm() < 1e-6:  # cameras rolled every way
+        return up[0]
+    return solved / solved.norm()
 
 
 def centred(camera: Camera) -> Camera:

@@ -164,14 +164,14 @@ class WithOwnFile(Protocol):
 
 
 @runtime_checkable
-class Bakeable(Protocol[D]):
+class Bakeable(Protocol):
     """A backbone whose splats depend on the camera, and can be followed from one camera to the next."""
 
     def slot_count(self) -> int:
         """How many numbers there are."""
         ...
 
-    def slots(self, drawn: D) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
+    def slots(self, drawn: Any) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
         """(a number for each splat drawn, the same from every camera; the numbers of all that could have been).
 
         What could have been and is not drawn has opacity 0 for this camera.

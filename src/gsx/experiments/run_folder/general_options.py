@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.options import label, without_effect
-from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Steps
+from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Share, Steps
 
 BEGINNINGS = ("scratch", "warm_start")
 """Values of `init` that are no file; both train the same."""
@@ -42,6 +42,15 @@ class GeneralOptions:
     """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
     disk_cache_gb: Gigabytes = without_effect(default=20.0)
     """For what runs share: states, reconstructions, undistorted and redrawn pictures, networks."""
+
+    viewer: bool = without_effect(default=False)
+    """The model is shown in a browser while it is trained."""
+    viewer_host: str = without_effect(default="127.0.0.1")
+    """Address at which the viewer listens: this machine alone."""
+    viewer_port: Annotated[int, Range(0, 65535)] = without_effect(default=8080)
+    """0: any that is free."""
+    viewer_share: Share = without_effect(default=0.25)
+    """Of the time of training, that pictures for the viewer may take."""
 
     def __post_init__(self) -> None:
         file = splat_file(self.init)

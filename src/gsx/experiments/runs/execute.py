@@ -74,6 +74,8 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     if run.warm_starts is not None:
         general = settings.general
         listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
+    if settings.general.viewer:
+        listeners.append(training_viewer(run, settings))
     try:
         with plugins.listening(listeners), telling_of_failure(run, plugins):
             train(run, plugins)
@@ -88,6 +90,20 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)
+
+
+def training_viewer(run: Run, settings: Settings) -> object:
+    """Shows the model in a browser; its address is told.
+
+    Raises:
+        ConfigError, InputError: viser is not installed, or the port is taken.
+    """
+    from gsx.experiments.viewer.training import TrainingViewer
+
+    general = settings.general
+    shown = TrainingViewer(run, general.viewer_host, general.viewer_port, general.viewer_share)
+    logger.info("look around: %s", shown.viewer.address)
+    return shown
 
 
 def keep_what_there_is(run: Run, error: BaseException) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx import __version__
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import View
 from gsx.core.gaussians.arrays import arrays_of, gaussians_from
 from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
@@ -27,7 +27,6 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.load_scene import unit_of
-from gsx.experiments.runs.orbit import upright
 from gsx.experiments.runs.settings import Settings
 
 PAGE = ".html"

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at, upright
 from gsx.core.data.images import in_memory
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
@@ -24,8 +24,6 @@ from gsx.core.errors import InputError, nearest
 from gsx.core.files import replacing
 from gsx.core.shapes import Float, UInt8
 
-UPRIGHT = 0.05
-"""How much the mean image-up counts against level horizons; small: horizons win wherever they say anything."""
 PARALLEL = 0.01
 """Viewing rays whose mean squared sine against one direction is below this (6 degrees) meet nowhere reliable."""
 OUTWARD = 0.01
@@ -132,19 +130,6 @@ def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: fl
         rise=0.0 if full else max(SWING * float(heights.max() - heights.min()) / 2, swing * radius / 4),
         outward=not inward,
     )
-
-
-def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
-    """The scene's up direction: near the mean image-up, and across the images' horizontal axes where those differ.
-
-    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
-    """
-    right, up = rotations[:, 0], -rotations[:, 1]
-    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
-    solved = torch.linalg.solve(level, up.mean(0))
-    if solved.norm() < 1e-6:  # cameras rolled every way
-        return up[0]
-    return solved / solved.norm()
 
 
 def scene_depth(

@@ -1,16 +1,26 @@
-"""Pictures of a run: its test views, one view by name, an orbit."""
+"""Pictures of a run: its test views, one view by name, an orbit; and of a run or a file along a camera path."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import remove_partial
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of
+from gsx.core.rasterizer import rasterize_tiled
+from gsx.core.shapes import Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.start_file import rules_of
+from gsx.experiments.viewer.camera_path import CameraPath
 
 
 def view_named(run: Run, name: str) -> View:
@@ -40,3 +50,41 @@ def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: flo
     pixels = settings.evaluation.tile_pixels
     cameras = (camera.zoom(zoom) for camera in orbit_cameras(run.scene, frames))
     write_animation(path, (render(run, camera, pixels).image for camera in cameras), fps)
+
+
+Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
+
+
+def run_pictures(run: Run, settings: Settings) -> Draw:
+    """The model of a run, for any camera."""
+    return lambda camera: render(run, camera, settings.evaluation.tile_pixels).image
+
+
+def file_pictures(path: Path) -> Draw:
+    """The splats of a file over black, for any camera.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    gaussians, raster = read_gaussians(path), rules_of(path)
+
+    @torch.no_grad()
+    def draw(camera: Camera) -> Float[Tensor, "3 H W"]:
+        splats = splats_of(gaussians, camera.centre)
+        return rasterize_tiled(splats, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
+
+    return draw
+
+
+def render_path(way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float) -> Path:
+    """Write the frames of a camera path: an animation, or a folder of numbered PNGs; returns which."""
+    cameras = way.cameras(zoom)
+    if movie:
+        remove_partial(to.parent, below=False)
+        write_animation(to, (draw(camera) for camera in cameras), way.fps)
+        return to
+    to.mkdir(parents=True, exist_ok=True)
+    remove_partial(to, below=False)
+    for number, camera in enumerate(cameras):
+        write_image(to / f"frame_{number:05d}.png", draw(camera))
+    return to

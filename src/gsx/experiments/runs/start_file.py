@@ -3,9 +3,9 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
@@ -13,6 +13,7 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splat_files import compensated, read_gaussians
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.compose import quoted
@@ -42,7 +43,7 @@ def starting_splats(settings: Settings) -> Gaussians | None:
     return gaussians
 
 
-def go_on_from(backbone: Backbone[Tensor], gaussians: Gaussians, name: str) -> None:
+def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
     """Give Gaussians to a backbone in place of what it was built with.
 
     Raises:
@@ -70,6 +71,15 @@ def in_front_of(camera: Camera) -> Gaussians:
 def one_point(gaussians: Gaussians) -> PointCloud:
     """The first of them as a point: a backbone is built from points, and is given the splats then."""
     return PointCloud(positions=gaussians.means[:1], colours=torch.full((1, 3), 128, dtype=torch.uint8))
+
+
+def rules_of(path: Path) -> RasterSettings:
+    """What a splat file is to be drawn by, as it says.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    return RasterSettings(dilation=MIP_KERNEL, compensate=True) if compensated(path) else RasterSettings()
 
 
 def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:

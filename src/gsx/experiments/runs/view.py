@@ -1,0 +1,80 @@
+"""`gsx view`: a run, also one that another process trains, or a splat file."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from gsx.core.errors import CheckpointError, InputError
+from gsx.core.gaussians.splat_files import read_gaussians
+from gsx.core.plugins import Plugins
+from gsx.core.training import checkpoint
+from gsx.experiments.run_folder.files import read_run, state_of
+from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.start_file import rules_of
+from gsx.experiments.viewer.pictures import FileModel, RunModel
+from gsx.experiments.viewer.server import Viewer
+from gsx.experiments.viewer.training import told_of
+
+EVERY = 2.0
+"""Seconds between looks at a run's folder."""
+
+
+class Watched:
+    """A run folder that another process may train in: its newest checkpoint is shown."""
+
+    def __init__(self, folder: Path, plugins: Plugins) -> None:
+        self.run, self.settings = open_run(folder, plugins)
+        self.run.raster = replace(self.run.raster, path="eager")  # compiling takes longer than most looks
+        self.looked = time.monotonic()
+
+    def refresh(self) -> bool:
+        """Whether there was something newer, which is shown from now on."""
+        if time.monotonic() - self.looked < EVERY:
+            return False
+        self.looked = time.monotonic()
+        there = checkpoint.sidecars(self.run.folder / "checkpoints")
+        if not there or checkpoint.step_of(there[-1]) <= self.run.step:
+            return False
+        try:
+            checkpoint.restore(self.run)
+        except (CheckpointError, OSError):  # it may be half written, or gone already: the next look finds out
+            return False
+        self.run.curves = read_curves(self.run.folder)
+        return True
+
+    def told(self) -> str:
+        """How it stands, in words."""
+        return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
+
+
+def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
+    """Show a run until Ctrl-C.
+
+    Raises:
+        InputError, CheckpointError: there is nothing to show, or the port is taken.
+    """
+    watched = Watched(folder, plugins)
+    viewer = Viewer(RunModel(watched.run), f"{watched.run.scene.name}, {folder.name}", host, port)
+    viewer.tell(watched.told())
+    announce(viewer.address)
+    try:
+        viewer.serve(lambda: False, lambda: viewer.changed(watched.told()) if watched.refresh() else None)
+    finally:
+        viewer.stop()
+
+
+def view_file(path: Path, host: str, port: int, announce: Callable[[str], None]) -> None:
+    """Show a splat file until Ctrl-C; errors as `view_run`."""
+    gaussians = read_gaussians(path)
+    if not len(gaussians.means):
+        raise InputError(f"{path} holds no splats: choose another file")
+    raster = rules_of(path)
+    viewer = Viewer(FileModel(gaussians, raster), path.name, host, port)
+    viewer.tell(f"{len(gaussians.means):,} splats{', opacities compensated' if raster.compensate else ''}")
+    announce(viewer.address)
+    try:
+        viewer.serve(lambda: False)
+    finally:
+        viewer.stop()

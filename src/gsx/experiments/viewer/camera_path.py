@@ -1,0 +1,212 @@
+"""Camera paths: keyframes in time, gsx's own JSON and nerfstudio's.
+
+Own files: {"gsx_camera_path": 1, "size": [width, height], "fps": 24, "keyframes": [{"time": 0.0, "position": [x, y, z],
+"wxyz": [w, x, y, z], "fov": degrees}, ...]}. Positions are in the world of the model; rotations take camera axes (x
+right, y down, z ahead) to the world; fov is vertical. nerfstudio's (`ns-render camera-path`): `camera_path` with
+`camera_to_world` (y up, z back) and `fov`, a frame each, taken to be in the same world.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx.core.data.camera import NEAR, Camera
+from gsx.core.errors import InputError
+from gsx.core.files import read_json, write_json
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
+from gsx.experiments.run_folder.files import is_number
+
+OWN = "gsx_camera_path"
+MOST_FRAMES = 100_000
+LARGEST_EDGE = 16_384
+"""Of pictures, px."""
+PARALLEL = 1e-6
+"""Quaternions this near to each other are interpolated along the chord."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where a camera is at some time."""
+
+    time: float
+    """Seconds."""
+    position: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+    """Camera to world; x right, y down, z ahead."""
+    fov: float
+    """Vertical field of view, radians."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Keyframes in order of time, and how they are to be filmed."""
+
+    size: tuple[int, int]
+    """Width and height of the pictures, px."""
+    fps: float
+    keyframes: tuple[Keyframe, ...]
+
+    def cameras(self, zoom: float = 1.0) -> list[Camera]:
+        """A camera for every frame from the first keyframe to the last; `zoom`: times the raster."""
+        frames = self.keyframes
+        count = 1 + round((frames[-1].time - frames[0].time) * self.fps)
+        return [self.camera(between(frames, frames[0].time + i / self.fps)).zoom(zoom) for i in range(count)]
+
+    def camera(self, frame: Keyframe) -> Camera:
+        """The pinhole camera of a keyframe."""
+        width, height = self.size
+        rotation = rotation_matrices(torch.tensor([frame.wxyz], dtype=torch.float64))[0].T
+        focal = height / (2 * math.tan(frame.fov / 2))
+        return Camera(
+            rotation=rotation,
+            translation=-rotation @ torch.tensor(frame.position, dtype=torch.float64),
+            fx=focal,
+            fy=focal,
+            cx=width / 2,
+            cy=height / 2,
+            width=width,
+            height=height,
+            near=NEAR,
+        )
+
+
+def between(frames: Sequence[Keyframe], time: float) -> Keyframe:
+    """The camera at a time: positions along a cubic through the keyframes (finite differences as slopes), rotations
+    on the shortest arc, the logarithm of tan(fov / 2) linear."""
+    after = next((i for i, frame in enumerate(frames) if frame.time >= time - 1e-9), len(frames) - 1)
+    if after == 0 or math.isclose(frames[after].time, time, abs_tol=1e-9):
+        return replace(frames[after], time=time)
+    a, b = frames[after - 1], frames[after]
+    t = (time - a.time) / (b.time - a.time)
+    fov = math.exp((1 - t) * math.log(math.tan(a.fov / 2)) + t * math.log(math.tan(b.fov / 2)))
+    return Keyframe(
+        time=time,
+        position=hermite(frames, after, t),
+        wxyz=slerp(a.wxyz, b.wxyz, t),
+        fov=2 * math.atan(fov),
+    )
+
+
+def hermite(frames: Sequence[Keyframe], after: int, t: float) -> tuple[float, float, float]:
+    """Position at a share t of the way to keyframe `after`."""
+    a, b = frames[after - 1], frames[after]
+    start, end = (torch.tensor(frame.position, dtype=torch.float64) for frame in (a, b))
+    lead, trail = ((b.time - a.time) * slope(frames, i) for i in (after - 1, after))
+    s = 1 - t
+    x, y, z = (s * s * (1 + 2 * t) * start + t * s * s * lead - t * t * s * trail + t * t * (3 - 2 * t) * end).tolist()
+    return x, y, z
+
+
+def slope(frames: Sequence[Keyframe], i: int) -> torch.Tensor:
+    """Velocity at a keyframe: from its neighbour on one side to that on the other."""
+    a, b = frames[max(0, i - 1)], frames[min(len(frames) - 1, i + 1)]
+    way = torch.tensor(b.position, dtype=torch.float64) - torch.tensor(a.position, dtype=torch.float64)
+    return way / (b.time - a.time)
+
+
+def slerp(
+    a: tuple[float, float, float, float], b: tuple[float, float, float, float], t: float
+) -> tuple[float, float, float, float]:
+    """The rotation at a share of the shortest arc from a to b (Shoemake 1985)."""
+    p, q = (torch.tensor(one, dtype=torch.float64) / math.hypot(*one) for one in (a, b))
+    cosine = float(p @ q)
+    q, cosine = (-q, -cosine) if cosine < 0 else (q, cosine)
+    angle = math.acos(min(1.0, cosine))
+    if angle < PARALLEL:
+        mixed = (1 - t) * p + t * q
+    else:
+        mixed = (math.sin((1 - t) * angle) * p + math.sin(t * angle) * q) / math.sin(angle)
+    w, x, y, z = (mixed / mixed.norm()).tolist()
+    return w, x, y, z
+
+
+def write_camera_path(path: Path, made: CameraPath) -> None:
+    """Write a file of ours."""
+    frames = [{"time": frame.time, "position": list(frame.position), "wxyz": list(frame.wxyz),
+               "fov": math.degrees(frame.fov)} for frame in made.keyframes]  # fmt: skip
+    write_json(path, {OWN: 1, "size": list(made.size), "fps": made.fps, "keyframes": frames})
+
+
+def read_camera_path(path: Path) -> CameraPath:
+    """A file of ours, or of nerfstudio.
+
+    Raises:
+        InputError: it is neither, or says something that no camera can be.
+    """
+    try:
+        content = read_json(path)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"camera path '{path}' cannot be read ({error}): give a JSON file") from error
+    try:
+        made = own(content) if isinstance(content, dict) and OWN in content else of_nerfstudio(content)
+        refuse_odd(made)
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"camera path '{path}' {what}: give one that gsx view has saved, or a camera path of nerfstudio"
+        ) from error
+    return made
+
+
+def refuse_odd(path: CameraPath) -> None:
+    """Raise ValueError for what cannot be filmed."""
+    times = [frame.time for frame in path.keyframes]
+    if not times or any(later <= earlier for earlier, later in pairwise(times)):
+        raise ValueError("has no keyframes whose times increase")
+    if not all(1 <= side <= LARGEST_EDGE for side in path.size) or not 0 < path.fps <= 1000:
+        raise ValueError(f"has size {path.size} and {path.fps} frames a second")
+    if (times[-1] - times[0]) * path.fps >= MOST_FRAMES:
+        raise ValueError(f"has {(times[-1] - times[0]) * path.fps:,.0f} frames, more than {MOST_FRAMES:,}")
+    if not all(0 < frame.fov < math.pi for frame in path.keyframes):
+        raise ValueError("has a field of view that is not between 0 and 180 degrees")
+    if not all(math.hypot(*frame.wxyz) > 0 for frame in path.keyframes):
+        raise ValueError("has a rotation that is none")
+
+
+def own(content: dict[str, Any]) -> CameraPath:
+    """Of gsx."""
+    frames = [
+        Keyframe(time=number(one["time"]), position=numbers(one["position"], 3), wxyz=numbers(one["wxyz"], 4),
+                 fov=math.radians(number(one["fov"])))
+        for one in content["keyframes"]
+    ]  # fmt: skip
+    width, height = numbers(content["size"], 2)
+    return CameraPath(size=(int(width), int(height)), fps=number(content["fps"]), keyframes=tuple(frames))
+
+
+def of_nerfstudio(content: Any) -> CameraPath:
+    """Of nerfstudio, a keyframe each frame."""
+    if not isinstance(content, dict) or content.get("camera_type", "perspective") != "perspective":
+        raise ValueError("is no path of perspective cameras")
+    entries = content["camera_path"]
+    fps = number(content["fps"]) if "fps" in content else len(entries) / number(content["seconds"])
+    frames = []
+    for i, entry in enumerate(entries):
+        matrix = torch.tensor(numbers(entry["camera_to_world"], 16), dtype=torch.float64).view(4, 4)
+        axes = matrix[:3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+        axes = axes / axes.norm(dim=0)
+        x, y, z = matrix[:3, 3].tolist()
+        w, *xyz = quaternions_of(axes[None])[0].tolist()
+        frames.append(Keyframe(i / fps, (x, y, z), (w, *xyz), math.radians(number(entry["fov"]))))
+    size = int(number(content["render_width"])), int(number(content["render_height"]))
+    return CameraPath(size=size, fps=fps, keyframes=tuple(frames))
+
+
+def number(value: Any) -> float:
+    """A finite number; else ValueError."""
+    if not is_number(value):
+        raise ValueError(f"has {value!r} where a number should be")
+    return float(value)
+
+
+def numbers(values: Any, count: int) -> Any:
+    """So many finite numbers, of a list or of lists in it; else ValueError."""
+    flat = [one for row in values for one in (row if isinstance(row, list) else [row])]
+    if len(flat) != count:
+        raise ValueError(f"has {len(flat)} numbers where {count} should be")
+    return tuple(number(one) for one in flat)

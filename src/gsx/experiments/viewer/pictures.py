@@ -1,0 +1,201 @@
+"""What a viewer shows: a model from anywhere, by the rasterizer that trained it, alone or beside something else."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
+
+from gsx.core.data.camera import NEAR, Camera
+from gsx.core.data.scene import View
+from gsx.core.gaussians.quaternions import rotation_matrices
+from gsx.core.gaussians.splat_files import splats_of
+from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.quality.metrics import bicubic
+from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.render import render, splats_for
+from gsx.core.training.run import Run
+
+BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
+"""What the right part of the picture may show: the photograph of the view one has jumped to, how far the render is
+from it, or the same camera at the resolution of the photographs, enlarged."""
+FILTERS = ("as trained", "plain 3D-GS", "compensated")
+"""Screen filters: the model's own, dilation by 0.3 px^2 without and with compensated opacities."""
+ERROR_GAIN = 4.0
+"""Errors are shown so many times as large."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a browser looks from, and how large its canvas is."""
+
+    position: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+    """Camera to world; x right, y down, z ahead."""
+    fov: float
+    """Vertical field of view, radians."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a panel says about the picture."""
+
+    zoom: float = 1.0
+    beside: str = "nothing"
+    split: float = 0.5
+    """Where the other picture begins, of the width."""
+    filter: str = "as trained"
+    finer_levels: float = 0.0
+    """Levels of detail of a camera that is 2^this times as fine."""
+    box: float = 1.0
+    """Half edge of the cube about the scene's middle outside of which nothing is drawn, of its extent; 1: no cube."""
+    view: str = ""
+    """The view one has jumped to and not left since."""
+
+
+def camera_of(pose: Pose, width: int, zoom: float = 1.0) -> Camera:
+    """The pinhole camera of a pose on a raster of that width, its field of view narrowed by `zoom`."""
+    height = max(1, round(width * pose.height / pose.width))
+    rotation = rotation_matrices(torch.tensor([pose.wxyz], dtype=torch.float64))[0].T
+    focal = zoom * height / (2 * math.tan(pose.fov / 2))
+    return Camera(
+        rotation=rotation,
+        translation=-rotation @ torch.tensor(pose.position, dtype=torch.float64),
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        width=width,
+        height=height,
+        near=NEAR,
+    )
+
+
+@dataclass(eq=False)
+class RunModel:
+    """The model of a run, as it is now."""
+
+    run: Run
+
+    def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
+        """The model alone."""
+        splats = splats_for(self.run, camera.zoom(2.0**look.finer_levels))
+        shown = inside(splats, self.middle(), look.box * self.run.scene.extent, look)
+        return render(replace(self.run, raster=filtered(self.run.raster, look.filter)), camera, splats=shown).image
+
+    def middle(self) -> Float[Tensor, "3"]:
+        """Of the points that it began with, or of its cameras."""
+        points = self.run.scene.points.positions
+        centres = torch.stack([view.camera.centre for view in self.run.scene.train]).float()
+        return (points if len(points) else centres).median(0).values
+
+    @property
+    def focal(self) -> float:
+        """Of the photographs, px; per px of their height."""
+        camera = self.run.scene.train[0].camera
+        return camera.fy / camera.height
+
+    @property
+    def height(self) -> int:
+        """Of the photographs, px."""
+        return self.run.scene.train[0].camera.height
+
+    def views(self) -> dict[str, View]:
+        """Training and test views by name."""
+        return {view.name: view for view in (*self.run.scene.test, *self.run.scene.train)}
+
+
+@dataclass(eq=False)
+class FileModel:
+    """The splats of a file."""
+
+    gaussians: Gaussians
+    raster: RasterSettings
+    height: int = 480
+    """Of photographs that nobody knows."""
+
+    @torch.no_grad()
+    def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
+        """The model alone, over black."""
+        splats = splats_of(self.gaussians, camera.centre)
+        reach = float((self.gaussians.means - self.middle()).norm(dim=1).quantile(0.9)) if len(splats) else 1.0
+        shown = inside(splats, self.middle(), look.box * reach, look)
+        raster = filtered(self.raster, look.filter)
+        return rasterize_tiled(shown, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
+
+    def middle(self) -> Float[Tensor, "3"]:
+        """Of the splats."""
+        return self.gaussians.means.median(0).values
+
+    def views(self) -> dict[str, View]:
+        """None."""
+        return {}
+
+
+Model = RunModel | FileModel
+
+
+def filtered(raster: RasterSettings, name: str) -> RasterSettings:
+    """Rules of the rasterizer with another screen filter."""
+    if name == "as trained":
+        return raster
+    return replace(raster, dilation=0.3, compensate=name == "compensated", zoomed="plain", pixel="sample")
+
+
+def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float, look: Look) -> Splats:
+    """The splats in the cube, if there is one."""
+    if look.box >= 1:
+        return splats
+    kept: Bool[Tensor, N] = ((splats.means - middle.to(splats.means)).abs() <= reach).all(1)
+    return Splats(**{name: value[kept] for name, value in vars(splats).items()})
+
+
+def picture(model: Model, pose: Pose, look: Look, width: int) -> Float[Tensor, "3 H W"]:
+    """What the browser is sent, of that width."""
+    camera = camera_of(pose, width, look.zoom)
+    shown = model.drawn(camera, look)
+    view = model.views().get(look.view)
+    if look.beside == "x1, enlarged":
+        return split(shown, enlarged(model, pose, look, shown), look.split)
+    if look.beside == "nothing" or view is None:
+        return shown
+    photo, covered = placed(view.image().to(shown), view.camera, camera)
+    other = photo if look.beside == "photograph" else (ERROR_GAIN * (photo - shown).abs()).clamp_(0, 1)
+    return split(shown, torch.where(covered, other, shown), look.split)
+
+
+def split(left: Float[Tensor, "3 H W"], right: Float[Tensor, "3 H W"], at: float) -> Float[Tensor, "3 H W"]:
+    """Two pictures, of which the second begins at a share of the width, with a white line between."""
+    column = round(at * left.shape[2])
+    joined = torch.cat([left[..., :column], right[..., column:]], 2)
+    joined[..., max(0, column - 1) : column] = 1
+    return joined
+
+
+def enlarged(model: Model, pose: Pose, look: Look, like: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """The same camera as fine as the photographs, before it is zoomed; enlarged by Keys bicubic."""
+    per_pixel = 2 * math.tan(pose.fov / 2) * (model.focal if isinstance(model, RunModel) else 0.5)
+    height = max(2, round(model.height * per_pixel / look.zoom))
+    small = camera_of(pose, max(2, round(height * pose.width / pose.height)), look.zoom)
+    return bicubic(model.drawn(small, look), like.shape[2], like.shape[1])
+
+
+def placed(
+    photo: Float[Tensor, "3 h w"], taken_by: Camera, camera: Camera
+) -> tuple[Float[Tensor, "3 H W"], Bool[Tensor, "H W"]]:
+    """(a photograph where it lies in the raster of a camera at the same place, which pixels it covers)."""
+    scale = camera.fy / taken_by.fy
+    columns = (torch.arange(camera.width).to(photo) + 0.5 - camera.cx) / scale + taken_by.cx
+    rows = (torch.arange(camera.height).to(photo) + 0.5 - camera.cy) / scale + taken_by.cy
+    x, y = 2 * columns / taken_by.width - 1, 2 * rows / taken_by.height - 1
+    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
+    smaller = photo[None]
+    if scale < 1:  # averaged first, so that it does not alias
+        size = [max(1, round(side * scale)) for side in photo.shape[1:]]
+        smaller = interpolate(smaller, size, mode="bicubic", antialias=True).clamp(0, 1)
+    sampled = grid_sample(smaller, grid, padding_mode="border", align_corners=False)
+    return sampled[0], (x.abs() <= 1)[None] & (y.abs() <= 1)[:, None]

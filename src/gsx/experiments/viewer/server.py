@@ -1,0 +1,276 @@
+"""A model in a browser: viser shows pictures that our own rasterizer draws, and asks what is to be drawn."""
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from functools import partial
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import upright
+from gsx.core.data.images import write_image
+from gsx.core.data.resize import to_uint8
+from gsx.core.data.scene import View
+from gsx.core.errors import InputError
+from gsx.core.gaussians.quaternions import quaternions_of
+from gsx.core.packages import require
+from gsx.core.shapes import Float
+from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
+from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
+from gsx.experiments.viewer.screens import FrameServer, Screen
+
+LOCAL = "127.0.0.1"
+JPEG_QUALITY = 90
+FRUSTUM = 0.03
+"""Size of the cameras that are shown, of the scene's extent."""
+COLOURS = {"training": (60, 110, 200), "test": (220, 120, 40)}
+ARRIVAL = 5.0
+"""Seconds that a browser has to arrive at a view."""
+KEYFRAME_SECONDS = 1.0
+"""Between two keyframes of a camera path."""
+
+
+class Viewer:
+    """A server, its browsers, and the model that they see."""
+
+    def __init__(self, model: Model, title: str, host: str = LOCAL, port: int = 8080, training: bool = False) -> None:
+        require("gsx view", ("viser",), "gsx[viewer]")
+        import viser
+
+        self.frames, self.title, self.folder = FrameServer(model), title, Path.cwd()
+        self.training, self.paused, self.keyframes = training, False, list[Keyframe]()
+        self.told = ""
+        self.panels: dict[int, Panel] = {}
+        try:
+            with redirect_stdout(StringIO()):  # its banner; the address is told by us
+                self.server: Any = viser.ViserServer(host=host, port=port, label=f"gsx: {title}", verbose=False)
+        except OSError as error:
+            raise InputError(f"port {port} of {host} cannot be used ({error.strerror}): choose another port") from error
+        self.address = f"http://{host}:{self.server.get_port()}"
+        self.place_cameras()
+        self.server.on_client_connect(self.connected)
+        self.server.on_client_disconnect(self.left)
+
+    def place_cameras(self) -> None:
+        """Show training and test cameras, and begin at the first test view."""
+        model = self.frames.model
+        if not isinstance(model, RunModel):
+            self.server.scene.set_up_direction("-y")
+            return
+        scene = model.run.scene
+        up = upright(torch.stack([view.camera.rotation for view in scene.train]).double())
+        self.server.scene.set_up_direction(tuple(up.tolist()))
+        for kind, views in (("training", scene.train), ("test", scene.test)):
+            for view in views:
+                self.place_camera(kind, view, FRUSTUM * scene.extent)
+
+    def place_camera(self, kind: str, view: View, scale: float) -> None:
+        """Show one camera, to which a click leads."""
+        pose = pose_of(view, 100)
+        shown = self.server.scene.add_camera_frustum(
+            f"/{kind}/{view.name}", fov=pose.fov, aspect=view.camera.width / view.camera.height, scale=scale,
+            color=COLOURS[kind], wxyz=pose.wxyz, position=pose.position, visible=False,
+        )  # fmt: skip
+        shown.on_click(lambda event: self.panels[event.client.client_id].jump(view.name))
+
+    def connected(self, client: Any) -> None:
+        """A browser has come."""
+        screen = Screen(partial(send, client))
+        self.panels[client.client_id] = panel = Panel(self, client, screen)
+        client.camera.on_update(lambda camera: panel.moved(camera))
+        panel.begin()
+        self.frames.screens[client.client_id] = screen
+
+    def left(self, client: Any) -> None:
+        """A browser has gone."""
+        self.frames.screens.pop(client.client_id, None)
+        self.panels.pop(client.client_id, None)
+
+    def changed(self, told: str) -> None:
+        """The model is another now; `told`: how it stands, in words."""
+        self.frames.version += 1
+        self.tell(told)
+
+    def tell(self, told: str) -> None:
+        """Say in all panels how the model stands."""
+        self.told = told
+        for panel in list(self.panels.values()):
+            panel.tell()
+
+    def stop(self) -> None:
+        """Close the server."""
+        self.server.stop()
+
+    def serve(self, until: Callable[[], bool], poll: Callable[[], None] = lambda: None) -> None:
+        """Draw whatever is asked for, until told otherwise; `poll` is called between pictures."""
+        while not until():
+            poll()
+            if not self.frames.show_next():
+                time.sleep(0.01)
+
+
+class Panel:
+    """What one browser has beside its picture."""
+
+    def __init__(self, viewer: Viewer, client: Any, screen: Screen) -> None:
+        self.viewer, self.client, self.screen, gui = viewer, client, screen, client.gui
+        self.lock, self.patience = threading.Lock(), 0.0
+        self.target: tuple[float, float, float] | None = None
+        names = list(viewer.frames.model.views())
+        self.state = gui.add_markdown("")
+        pause = gui.add_checkbox("pause training", viewer.paused, visible=viewer.training)
+        pause.on_update(lambda _: setattr(viewer, "paused", pause.value))
+        with gui.add_folder("view"):
+            self.view = gui.add_dropdown("camera", ["-", *names], visible=bool(names))
+            self.view.on_update(lambda _: self.chosen())
+            cameras = gui.add_checkbox("show cameras", False, visible=bool(names))
+            cameras.on_update(lambda _: self.show_cameras(cameras.value))
+            self.slider("zoom", "zoom", 1.0, 8.0, 0.1, 1.0)
+            beside = gui.add_dropdown("beside", BESIDE if names else [BESIDE[0], BESIDE[3]])
+            beside.on_update(lambda _: self.choose(beside=beside.value))
+            self.slider("begins at", "split", 0.0, 1.0, 0.01, 0.5)
+        with gui.add_folder("model", expand_by_default=False):
+            filters = gui.add_dropdown("filter", FILTERS)
+            filters.on_update(lambda _: self.choose(filter=filters.value))
+            self.slider("finer levels", "finer_levels", -4.0, 4.0, 0.5, 0.0)
+            self.slider("crop box", "box", 0.02, 1.0, 0.02, 1.0)
+        with gui.add_folder("path and pictures", expand_by_default=False):
+            gui.add_button("add keyframe").on_click(lambda _: self.add_keyframe())
+            gui.add_button("save path").on_click(lambda _: self.save_path())
+            gui.add_button("snapshot").on_click(lambda _: viewer.frames.jobs.append(self.snapshot))
+        self.tell()
+
+    def slider(self, label: str, key: str, least: float, most: float, step: float, value: float) -> None:
+        """A number of the look."""
+        handle = self.client.gui.add_slider(label, least, most, step, value)
+        handle.on_update(lambda _: self.choose(**{key: handle.value}))
+
+    def choose(self, **chosen: object) -> None:
+        """The look is another."""
+        self.screen.choose(**chosen)
+
+    def tell(self) -> None:
+        """How the model stands, and how fast pictures come."""
+        rate = f", {self.screen.rate:.1f} pictures/s while moving" if self.screen.rate else ""
+        self.state.content = f"**{self.viewer.title}**  \n{self.viewer.told}{rate}"
+
+    def begin(self) -> None:
+        """Look from the first test view, or from before the splats."""
+        model = self.viewer.frames.model
+        names = list(model.views())
+        if names:
+            self.jump(names[0])
+            return
+        middle = model.middle()
+        self.client.camera.position = tuple((middle + torch.tensor([0.0, 0.0, -3.0])).tolist())
+        self.client.camera.look_at = tuple(middle.tolist())
+
+    def chosen(self) -> None:
+        """Somebody chose a view; or we did, who have jumped there already."""
+        if self.view.value not in ("-", self.screen.look.view):
+            self.jump(self.view.value)
+
+    def jump(self, name: str) -> None:
+        """Look from where a photograph was taken."""
+        view = self.viewer.frames.model.views()[name]
+        pose, camera = pose_of(view, 100), self.client.camera
+        with self.lock:
+            self.target, self.patience = pose.position, time.monotonic() + ARRIVAL
+            with self.client.atomic():
+                camera.wxyz, camera.position, camera.fov = pose.wxyz, pose.position, pose.fov
+            self.choose(view=name)
+        self.view.value = name
+
+    def moved(self, camera: Any) -> None:
+        """The browser looks from elsewhere."""
+        x, y, z = map(float, camera.position)
+        w, i, j, k = map(float, camera.wxyz)
+        size = int(camera.image_width) or 640, int(camera.image_height) or 480
+        pose = Pose((x, y, z), (w, i, j, k), float(camera.fov), *size)
+        with self.lock:
+            if self.on_its_way(pose):
+                return
+            self.screen.turn(pose)
+        self.tell()
+
+    def on_its_way(self, pose: Pose) -> bool:
+        """Whether the browser has yet to arrive where it was sent; once there, what leads away leaves the view."""
+        if self.target is None:
+            return False
+        if math.dist(pose.position, self.target) <= 1e-4 * (1 + math.hypot(*self.target)):
+            self.patience = 0.0
+        elif time.monotonic() < self.patience:
+            return True
+        else:
+            self.target = None
+            self.choose(view="")
+            self.view.value = "-"
+        return False
+
+    def show_cameras(self, shown: bool) -> None:
+        """Frusta of all cameras, or none."""
+        for name in COLOURS:
+            for view in self.viewer.frames.model.views():
+                handle = self.viewer.server.scene.get_handle_by_name(f"/{name}/{view}")
+                if handle is not None:
+                    handle.visible = shown
+
+    def add_keyframe(self) -> None:
+        """Remember where one looks from."""
+        if self.screen.pose is None:
+            return
+        frames, pose = self.viewer.keyframes, self.screen.pose
+        at = frames[-1].time + KEYFRAME_SECONDS if frames else 0.0
+        frames.append(Keyframe(time=at, position=pose.position, wxyz=pose.wxyz, fov=pose.fov))
+        self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
+
+    def save_path(self) -> None:
+        """Write the keyframes where `gsx render` finds them."""
+        if self.screen.pose is None or not self.viewer.keyframes:
+            self.notify("no path", "add keyframes first")
+            return
+        path = free(self.viewer.folder, "camera_path", ".json")
+        size = (self.screen.pose.width, self.screen.pose.height)
+        write_camera_path(path, CameraPath(size=size, fps=24.0, keyframes=tuple(self.viewer.keyframes)))
+        self.notify("path saved", f"{path}: gsx render RUN --path {path.name} --movie FILE.mp4")
+
+    def snapshot(self) -> None:
+        """Write the picture as large as the canvas."""
+        if self.screen.pose is None:
+            return
+        path = free(self.viewer.folder, "snapshot", ".png")
+        with torch.no_grad():
+            image = picture(self.viewer.frames.model, self.screen.pose, self.screen.look, self.screen.pose.width)
+        write_image(path, image)
+        self.notify("snapshot", str(path))
+
+    def notify(self, title: str, body: str) -> None:
+        """A word in the browser."""
+        self.client.add_notification(title, body, auto_close_seconds=5.0)
+
+
+def send(client: Any, image: Float[Tensor, "3 H W"]) -> None:
+    """A picture for a browser."""
+    pixels = np.ascontiguousarray(to_uint8(image.cpu()).permute(1, 2, 0).numpy())
+    client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=JPEG_QUALITY)
+
+
+def pose_of(view: View, width: int) -> Pose:
+    """The pose of a view's camera; its principal point is taken for the middle."""
+    camera = view.camera
+    wxyz = quaternions_of(camera.rotation.T.double()[None])[0]
+    fov = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
+    height = max(1, round(width * camera.height / camera.width))
+    return Pose(tuple(camera.centre.tolist()), tuple(wxyz.tolist()), fov, width, height)
+
+
+def free(folder: Path, stem: str, suffix: str) -> Path:
+    """A name in a folder that no file has yet."""
+    return next(path for n in range(1, 10**6) if not (path := folder / f"{stem}_{n}{suffix}").exists())

@@ -1,0 +1,244 @@
+"""What a browser is sent: the right picture, soon coarse and then fine, and nothing that changes training."""
+
+import math
+import threading
+import time
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+from browser import CHROMIUM, browser
+from tiny import final_tensors, tiny_run
+
+from gsx.builtin import plugins
+from gsx.core.data.images import read_image
+from gsx.core.quality.metrics import bicubic, psnr
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.runs.open import open_run
+from gsx.experiments.viewer import screens
+from gsx.experiments.viewer.pictures import Look, Pose, RunModel, camera_of, picture, placed, split
+from gsx.experiments.viewer.screens import FrameServer, Screen
+
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("viewer") / "run"
+    tiny_run(folder, ["iterations=8", "rasterizer=eager"])
+    return open_run(folder, plugins())[0]
+
+
+def pose_at(run: Run, number: int = 0, width: int = 48) -> Pose:
+    from gsx.experiments.viewer.server import pose_of
+
+    return pose_of(run.scene.test[number], width)
+
+
+def test_a_pose_is_the_camera_that_it_was_made_of(run: Run) -> None:
+    camera = run.scene.test[0].camera
+    again = camera_of(pose_at(run), camera.width)
+    assert torch.allclose(again.rotation, camera.rotation.double(), atol=1e-12)
+    assert torch.allclose(again.translation, camera.translation.double(), atol=1e-12)
+    assert (again.size, again.fy) == (camera.size, pytest.approx(camera.fy))
+    zoomed = camera_of(pose_at(run), camera.width, zoom=3)
+    assert zoomed.fy == pytest.approx(3 * camera.fy)
+
+
+def test_the_picture_is_that_of_the_run(run: Run) -> None:
+    """The built-in scene's pixels are square."""
+    shown = picture(RunModel(run), pose_at(run), Look(), 96)
+    assert psnr(shown, render(run, run.scene.test[0].camera.zoom(2)).image) > 60
+
+
+def test_the_photograph_lies_where_it_was_taken(run: Run) -> None:
+    view = run.scene.test[0]
+    photo, covered = placed(view.image(), view.camera, view.camera)
+    assert bool(covered.all())
+    assert torch.allclose(photo, view.image(), atol=1e-5)
+    wider = replace(view.camera, width=view.camera.width + 20, cx=view.camera.cx + 10)
+    photo, covered = placed(view.image(), view.camera, wider)
+    assert torch.allclose(photo[:, :, 10:-10], view.image(), atol=1e-5)
+    assert covered[:, 10:-10].all()
+    assert not covered[:, :10].any()
+    look = Look(beside="photograph", split=0.5, view=view.name)
+    shown = picture(RunModel(run), pose_at(run), look, 48)
+    assert torch.allclose(shown[:, :, 24:], view.image()[:, :, 24:], atol=1e-4)
+    error = picture(RunModel(run), pose_at(run), replace(look, beside="error", split=0.0), 48)
+    own = picture(RunModel(run), pose_at(run), Look(), 48)
+    assert torch.allclose(error, (4 * (own - view.image()).abs()).clamp(0, 1), atol=1e-3)
+
+
+def test_beside_a_zoomed_picture_stands_the_enlarged_one(run: Run) -> None:
+    """At zoom 2 the other half is the middle of the x1 render at half the raster, enlarged."""
+    look = Look(zoom=2.0, beside="x1, enlarged", split=0.0)
+    shown = picture(RunModel(run), pose_at(run), look, 96)
+    camera = camera_of(pose_at(run), 24, 2.0)
+    assert camera.fy == pytest.approx(run.scene.test[0].camera.fy)
+    assert torch.allclose(shown, bicubic(render(run, camera).image, 96, 72), atol=1e-5)
+
+
+def test_two_pictures_meet_at_a_line() -> None:
+    joined = split(torch.zeros(3, 2, 10), torch.full((3, 2, 10), 0.5), 0.4)
+    assert joined[0, 0].tolist() == [0, 0, 0, 1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+
+
+def test_a_box_leaves_out_what_is_beyond_it(run: Run) -> None:
+    whole, cut = (picture(RunModel(run), pose_at(run), Look(box=box), 48) for box in (1.0, 0.02))
+    assert not torch.equal(whole, cut)
+    assert psnr(cut, run.background[:, None, None].expand_as(cut)) > psnr(
+        whole, run.background[:, None, None].expand_as(whole)
+    )
+
+
+class Still:
+    """A model of one colour that takes its time."""
+
+    def __init__(self, seconds_per_pixel: float) -> None:
+        self.seconds_per_pixel = seconds_per_pixel
+
+    def drawn(self, camera, look) -> torch.Tensor:
+        time.sleep(self.seconds_per_pixel * camera.width * camera.height)
+        return torch.zeros(3, camera.height, camera.width)
+
+    def views(self) -> dict[str, object]:
+        return {}
+
+
+def test_pictures_are_coarse_at_first_and_sharpen_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(screens, "REST", 0.0)
+    widths: list[int] = []
+    server = FrameServer(Still(0.0), seconds_per_pixel=1e-5)  # type: ignore[arg-type]
+    screen = Screen(lambda image: widths.append(image.shape[2]))
+    server.screens[0] = screen
+    assert not server.show_next()  # nobody has said from where
+    pose = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 1000, 500)
+    screen.turn(pose)
+    while server.show_next():
+        pass
+    assert widths[0] == int((0.1 / 1e-5 * 2) ** 0.5)
+    assert widths == sorted(widths)
+    assert widths[-1] == 1000
+    widths.clear()
+    screen.turn(pose)  # the same
+    assert not server.show_next()
+    screen.choose(zoom=2.0)
+    assert server.show_next()
+    assert widths[0] < 1000
+    server.version += 1  # another model
+    assert server.show_next()
+
+
+def test_moving_goes_before_sharpening(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(screens, "REST", 0.0)
+    shown: list[str] = []
+    server = FrameServer(Still(0.0))  # type: ignore[arg-type]
+    for name in ("a", "b"):
+        server.screens[len(server.screens)] = Screen(lambda image, name=name: shown.append(name))
+    pose = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 1000, 500)
+    server.screens[0].turn(pose)
+    server.show_next()
+    server.screens[1].turn(pose)
+    server.show_next()
+    assert shown == ["a", "b"]  # not the second, finer one of a
+
+
+@needs_viser
+def test_training_is_the_same_bits_with_somebody_looking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsx.experiments.viewer import training
+
+    drawn = []
+
+    class Scripted:
+        """A viewer with a screen that moves all the time, and no server."""
+
+        def __init__(self, model, title, host, port, training) -> None:
+            self.frames, self.paused = FrameServer(model), False
+            self.frames.screens[0] = Screen(lambda image: drawn.append(image.shape))
+            self.address, self.turns = "nowhere", 0
+
+        def changed(self, told: str) -> None:
+            assert "held-out" in told or "step" in told
+            self.frames.version += 1
+            self.turns += 1
+            self.frames.screens[0].turn(Pose((0.1 * self.turns, -2.0, 1.0), (0.7, -0.7, 0.0, 0.0), 1.0, 64, 48))
+
+        def stop(self) -> None:
+            drawn.append(None)
+
+    monkeypatch.setattr(training, "Viewer", Scripted)
+    more = ["iterations=8", "rasterizer=eager", "training.test_points=2"]
+    tiny_run(tmp_path / "alone", more)
+    tiny_run(tmp_path / "looked_at", [*more, "viewer=true", "viewer_share=1.0"])
+    assert len(drawn) > 3
+    assert drawn[-1] is None
+    expected, found = final_tensors(tmp_path / "alone"), final_tensors(tmp_path / "looked_at")
+    assert all(torch.equal(value, found[name]) for name, value in expected.items())
+
+
+@needs_viser
+def test_a_share_of_the_time_is_not_exceeded(run: Run) -> None:
+    from gsx.experiments.viewer.training import TrainingViewer
+
+    shown = TrainingViewer(run, "127.0.0.1", 0, share=0.5)
+    try:
+        server = shown.viewer.frames
+        server.model = Still(1e-5)  # type: ignore[assignment]
+        server.screens[0] = Screen(lambda image: None)
+        for turn in range(20):
+            server.screens[0].turn(Pose((float(turn), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 200, 100))
+            shown.gsx_step_finished(run, None)  # type: ignore[arg-type]
+            time.sleep(0.02)
+        elapsed = time.monotonic() - shown.begun
+        assert 0 < server.spent < 0.5 * elapsed + 0.3  # by one picture at most
+    finally:
+        shown.viewer.stop()
+
+
+@needs_viser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_browser_shows_the_model_and_its_panel(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsx.experiments.viewer.server import Viewer
+
+    monkeypatch.chdir(tmp_path)
+    done = threading.Event()
+    viewer = Viewer(RunModel(run), "a title", "127.0.0.1", 0)
+    loop = threading.Thread(target=viewer.serve, args=(done.is_set,), daemon=True)
+    loop.start()
+    try:
+        with browser(640, 480) as page:
+            page.open(viewer.address)
+            until = time.monotonic() + 90
+            while not (list(viewer.frames.screens.values()) or [Screen(print)])[0].width:
+                page.value("1")  # so that its events are heard
+                assert time.monotonic() < until, page.said
+                time.sleep(0.2)
+            (screen,) = viewer.frames.screens.values()
+            (panel,) = viewer.panels.values()
+            assert screen.look.view == run.scene.test[0].name
+            assert math.dist(screen.pose.position, run.scene.test[0].camera.centre.tolist()) < 1e-3
+            screen.choose(zoom=2.0)
+            while screen.drawn is None or screen.drawn[1].zoom != 2.0 or screen.width < 640:
+                page.value("1")
+                assert time.monotonic() < until
+                time.sleep(0.1)
+            page.value("new Promise(done => setTimeout(done, 2000))")
+            shown = read_image(page.picture(tmp_path / "shown.png"))[:3].float() / 255
+            expected = picture(viewer.frames.model, screen.pose, screen.look, 640)
+            free_part = (slice(None), slice(200, 470), slice(0, 300))  # beside panel and notices
+            assert psnr(shown[free_part], expected[free_part]) > 30
+            panel.add_keyframe()
+            panel.add_keyframe()
+            panel.save_path()
+            viewer.frames.jobs.append(panel.snapshot)
+            while not (tmp_path / "snapshot_1.png").exists():
+                time.sleep(0.1)
+            assert (tmp_path / "camera_path_1.json").exists()
+            assert [said for said in page.said if "deprecated" not in said] == []
+    finally:
+        done.set()
+        loop.join(10)
+        viewer.stop()
