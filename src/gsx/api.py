@@ -148,7 +148,7 @@ def train(*given: str, **values: Any) -> TrainedRun:
 
 
 def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
-    """A run folder, or a splat file of any kind that is written; raster: what the latter is drawn by, if not as it says.
+    """A run folder, or a splat file of any kind that is written; raster: what it is drawn by, if not as it says.
 
     Raises:
         InputError: it is neither, or damaged.

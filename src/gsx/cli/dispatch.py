@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
+from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_render, verb_view
@@ -18,7 +19,7 @@ HELP = """\
 gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.
 
   gsx                                            train the built-in scene (start here; a few minutes on a laptop)
-  gsx scene=photos scene.path=FOLDER             train from nothing but photos
+  gsx FOLDER                                     train from what is in it: photos, COLMAP, transforms; or from a VIDEO
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
 
   gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
@@ -94,8 +95,12 @@ def dispatch(arguments: list[str]) -> int:
         return 0
     if not arguments or arguments[0].startswith(("-", "+", "~")) or "=" in arguments[0]:
         return verb_train(arguments)
+    if arguments[0] not in VERBS and is_given(arguments[0]):
+        set_up_logging()
+        return train_from(arguments)
     if arguments[0] not in VERBS:
-        raise ConfigError(f"'{arguments[0]}' is no verb of gsx.{nearest(arguments[0], VERBS)} See gsx --help")
+        problem = f"'{arguments[0]}' is no verb of gsx, and no folder."
+        raise ConfigError(f"{problem}{nearest(arguments[0], VERBS)} See gsx --help")
     set_up_logging()
     return VERBS[arguments[0]](arguments[1:])
 

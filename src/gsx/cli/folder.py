@@ -1,0 +1,64 @@
+"""gsx FOLDER: find out what it is, say what is done with it, and do it."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsx.builtin import plugins
+from gsx.cli.train import verb_train
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.gaussians.suffixes import suffix_of
+from gsx.core.plugins import Plugins
+
+logger = logging.getLogger("gsx.cli")
+
+
+def is_given(word: str) -> bool:
+    """Whether a word of the command line is a folder or file that one may train from."""
+    return Path(word).expanduser().exists()
+
+
+def train_from(arguments: list[str]) -> int:
+    """gsx FOLDER|VIDEO [KEY=VALUE ...]: train from it, as whatever it is."""
+    path, overrides = Path(arguments[0]).expanduser(), arguments[1:]
+    odd = next((word for word in overrides if "=" not in word or word.startswith(("scene=", "scene.path="))), "")
+    if odd:
+        raise ConfigError(f"gsx {arguments[0]}: '{odd}' does not go with it: it says itself what scene it is")
+    words = scene_words(path, overrides, plugins())
+    logger.info("%s is %s", path, told(words, path))
+    logger.info("gsx %s", " ".join([*words, *overrides]))
+    return verb_train([*words, *overrides])
+
+
+def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:
+    """Words of the command line for the scene that a folder or a video is.
+
+    Raises:
+        InputError: it is none; a splat file gets told what can be done with it.
+    """
+    from gsx.experiments.runs.compose import quoted
+    from gsx.experiments.runs.inspect import readable, unknown
+    from gsx.experiments.runs.video import is_video, photos_of
+
+    if (path / "config.yaml").is_file():
+        raise InputError(f"{path} is a run: gsx view {path}, gsx eval {path}, gsx resume {path}")
+    if path.is_file() and suffix_of(path):
+        raise InputError(
+            f"{path} is a splat file: gsx view {path}, gsx eval {path} scene=... scene.path=FOLDER, or train on with "
+            f"init={path} scene=... scene.path=FOLDER"
+        )
+    if is_video(path):
+        output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")
+        return ["scene=photos", f"scene.path={quoted(str(photos_of(path, Path(output))))}"]
+    loaders = readable(path, loaded)
+    if not loaders:
+        raise unknown(path, loaded)
+    loader, its = loaders[0]
+    more = [f"scene.{key}={quoted(value)}" for key, value in its.overrides(path).items()]
+    return [f"scene={loader.name}", f"scene.path={quoted(str(path))}", *more]
+
+
+def told(words: Sequence[str], path: Path) -> str:
+    """What it is, in words."""
+    scene = words[0].partition("=")[2]
+    return "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"

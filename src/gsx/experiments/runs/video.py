@@ -1,0 +1,103 @@
+"""Photographs out of a video: of each stretch of time the sharpest frame."""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsx.core.cache import file_stamp
+from gsx.core.errors import InputError, first_line
+from gsx.core.files import read_json, write_json
+from gsx.core.packages import require
+from gsx.core.shapes import Float, UInt8
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+FRAMES = 100
+"""Stretches of time, and so photographs, of a video."""
+LEAST_FRAMES = 10
+"""Fewer frames than that show too little to be reconstructed."""
+INDEX = "frames.json"
+"""Written last: which video the folder is of."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether it is called as videos are."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
+    """A folder below `output` with the sharpest frame of each of `count` stretches of a video; made once.
+
+    Raises:
+        ConfigError: PyAV is not installed.
+        InputError: the video cannot be read, or is too short.
+    """
+    require(f"frames of {path}", ("av",), "gsx[video]")
+    folder, made_of = output / "videos" / path.name, [*map(str, file_stamp(path)), count]
+    if (folder / INDEX).exists() and read_json(folder / INDEX) == made_of:
+        logger.info("frames were chosen earlier: %s", folder)
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in [folder / INDEX, *folder.glob("frame_*.png")]:
+        old.unlink(missing_ok=True)
+    total = sum(1 for _ in frames_in(path))
+    if total < LEAST_FRAMES:
+        raise InputError(f"'{path}' has {total} frames, too few to reconstruct a scene: film for at least some seconds")
+    stretches = min(count, total)
+    for number, pixels in sharpest(path, total, stretches):
+        write_png(folder / f"frame_{number:05d}.png", pixels)
+    write_json(folder / INDEX, made_of)
+    logger.info("%d of %d frames chosen, the sharpest of each stretch: %s", stretches, total, folder)
+    return folder
+
+
+def frames_in(path: Path) -> Iterator[Any]:
+    """Frames of the first video stream, decoded one after the other.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"'{path}' holds no video: give another file")
+            container.streams.video[0].thread_type = "AUTO"
+            yield from container.decode(video=0)
+    except av.error.FFmpegError as error:
+        raise InputError(f"'{path}' cannot be read as a video ({first_line(error)}): give another file") from error
+
+
+def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """(number, pixels) of the sharpest frame of each stretch, in order."""
+    best: tuple[float, int, Any] | None = None
+    for number, frame in enumerate(frames_in(path)):
+        if best is not None and number * stretches // total > best[1] * stretches // total:
+            yield best[1], best[2].to_ndarray(format="rgb24")
+            best = None
+        score = sharpness(frame.to_ndarray(format="gray").astype(np.float32))
+        if best is None or score > best[0]:
+            best = score, number, frame
+    if best is not None:
+        yield best[1], best[2].to_ndarray(format="rgb24")
+
+
+def sharpness(grey: Float[np.ndarray, "H W"]) -> float:
+    """Variance of the Laplacian: blur takes it away (Pech-Pacheco et al. 2000)."""
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return float(laplacian.var())
+
+
+def write_png(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
+    """A picture; it appears whole or not at all."""
+    import torch
+
+    from gsx.core.data.images import write_image
+
+    write_image(path, torch.from_numpy(pixels).permute(2, 0, 1).float() / 255)

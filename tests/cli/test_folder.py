@@ -1,0 +1,110 @@
+"""gsx FOLDER: what it is taken for, and what it says of what it cannot train from."""
+
+import logging
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic_colmap import synthesize, write_photos, write_scene
+
+from gsx.builtin import plugins
+from gsx.cli import folder as folders
+from gsx.cli.dispatch import main
+from gsx.core.errors import InputError
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.orbit import write_animation
+from gsx.experiments.runs.video import photos_of, sharpest, sharpness
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Words of what would be trained."""
+    given: list[list[str]] = []
+    monkeypatch.setattr(folders, "verb_train", lambda words: given.append(words) or 0)
+    return given
+
+
+def test_a_colmap_folder_and_photos_are_told_apart(tmp_path: Path, trained: list[list[str]]) -> None:
+    write_scene(synthesize(), tmp_path / "it's a model")
+    write_photos(synthesize(), tmp_path / "photos")
+    assert main([str(tmp_path / "it's a model"), "iterations=7"]) == 0
+    assert main([str(tmp_path / "photos")]) == 0
+    model, photos = (compose(words, plugins()) for words in trained)
+    assert model.scene.component.name == "colmap"
+    assert Path(model.scene.options.path) == tmp_path / "it's a model"
+    assert model.general.iterations == 7
+    assert photos.scene.component.name == "photos"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("empty", "is no scene"),
+        ("run", "is a run: gsx view"),
+        ("a.ply", "is a splat file: gsx view"),
+        ("notes.txt", "is no folder"),
+    ],
+)
+def test_what_is_no_scene_is_told_with_a_remedy(
+    tmp_path: Path, trained: list[list[str]], capsys: pytest.CaptureFixture[str], name: str, words: str
+) -> None:
+    for folder in ("empty", "run"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("")
+    for file in ("a.ply", "notes.txt"):
+        (tmp_path / file).write_text("")
+    assert main([str(tmp_path / name)]) == 2
+    assert words in capsys.readouterr().err
+    assert trained == []
+
+
+def test_a_scene_beside_it_makes_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path), "scene=demo"]) == 2
+    assert "'scene=demo' does not go with it" in capsys.readouterr().err
+    assert main([str(tmp_path / "none")]) == 2
+    assert "is no verb of gsx, and no folder" in capsys.readouterr().err
+
+
+def test_sharpness_by_hand() -> None:
+    """A single bright pixel: the Laplacian is -4 there, 1 at four neighbours, 0 at the twenty others of 25."""
+    grey = np.zeros((7, 7), np.float32)
+    grey[3, 3] = 1
+    values = np.array([-4, 1, 1, 1, 1] + [0] * 20)
+    assert sharpness(grey) == pytest.approx(values.var())
+    assert sharpness(np.full((7, 7), 9, np.float32)) == 0
+
+
+@pytest.mark.skipif(find_spec("av") is None, reason="PyAV is not installed")
+def test_of_each_stretch_of_a_video_the_sharpest_frame_is_taken(
+    tmp_path: Path, trained: list[list[str]], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sharp_ones = {3, 14, 21, 39}
+    g = torch.Generator().manual_seed(0)
+    noise = torch.rand(3, 64, 96, generator=g)
+
+    def frames():
+        for number in range(40):
+            shown = noise.roll(number, 2)
+            blurred = torch.nn.functional.avg_pool2d(shown[None], 9, 1, 4)[0]
+            yield shown if number in sharp_ones else blurred
+
+    video = tmp_path / "a video.mp4"
+    write_animation(video, frames(), 20)
+    assert {number for number, _ in sharpest(video, 40, 4)} == sharp_ones
+    monkeypatch.chdir(tmp_path)
+    assert main([str(video)]) == 0
+    settings = compose(trained[0], plugins())
+    assert settings.scene.component.name == "photos"
+    made = sorted(path.name for path in Path(settings.scene.options.path).glob("*.png"))
+    first = photos_of(video, tmp_path / "outputs", 4)
+    assert sorted(path.name for path in first.glob("*.png")) == [f"frame_{n:05d}.png" for n in sorted(sharp_ones)]
+    assert made
+    monkeypatch.setattr(logging.getLogger("gsx"), "propagate", True)
+    caplog.set_level(logging.INFO, logger="gsx")
+    assert photos_of(video, tmp_path / "outputs", 4) == first
+    assert "chosen earlier" in caplog.text
+    (tmp_path / "broken.mp4").write_bytes(b"no video at all" * 50)
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        photos_of(tmp_path / "broken.mp4", tmp_path / "outputs")
