@@ -113,14 +113,17 @@ def by_another(run: Run, path: Path, written: Exported, own: list[torch.Tensor],
     if not program or path.suffix in (".glb", ".html"):
         return {}
     plain = path.with_name("again.ply")
-    told = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
     done = subprocess.run([program, "-q", "-w", str(path), str(plain)], capture_output=True, text=True, check=False)
     if done.returncode:
         return {"reader": f"splat-transform: FAILED, {done.stderr.strip()[:100]}"}
     again = read_gaussians(plain)
     if path.suffix == ".spz":  # it takes SPZ for the axes of PLY, which are turned by half a turn about x
         again = half_turn(again)
-    return {"reader": told.split(" (")[0].strip(), "reader_alike": mean(pictures(run, again), own)}
+    return {
+        "reader": (told.stdout + told.stderr).split(" (")[0].strip(),
+        "reader_alike": mean(pictures(run, again), own),
+    }
 
 
 def half_turn(gaussians: Gaussians) -> Gaussians:
@@ -132,9 +135,11 @@ def glb_is_sound(path: Path, gaussians: Gaussians) -> bool:
     """Whether trimesh finds as many positions, within the bounds of ours turned to glTF's axes."""
     import trimesh
 
-    (cloud,) = trimesh.load(path).geometry.values()
+    scene = trimesh.load(path)
+    ((name, cloud),) = scene.geometry.items()
+    turn, _ = scene.graph.get(scene.graph.geometry_nodes[name][0])  # the node's
     ours = gaussians.means.numpy() * np.array([-1, -1, 1])
-    found = np.asarray(cloud.vertices)
+    found = np.asarray(cloud.vertices) @ turn[:3, :3].T
     return len(found) == len(ours) and np.allclose(found.min(0), ours.min(0)) and np.allclose(found.max(0), ours.max(0))
 
 

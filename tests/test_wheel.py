@@ -38,7 +38,7 @@ def wheel(tmp_path_factory) -> Path:
 def test_wheel_holds_every_module_and_configuration_file(wheel: Path) -> None:
     inside = set(zipfile.ZipFile(wheel).namelist())
     sources = (ROOT / "src").rglob("*")
-    expected = {str(p.relative_to(ROOT / "src")) for p in sources if p.suffix in (".py", ".html", ".typed")}
+    expected = {str(p.relative_to(ROOT / "src")) for p in sources if p.suffix in (".py", ".html", ".typed", ".xz")}
     assert "gsx/py.typed" in expected
     expected |= {f"gsx/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
     assert expected <= inside, expected - inside

@@ -11,7 +11,7 @@ from faults.verbs import VERBS, Prepared, orphans, prepared
 
 pytestmark = [pytest.mark.faults, pytest.mark.skipif(STRACE is None, reason="strace is not installed")]
 
-PARTS = 4
+PARTS, TRIES = 4, 5
 """Shares of the calls, so that processes can take one each."""
 NAMES = [name for name in VERBS if name != "train"]
 """Commands that can be given again; `train` is `reuse` in a named folder."""
@@ -60,10 +60,19 @@ def test_every_call_fails_once(tmp_path: Path, name: str, first: int, part: int)
     with record(f"{TITLES.get(name, f'gsx {name}')}: a call fails ({', '.join(ERRORS)}), then again",
                 PARTS * first + part) as counts:  # fmt: skip
         for number, call in some(calls[part::PARTS]):
-            case.put_back()
-            told(failed(case.verb.words, case.place, call, ERRORS[number % 3]), case, call)
+            told(first_that(case, call, ERRORS[number % 3]), case, call)
             again(case, call)
             counts.cases += 1
+
+
+def first_that(case: Prepared, call: Call, error: str) -> Ended:
+    """The command, with the first failure out of some that was one of its own files'."""
+    for _ in range(TRIES):
+        case.put_back()
+        ended = failed(case.verb.words, case.place, call, error)
+        if ended is not None:
+            return ended
+    raise AssertionError(f"{call} was not met in {TRIES} runs")
 
 
 def told(ended: Ended, case: Prepared, call: Call) -> None:
@@ -74,4 +83,6 @@ def told(ended: Ended, case: Prepared, call: Call) -> None:
         assert case.verb.result(case.place) == case.expected, call
     else:
         assert ended.code == 2, (call, ended.said)
-        assert 0 < len(ended.sentences) <= case.verb.sentences, (call, ended.said)
+        warned = [line for line in ended.said.splitlines() if line.startswith("warning: ")]  # tables go on
+        sentences = ended.sentences or (warned if case.verb.words is VERBS["table"].words else [])
+        assert 0 < len(sentences) <= case.verb.sentences, (call, ended.said)

@@ -46,6 +46,11 @@ def claimed_name(folder: Path) -> Iterator[None]:
         yield
 
 
+def left_behind(folder: Path) -> bool:
+    """Whether there is a claim on a folder or its name: somebody is at work, or was killed there."""
+    return (folder / LOCK).exists() or (folder.parent / f".{folder.name}{LOCK}").exists()
+
+
 @contextmanager
 def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
     """A lock file that says who works in the folder."""

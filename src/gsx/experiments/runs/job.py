@@ -109,9 +109,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     """Train what is left of a composition in its own folder."""
-    from gsx.experiments.reports.report import write_report
-    from gsx.experiments.run_folder.claims import claimed, claimed_name
-    from gsx.experiments.run_folder.files import reported
+    from gsx.experiments.run_folder.claims import claimed_name
     from gsx.experiments.run_folder.run_key import place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
 
@@ -123,12 +121,24 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with in_use(), claimed_name(folder), ExitStack() as claims:
         _, run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
-            with claimed(folder):  # what a process left that was killed at its very end
-                remove_partial(folder)
-                if not reported(folder):
-                    write_report(folder)
+            tidied(folder)
             return 0
         return carry_out(run, settings, loaded)
+
+
+def tidied(folder: Path) -> None:
+    """Finish what a process left of a finished run that was killed at its very end: partial files, no report.
+
+    To be called with the folder's name claimed.
+    """
+    from gsx.experiments.reports.report import write_report
+    from gsx.experiments.run_folder.claims import claimed
+    from gsx.experiments.run_folder.files import reported
+
+    with claimed(folder):
+        remove_partial(folder)
+        if not reported(folder):
+            write_report(folder)
 
 
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:

@@ -3,16 +3,20 @@
 import logging
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from gsx.core.cache import content_key, in_use
-from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.files import replace_text
+from gsx.core.errors import ConfigError, InputError, first_line, nearest
+from gsx.core.files import remove_partial, replace_text
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.run_folder.claims import claimed_name, left_behind
+from gsx.experiments.run_folder.files import reported
 from gsx.experiments.run_folder.run_key import sorted_items
 from gsx.experiments.runs.compose import Compositions, parse_overrides
+from gsx.experiments.runs.job import tidied
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
 from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned, words_of
@@ -82,12 +86,23 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         tell(plan, lacking)
         if experiment.dry:
             return "".join(f"gsx {shlex.join(job)}\n" for phase in plan.phases for job in phase), 0
+        tidy(folder, due)
         for number, phase in enumerate(plan.phases):
             launched(compositions, launching, folder / "launched" / str(number), phase, job)
     published = read_table(experiment.published) if experiment.published else None
     table = table_of(experiment, datasets, cells, published, lacking, foreign)
     write_table(table, folder, [cell.folder for cell in cells if cell.folder.is_dir()])
     return f"{as_text(table)}\n{folder / 'table.md'}\n", 0 if set(table.states) == {"ok"} else 2
+
+
+def tidy(folder: Path, cells: Sequence[Cell]) -> None:
+    """Finish what killed processes left of runs that are not started again, and of the table's own folder."""
+    if folder.is_dir():
+        remove_partial(folder)
+    for run in dict.fromkeys(cell.folder for cell in cells if cell.finished):
+        if left_behind(run) or not reported(run):
+            with suppress(InputError), claimed_name(run):  # who is at work there does so himself
+                tidied(run)
 
 
 def launched(
