@@ -120,10 +120,8 @@ def by_another(run: Run, path: Path, written: Exported, own: list[torch.Tensor],
     again = read_gaussians(plain)
     if path.suffix == ".spz":  # it takes SPZ for the axes of PLY, which are turned by half a turn about x
         again = half_turn(again)
-    return {
-        "reader": (told.stdout + told.stderr).split(" (")[0].strip(),
-        "reader_alike": mean(pictures(run, again), own),
-    }
+    reader = (told.stdout + told.stderr).split(" (")[0].strip()
+    return {"reader": reader, "reader_alike": mean(pictures(run, again), own)}
 
 
 def half_turn(gaussians: Gaussians) -> Gaussians:
@@ -135,7 +133,7 @@ def glb_is_sound(path: Path, gaussians: Gaussians) -> bool:
     """Whether trimesh finds as many positions, within the bounds of ours turned to glTF's axes."""
     import trimesh
 
-    scene = trimesh.load(path)
+    scene: Any = trimesh.load(path)
     ((name, cloud),) = scene.geometry.items()
     turn, _ = scene.graph.get(scene.graph.geometry_nodes[name][0])  # the node's
     ours = gaussians.means.numpy() * np.array([-1, -1, 1])

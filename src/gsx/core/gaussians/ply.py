@@ -4,6 +4,7 @@ Reads binary little-endian and ascii, writes binary little-endian. Elements afte
 """
 
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,7 @@ def _elements(lines: list[list[str]]) -> list[tuple[str, int, np.dtype]]:
     """Name, number and type of the elements that a header tells."""
     starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
     found = []
-    for start, stop in zip(starts, [*starts[1:], len(lines)], strict=True):
+    for start, stop in pairwise([*starts, len(lines)]):
         words = lines[start]
         properties = [line for line in lines[start:stop] if line[:1] == ["property"]]
         if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MOST_DIGITS:
