@@ -169,6 +169,7 @@ def test_centred_principal_point(tmp_path: Path) -> None:
         ({"fl_x": math.nan}, "fl_x nan"),
         ({"cx": "middle"}, "cx 'middle'"),
         ({"w": 0}, "size 0 x 90"),
+        ({"w": 1e20}, r"size 1e\+20 x 90"),
         ({"frames": frame_changes(transform_matrix=None)}, "pose that is no matrix"),
         ({"frames": frame_changes(transform_matrix=[*POSES[0][:3], [0, 0, 4, 1]])}, "fourth row .*transposed"),
         ({"frames": frame_changes(transform_matrix=[[math.inf] * 4] * 4)}, "finite numbers"),

@@ -39,6 +39,8 @@ from gsx.scenes.splits import Split, split_names
 from gsx.scenes.undistort import METHOD
 
 FILE = "transforms.json"
+LARGEST_SIDE = 2**20
+"""Of photographs, px: larger numbers are none."""
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 FURTHER_DISTORTION = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -147,7 +149,7 @@ def _size(entry: Mapping[str, Any], photo: Path, place: str) -> Size:
     width, height = (_number(entry, name, math.nan, place) for name in ("w", "h"))
     if math.isnan(width) or math.isnan(height):
         return image_size(photo)
-    if min(width, height) < 1:
+    if not 1 <= min(width, height) <= max(width, height) <= LARGEST_SIDE:
         raise InputError(f"{place} has size {width:g} x {height:g}, correct w and h.")
     return round(width), round(height)
 

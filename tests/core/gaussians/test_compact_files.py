@@ -227,3 +227,10 @@ def test_spz_of_version_4_is_told_apart(tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(struct.pack("<II", 0x5053474E, 4) + bytes(24))
     with pytest.raises(InputError, match="version 4 or later"):
         read_gaussians(tmp_path / "a.spz")
+
+
+def test_a_compressed_ply_of_no_elements_is_told(tmp_path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nend_header\n"
+    (tmp_path / "a.compressed.ply").write_text(head)
+    with pytest.raises(InputError, match="lacks packed splats"):
+        read_gaussians(tmp_path / "a.compressed.ply")
