@@ -34,7 +34,7 @@ from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import stamped, text_table, write_results
 
 RESULTS = Path(__file__).parent / "results"
-NAMES = ("model.ply", "model.compressed.ply", "model.spz", "model.glb", "model.html")
+NAMES = ("model.ply", "model.compressed.ply", "model.spz", "model.sog", "model.glb", "model.html")
 VIEWS = 5
 COLUMNS = [
     ["run", "run"],

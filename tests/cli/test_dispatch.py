@@ -161,11 +161,11 @@ def test_help_of_a_verb_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("name", ["x.sog", "x.splat", "x", "x.ply.gz"])
+@pytest.mark.parametrize("name", ["x.ksplat", "x.splat", "x", "x.ply.gz"])
 def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path / "no_run"), str(tmp_path / name)]) == 2
     told = capsys.readouterr().err
-    assert f"{name} is not written: gsx writes .compressed.ply, .ply, .spz, .glb, .html alone" in told
+    assert f"{name} is not written: gsx writes .compressed.ply, .ply, .spz, .sog, .glb, .html alone" in told
     assert len(told.splitlines()) == 1
 
 

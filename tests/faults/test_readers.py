@@ -192,7 +192,7 @@ def read_splats(folder: Path) -> None:
     read_gaussians(folder / "run" / "point_cloud.ply")
 
 
-COMPACT = ("a.compressed.ply", "a.spz", "a.glb")
+COMPACT = ("a.compressed.ply", "a.spz", "a.sog", "a.glb")
 
 
 def compact(folder: Path) -> list[Path]:

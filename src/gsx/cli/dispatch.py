@@ -27,7 +27,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx view RUN|FILE         look around in a browser, also while RUN is trained (gsx[viewer]); or viewer=true
   gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
   gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
-  gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .glb), or model.html: one page to send
+  gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems

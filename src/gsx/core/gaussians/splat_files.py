@@ -17,6 +17,7 @@ from gsx.core.gaussians.glb import decode_glb, encode_glb
 from gsx.core.gaussians.ply import read_ply, write_ply, write_whole
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.smoothing import logit_of_log, smoothed
+from gsx.core.gaussians.sog import decode_sog, encode_sog, sog_is_antialiased
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.gaussians.spz import decode_spz, encode_spz, is_antialiased
 from gsx.core.gaussians.suffixes import STANDARD, suffix_of
@@ -68,6 +69,8 @@ def write_compact(
     """Write a splat file that is no standard PLY; errors as `write_gaussians`."""
     if suffix == ".spz":
         content = encode_spz(arrays, compensated, axes)
+    elif suffix == ".sog":
+        content = encode_sog(arrays, compensated)
     else:
         content = (encode_glb if suffix == ".glb" else encode_compressed_ply)(arrays, comments)
     write_whole(path, content)
@@ -99,7 +102,7 @@ def read_compact(path: Path, suffix: str, axes: str) -> Arrays:
         content = path.read_bytes()
         if suffix == ".spz":
             return decode_spz(content, axes)
-        return decode_glb(content) if suffix == ".glb" else decode_compressed_ply(content)
+        return {".sog": decode_sog, ".glb": decode_glb, ".compressed.ply": decode_compressed_ply}[suffix](content)
     except (OSError, InputError) as problem:
         raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
 
@@ -181,8 +184,8 @@ def finite_rows(raw: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
 def compensated(path: Path) -> bool:
     """Whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
 
-    SPZ has a flag for it; PLY a comment, `SplatRenderMode: mip` (Brush, SuperSplat) or `antialiased 1` (Postshot), of
-    which the last counts.
+    SPZ has a flag for it, SOG an entry; PLY a comment, `SplatRenderMode: mip` (Brush, SuperSplat) or `antialiased 1`
+    (Postshot), of which the last counts.
 
     Raises:
         InputError: it cannot be read.
@@ -194,6 +197,8 @@ def compensated(path: Path) -> bool:
         raise InputError(f"'{path}' cannot be read: {problem.strerror}") from None
     if suffix_of(path) == ".spz":
         return is_antialiased(head)
+    if suffix_of(path) == ".sog":
+        return sog_is_antialiased(path)
     if suffix_of(path) == ".glb":
         return False
     lines = head.partition(b"end_header")[0].decode("latin-1").lower().splitlines()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from gsx.core.errors import InputError
 
-SUFFIXES = (".compressed.ply", ".ply", ".spz", ".glb")
+SUFFIXES = (".compressed.ply", ".ply", ".spz", ".sog", ".glb")
 """The longer of two that fit first."""
 STANDARD = ".ply"
 """Nothing is lost in it, and a backbone's own file is one."""
