@@ -115,8 +115,8 @@ def verb_view(arguments: list[str]) -> int:
 def verb_export(arguments: list[str]) -> int:
     """gsx export RUN [FILE] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
     told = (
-        "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .sog, .glb; or "
-        ".html, one page with a viewer in it that opens from disk."
+        "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .sog, .glb; "
+        "or .html, one page with a viewer in it that opens from disk."
     )
     parser = Parser(prog="gsx export", description=told)
     parser.add_argument("run", type=Path, help="run folder")
