@@ -42,8 +42,20 @@ def test_fields_inside_count_too() -> None:
 
 def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
     """As they stood in one list before every field said it of itself."""
+    viewer = ("viewer", "viewer_host", "viewer_port", "viewer_share")  # newer than that list
     assert sorted(WHERE) == sorted(
-        ("folder", "output", "device", "data_root", "tracker", "reuse", "init", "disk_cache_gb", "warm_start_at")
+        (
+            "folder",
+            "output",
+            "device",
+            "data_root",
+            "tracker",
+            "reuse",
+            "init",
+            "disk_cache_gb",
+            "warm_start_at",
+            *viewer,
+        )
     )
     assert sorted(NAMES) == sorted(("variant", "length", "budget", "dataset"))
     settings = compose(

@@ -140,9 +140,12 @@ def verb_export(arguments: list[str]) -> int:
 
     if given.file:
         refuse_export(given.file)
+    if given.view and given.bake:
+        raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
-    path = given.file or given.run / ("point_cloud.ply" if view is None else "point_cloud_of_view.ply")
+    stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
+    path = given.file or given.run / f"{stem}.ply"
     remove_partial(path.parent, below=False)
     written = export(run, path, view.camera if view else None, given.axes, given.bake)
     if written:

@@ -71,6 +71,14 @@ def own_mark() -> str:
     return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node() + counted_by)}-{os.getpid()}"
 
 
+def at_home(path: str | Path) -> Path:
+    """A path with `~` and `~user` as what they stand for; as it is where there is no such user."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
+
+
 def remove_partial(folder: Path, below: bool = True) -> None:
     """Remove what killed processes left half-written in a folder, and below it."""
     for place, inner, names in os.walk(folder):

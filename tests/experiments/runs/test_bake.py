@@ -89,8 +89,9 @@ def test_compact_formats_and_pages_of_it_are_baked_and_their_loss_is_told(
     caplog.set_level(logging.INFO, logger="gsx")
     for name, words in (("a.spz", []), ("b.html", []), ("c.ply", ["--bake", "2"])):
         monkeypatch.setattr("gsx.cli.dispatch.set_up_logging", lambda: None)
+        caplog.clear()
         assert main(["export", str(scaffold), str(tmp_path / name), *words]) == 0
-    assert caplog.text.count("baked for all views") == 3
+        assert "baked for all views" in caplog.text
     assert len(read_gaussians(tmp_path / "c.ply").means) > 100
     assert "at 2 times their resolution" in (tmp_path / "c.ply").read_bytes()[:2000].decode("latin-1")
 

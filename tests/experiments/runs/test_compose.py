@@ -144,7 +144,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["+steps=5"], "'steps' is no configuration key"),
         (["trunk_gb=5"], "'trunk_gb' is no configuration key. It is now called 'disk_cache_gb'"),
         (["backbone.rates.sh_constant=1"], "It is now called 'backbone.rates.sh_dc'"),
-        (["init=trunk"], "choose scratch or warm_start"),
+        (["init=trunk"], "choose scratch, warm_start, or a splat file"),
         (["+backbone.rates.mean_first=1"], "'backbone.rates.mean_first'.*Did you mean 'backbone.rates.means_first'"),
         (["iterations=many"], "iterations: Value 'many'"),
         (["backbone.sh_degree=abc"], "backbone.sh_degree: Value 'abc'"),

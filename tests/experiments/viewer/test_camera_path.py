@@ -88,7 +88,9 @@ def test_what_no_camera_can_be_is_told(tmp_path: Path, change: dict[str, object]
         read_camera_path(tmp_path / "a.json")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", "3", '{"camera_path": 5, "fps": 1}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", "3", '{"camera_path": 5, "fps": 1}', '{"camera_path": [{}], "seconds": 0}', "[" * 100_000]
+)
 def test_other_files_are_told(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match="camera path"):

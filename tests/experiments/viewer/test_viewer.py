@@ -14,6 +14,7 @@ from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
 from gsx.core.data.images import read_image
+from gsx.core.errors import InputError
 from gsx.core.quality.metrics import bicubic, psnr
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -188,14 +189,47 @@ def test_a_share_of_the_time_is_not_exceeded(run: Run) -> None:
         server = shown.viewer.frames
         server.model = Still(1e-5)  # type: ignore[assignment]
         server.screens[0] = Screen(lambda image: None)
+        begun = time.monotonic()
         for turn in range(20):
             server.screens[0].turn(Pose((float(turn), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 200, 100))
             shown.gsx_step_finished(run, None)  # type: ignore[arg-type]
             time.sleep(0.02)
-        elapsed = time.monotonic() - shown.begun
+        elapsed = time.monotonic() - begun
         assert 0 < server.spent < 0.5 * elapsed + 0.3  # by one picture at most
+        time.sleep(0.1)
+        shown.before -= 3600  # an hour in which nobody looked is not made up for
+        shown.gsx_step_finished(run, None)  # type: ignore[arg-type]
+        assert shown.credit <= 1
     finally:
-        shown.viewer.stop()
+        shown.stop()
+
+
+@needs_viser
+def test_where_nothing_can_listen_is_told(run: Run) -> None:
+    from gsx.experiments.viewer.server import Viewer
+
+    first = Viewer(RunModel(run), "first", "127.0.0.1", 0)
+    try:
+        port = first.server.get_port()
+        for host, number in (("127.0.0.1", port), ("no such host", 0), ("127.0.0.1", 99_999)):
+            with pytest.raises(InputError, match="a viewer cannot listen"):
+                Viewer(RunModel(run), "second", host, number)
+    finally:
+        first.stop()
+
+
+def test_what_fails_for_a_browser_ends_nothing(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    server = FrameServer(RunModel(run))
+
+    def refuse(image: torch.Tensor) -> None:
+        raise OSError("gone")
+
+    server.screens[0] = Screen(refuse)
+    server.screens[0].turn(pose_at(run))
+    server.jobs.append(lambda: refuse(torch.zeros(1)))
+    assert server.show_next()
+    assert server.screens[0].width  # not tried again and again
+    assert caplog.text.count("gone") >= 2
 
 
 @needs_viser

@@ -200,7 +200,7 @@ def compensated(path: Path) -> bool:
     if suffix_of(path) == ".sog":
         return sog_is_antialiased(path)
     if suffix_of(path) == ".glb":
-        return False
+        return b"SplatRenderMode: mip" in head  # a comment of ours
     lines = head.partition(b"end_header")[0].decode("latin-1").lower().splitlines()
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
     told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]

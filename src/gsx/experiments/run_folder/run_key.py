@@ -140,4 +140,5 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:
     """Values by dotted key that runs may be compared by: not those that say where a run ran."""
-    return flattened({key: value for key, value in config.items() if key not in (*WHERE, "length")})
+    kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
+    return flattened(kept | ({"init": config["init"]} if splat_file(config.get("init")) else {}))

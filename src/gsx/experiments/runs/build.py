@@ -97,9 +97,9 @@ def build(
         return settings.backbone.component.factory(settings.backbone.options, context)
 
     if splat_file(general.init):
-        only = start or in_front_of(scene.train[0].camera)
-        backbone = anew(replace(scene, points=one_point(only)), general.iterations, generator)
-        go_on_from(backbone, only, settings.backbone.component.name)
+        stand_in = in_front_of(scene.train[0].camera)
+        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator)
+        go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
         backbone = anew(scene, general.iterations, generator)
     augmenters = build_augmenters(settings, scene) if training else []

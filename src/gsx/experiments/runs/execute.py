@@ -74,10 +74,12 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     if run.warm_starts is not None:
         general = settings.general
         listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
-    if settings.general.viewer:
-        listeners.append(training_viewer(run, settings))
     try:
-        with plugins.listening(listeners), telling_of_failure(run, plugins):
+        with (
+            viewed(run, settings) as viewers,
+            plugins.listening([*listeners, *viewers]),
+            telling_of_failure(run, plugins),
+        ):
             train(run, plugins)
             if run.complete:
                 finish(run, settings, plugins)
@@ -92,18 +94,25 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         write_report(run.folder)
 
 
-def training_viewer(run: Run, settings: Settings) -> object:
-    """Shows the model in a browser; its address is told.
+@contextmanager
+def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
+    """The listener that shows the model in a browser, where that is asked for; its address is told.
 
     Raises:
-        ConfigError, InputError: viser is not installed, or the port is taken.
+        ConfigError, InputError: viser is not installed, or nothing can listen there.
     """
+    general = settings.general
+    if not general.viewer:
+        yield []
+        return
     from gsx.experiments.viewer.training import TrainingViewer
 
-    general = settings.general
     shown = TrainingViewer(run, general.viewer_host, general.viewer_port, general.viewer_share)
     logger.info("look around: %s", shown.viewer.address)
-    return shown
+    try:
+        yield [shown]
+    finally:
+        shown.stop()
 
 
 def keep_what_there_is(run: Run, error: BaseException) -> None:

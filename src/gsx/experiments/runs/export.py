@@ -61,6 +61,7 @@ def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub"
         return None
     baked = columns is not None or zoom > 0
     gaussians = bake(run, zoom or 1.0) if baked else run.backbone.explicit(camera, run.model_step)
+    gaussians = Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
     comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
     if baked:
         comments.append(f"splats as training cameras see them on average, at {zoom or 1:g} times their resolution")

@@ -12,6 +12,7 @@ from gsx.core.cache import source_revision
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import write_json
+from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
@@ -83,6 +84,8 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
+    if settings.general.viewer:
+        require("viewer=true", ("viser",), "gsx[viewer]")
     start = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
     run = build(settings, scene, Path(), training=True, start=start)

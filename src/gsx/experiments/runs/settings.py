@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.files import at_home
 from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
@@ -123,7 +124,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
     if (file := splat_file(raw.get("init"))) is not None and suffix_of(file):
-        raw["init"] = str(file.expanduser().resolve())
+        raw["init"] = str(at_home(file).resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}
     checks = {r: typed(Checks, n, f"checks.{r}") for r, n in named_nodes(values.pop("checks", None), "checks").items()}
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)

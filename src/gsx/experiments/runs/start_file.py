@@ -96,7 +96,8 @@ def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
     words = ["backbone=gs3d", f"init={quoted(str(path))}", "iterations=0"]
-    if compensated(path) and not any(word.startswith("rasterizer.") for word in overrides):
+    filters = ("rasterizer.dilation=", "rasterizer.compensate=")
+    if compensated(path) and not any(word.lstrip("+").startswith(filters) for word in overrides):
         words += [f"rasterizer.dilation={MIP_KERNEL}", "rasterizer.compensate=true"]
         logger.info("%s says that its opacities are compensated: drawn with %s", path, " ".join(words[3:]))
     return [*words, *overrides]

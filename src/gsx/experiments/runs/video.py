@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsx.core.cache import file_stamp
+from gsx.core.cache import content_key, file_stamp
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
 from gsx.core.packages import require
@@ -37,7 +37,8 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
         InputError: the video cannot be read, or is too short.
     """
     require(f"frames of {path}", ("av",), "gsx[video]")
-    folder, made_of = output / "videos" / path.name, [*map(str, file_stamp(path)), count]
+    made_of = [*map(str, file_stamp(path)), count]
+    folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
     if (folder / INDEX).exists() and read_json(folder / INDEX) == made_of:
         logger.info("frames were chosen earlier: %s", folder)
         return folder

@@ -145,7 +145,7 @@ def read_camera_path(path: Path) -> CameraPath:
     try:
         made = own(content) if isinstance(content, dict) and OWN in content else of_nerfstudio(content)
         refuse_odd(made)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(
             f"camera path '{path}' {what}: give one that gsx view has saved, or a camera path of nerfstudio"

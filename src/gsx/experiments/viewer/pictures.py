@@ -84,7 +84,7 @@ class RunModel:
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
         """The model alone."""
         splats = splats_for(self.run, camera.zoom(2.0**look.finer_levels))
-        shown = inside(splats, self.middle(), look.box * self.run.scene.extent, look)
+        shown = inside(splats, self.middle(), look.box * self.run.scene.extent) if look.box < 1 else splats
         return render(replace(self.run, raster=filtered(self.run.raster, look.filter)), camera, splats=shown).image
 
     def middle(self) -> Float[Tensor, "3"]:
@@ -122,10 +122,14 @@ class FileModel:
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
         """The model alone, over black."""
         splats = splats_of(self.gaussians, camera.centre)
-        reach = float((self.gaussians.means - self.middle()).norm(dim=1).quantile(0.9)) if len(splats) else 1.0
-        shown = inside(splats, self.middle(), look.box * reach, look)
+        shown = inside(splats, self.middle(), look.box * self.reach()) if look.box < 1 else splats
         raster = filtered(self.raster, look.filter)
         return rasterize_tiled(shown, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
+
+    def reach(self) -> float:
+        """From the middle to the farthest but a tenth."""
+        far = (self.gaussians.means - self.middle()).norm(dim=1)
+        return float(far.kthvalue(max(1, round(0.9 * len(far)))).values)
 
     def middle(self) -> Float[Tensor, "3"]:
         """Of the splats."""
@@ -146,10 +150,8 @@ def filtered(raster: RasterSettings, name: str) -> RasterSettings:
     return replace(raster, dilation=0.3, compensate=name == "compensated", zoomed="plain", pixel="sample")
 
 
-def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float, look: Look) -> Splats:
-    """The splats in the cube, if there is one."""
-    if look.box >= 1:
-        return splats
+def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float) -> Splats:
+    """The splats in a cube."""
     kept: Bool[Tensor, N] = ((splats.means - middle.to(splats.means)).abs() <= reach).all(1)
     return Splats(**{name: value[kept] for name, value in vars(splats).items()})
 
@@ -189,7 +191,7 @@ def placed(
 ) -> tuple[Float[Tensor, "3 H W"], Bool[Tensor, "H W"]]:
     """(a photograph where it lies in the raster of a camera at the same place, which pixels it covers)."""
     scale = camera.fy / taken_by.fy
-    columns = (torch.arange(camera.width).to(photo) + 0.5 - camera.cx) / scale + taken_by.cx
+    columns = (torch.arange(camera.width).to(photo) + 0.5 - camera.cx) * (taken_by.fx / camera.fx) + taken_by.cx
     rows = (torch.arange(camera.height).to(photo) + 0.5 - camera.cy) / scale + taken_by.cy
     x, y = 2 * columns / taken_by.width - 1, 2 * rows / taken_by.height - 1
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]

@@ -1,14 +1,19 @@
 """Who looks, at what, and how sharp the next picture is to be: coarse while something changes, finer when it rests."""
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from gsx.core.errors import first_line
 from gsx.core.shapes import Float
 from gsx.experiments.viewer.pictures import Look, Model, Pose, picture
+
+logger = logging.getLogger(__name__)
 
 FAST = 0.1
 """Seconds that a picture should take while one moves."""
@@ -20,9 +25,18 @@ FINER = 2.0
 """Each picture of what rests is so many times as wide as the one before."""
 
 
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Whatever a browser asks for, and however that fails, training and the viewer go on."""
+    try:
+        yield
+    except Exception as error:
+        logger.warning("%s (%s)", what, first_line(error))
+
+
 @dataclass(eq=False)
 class Screen:
-    """One browser."""
+    """What one browser shows."""
 
     show: Callable[[Float[Tensor, "3 H W"]], None]
     """Sends a picture there."""
@@ -37,7 +51,7 @@ class Screen:
     """Pictures a second while one moved, lately."""
 
     def turn(self, pose: Pose) -> None:
-        """The browser looks from elsewhere; a view that one has jumped to is left."""
+        """The browser looks from elsewhere."""
         if pose != self.pose:
             self.pose, self.changed_at = pose, time.monotonic()
 
@@ -63,7 +77,8 @@ class FrameServer:
     def show_next(self) -> bool:
         """Draw the most urgent picture, if there is one to be drawn; returns whether there was."""
         while self.jobs:
-            self.jobs.pop(0)()
+            with told("a wish of a browser was not met"):
+                self.jobs.pop(0)()
         waiting = [(urgency, screen, width) for screen in list(self.screens.values())
                    for urgency, width in self.due(screen)]  # fmt: skip
         if not waiting:
@@ -76,7 +91,7 @@ class FrameServer:
         """[(urgency, width)] of the picture that a browser should have next; empty: it has the finest of what is."""
         if screen.pose is None:
             return []
-        full = min(screen.pose.width, LARGEST)
+        full = min(screen.pose.width, LARGEST, max(1, LARGEST * screen.pose.width // screen.pose.height))
         if screen.drawn != (screen.pose, screen.look, self.version):
             return [(0, min(full, self.quick_width(screen.pose)))]
         if screen.width < full and time.monotonic() - screen.changed_at > REST:
@@ -94,11 +109,11 @@ class FrameServer:
         assert screen.pose is not None
         wanted, begun = (screen.pose, screen.look, self.version), time.monotonic()
         moving = screen.drawn is not None and screen.drawn[0] != screen.pose
-        with torch.no_grad():
-            image = picture(self.model, screen.pose, screen.look, width)
-        screen.show(image)
+        with told("a picture for a browser was not drawn"), torch.no_grad():
+            screen.show(picture(self.model, screen.pose, screen.look, width))
         taken = max(time.monotonic() - begun, 1e-6)
         self.spent += taken
-        self.seconds_per_pixel += 0.3 * (taken / image[0].numel() - self.seconds_per_pixel)
+        pixels = width * max(1, round(width * screen.pose.height / screen.pose.width))
+        self.seconds_per_pixel += 0.3 * (taken / pixels - self.seconds_per_pixel)
         screen.rate = (0.7 * screen.rate + 0.3 / taken if screen.rate else 1 / taken) if moving else screen.rate
         screen.drawn, screen.width = wanted, width

@@ -1,6 +1,7 @@
 """A model in a browser: viser shows pictures that our own rasterizer draws, and asks what is to be drawn."""
 
 import math
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -31,7 +32,7 @@ JPEG_QUALITY = 90
 FRUSTUM = 0.03
 """Size of the cameras that are shown, of the scene's extent."""
 COLOURS = {"training": (60, 110, 200), "test": (220, 120, 40)}
-ARRIVAL = 5.0
+ARRIVAL = 20.0
 """Seconds that a browser has to arrive at a view."""
 KEYFRAME_SECONDS = 1.0
 """Between two keyframes of a camera path."""
@@ -48,18 +49,17 @@ class Viewer:
         self.training, self.paused, self.keyframes = training, False, list[Keyframe]()
         self.told = ""
         self.panels: dict[int, Panel] = {}
-        try:
-            with redirect_stdout(StringIO()):  # its banner; the address is told by us
-                self.server: Any = viser.ViserServer(host=host, port=port, label=f"gsx: {title}", verbose=False)
-        except OSError as error:
-            raise InputError(f"port {port} of {host} cannot be used ({error.strerror}): choose another port") from error
+        refuse_port(host, port)
+        with redirect_stdout(StringIO()):  # its banner; the address is told by us
+            self.server: Any = viser.ViserServer(host=host, port=port, label=f"gsx: {title}", verbose=False)
+        self.server.gui.configure_theme(show_share_button=False)  # which would open it to the world
         self.address = f"http://{host}:{self.server.get_port()}"
         self.place_cameras()
         self.server.on_client_connect(self.connected)
         self.server.on_client_disconnect(self.left)
 
     def place_cameras(self) -> None:
-        """Show training and test cameras, and begin at the first test view."""
+        """Place training and test cameras, which are shown when asked for."""
         model = self.frames.model
         if not isinstance(model, RunModel):
             self.server.scene.set_up_direction("-y")
@@ -106,7 +106,8 @@ class Viewer:
 
     def stop(self) -> None:
         """Close the server."""
-        self.server.stop()
+        with redirect_stdout(StringIO()):
+            self.server.stop()
 
     def serve(self, until: Callable[[], bool], poll: Callable[[], None] = lambda: None) -> None:
         """Draw whatever is asked for, until told otherwise; `poll` is called between pictures."""
@@ -228,7 +229,8 @@ class Panel:
             return
         frames, pose = self.viewer.keyframes, self.screen.pose
         at = frames[-1].time + KEYFRAME_SECONDS if frames else 0.0
-        frames.append(Keyframe(time=at, position=pose.position, wxyz=pose.wxyz, fov=pose.fov))
+        fov = 2 * math.atan(math.tan(pose.fov / 2) / self.screen.look.zoom)
+        frames.append(Keyframe(time=at, position=pose.position, wxyz=pose.wxyz, fov=fov))
         self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
 
     def save_path(self) -> None:
@@ -254,6 +256,19 @@ class Panel:
     def notify(self, title: str, body: str) -> None:
         """A word in the browser."""
         self.client.add_notification(title, body, auto_close_seconds=5.0)
+
+
+def refuse_port(host: str, port: int) -> None:
+    """Raise InputError if nothing can listen there: viser would wait for ever, or take another port."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind((host, port))
+        except (OSError, OverflowError) as error:
+            raise InputError(
+                f"a viewer cannot listen at {host}, port {port} ({error}): choose another port, 0 for any that is "
+                "free, and an address of this machine"
+            ) from error
 
 
 def send(client: Any, image: Float[Tensor, "3 H W"]) -> None:

@@ -7,28 +7,32 @@ from gsx.core.training.run import Run, Step
 from gsx.experiments.viewer.pictures import RunModel
 from gsx.experiments.viewer.server import Viewer
 
+MOST_CREDIT = 1.0
+"""Seconds of drawing that are saved up where nobody looks."""
+
 
 class TrainingViewer:
     """Listener: shows the model between steps, for a share of the time that they take."""
 
     def __init__(self, run: Run, host: str, port: int, share: float) -> None:
         self.viewer = Viewer(RunModel(run), f"{run.scene.name}, {run.folder.name}", host, port, training=True)
-        self.share, self.begun = share, time.monotonic()
+        self.share, self.credit, self.before = share, 0.0, time.monotonic()
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
         """Show pictures while there is time for them, or while training is paused."""
-        viewer = self.viewer
+        viewer, frames = self.viewer, self.viewer.frames
         viewer.changed(told_of(run))
-        allowed = self.share * (time.monotonic() - self.begun)
-        while viewer.frames.spent < allowed and viewer.frames.show_next():
+        spent, self.credit = frames.spent, min(MOST_CREDIT, self.credit + self.share * (time.monotonic() - self.before))
+        while frames.spent - spent < self.credit and frames.show_next():
             pass
+        self.credit -= frames.spent - spent
         if viewer.paused:
             viewer.serve(until=lambda: not viewer.paused or run.stopping)
+        self.before = time.monotonic()
 
-    @hookimpl
-    def gsx_training_finished(self, run: Run) -> None:
-        """Close; `gsx view RUN` goes on."""
+    def stop(self) -> None:
+        """Close the server; `gsx view RUN` goes on."""
         self.viewer.stop()
 
 
