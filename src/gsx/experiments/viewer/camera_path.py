@@ -59,20 +59,24 @@ class CameraPath:
 
     def camera(self, frame: Keyframe) -> Camera:
         """The pinhole camera of a keyframe."""
-        width, height = self.size
-        rotation = rotation_matrices(torch.tensor([frame.wxyz], dtype=torch.float64))[0].T
-        focal = height / (2 * math.tan(frame.fov / 2))
-        return Camera(
-            rotation=rotation,
-            translation=-rotation @ torch.tensor(frame.position, dtype=torch.float64),
-            fx=focal,
-            fy=focal,
-            cx=width / 2,
-            cy=height / 2,
-            width=width,
-            height=height,
-            near=NEAR,
-        )
+        return pinhole(frame.position, frame.wxyz, frame.fov, *self.size)
+
+
+def pinhole(position: Sequence[float], wxyz: Sequence[float], fov: float, width: int, height: int) -> Camera:
+    """A camera of square pixels; `wxyz`: camera to world, `fov`: vertical, radians."""
+    rotation = rotation_matrices(torch.tensor([wxyz], dtype=torch.float64))[0].T
+    focal = height / (2 * math.tan(fov / 2))
+    return Camera(
+        rotation=rotation,
+        translation=-rotation @ torch.tensor(position, dtype=torch.float64),
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        width=width,
+        height=height,
+        near=NEAR,
+    )
 
 
 def between(frames: Sequence[Keyframe], time: float) -> Keyframe:

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from gsx.core.data.camera import NEAR, Camera
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.splat_files import splats_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.metrics import bicubic
@@ -17,6 +16,7 @@ from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
+from gsx.experiments.viewer.camera_path import pinhole
 
 BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
 """What the right part of the picture may show: the photograph of the view one has jumped to, how far the render is
@@ -60,19 +60,7 @@ class Look:
 def camera_of(pose: Pose, width: int, zoom: float = 1.0) -> Camera:
     """The pinhole camera of a pose on a raster of that width, its field of view narrowed by `zoom`."""
     height = max(1, round(width * pose.height / pose.width))
-    rotation = rotation_matrices(torch.tensor([pose.wxyz], dtype=torch.float64))[0].T
-    focal = zoom * height / (2 * math.tan(pose.fov / 2))
-    return Camera(
-        rotation=rotation,
-        translation=-rotation @ torch.tensor(pose.position, dtype=torch.float64),
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=width,
-        height=height,
-        near=NEAR,
-    )
+    return pinhole(pose.position, pose.wxyz, 2 * math.atan(math.tan(pose.fov / 2) / zoom), width, height)
 
 
 @dataclass(eq=False)
