@@ -25,12 +25,12 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of
+from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.processes import processes
-from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
-from gsx.core.training.render import render
+from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose, quoted
@@ -120,12 +120,10 @@ class SplatFile:
     raster: RasterSettings
     """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
 
-    @torch.no_grad()
     def render(self, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> Float[Tensor, "3 H W"]:
         """The splats seen by a camera, over a colour; colours in [0, 1]."""
-        splats = splats_of(self.gaussians, camera.centre)
         over = torch.tensor(background, dtype=torch.float32)
-        return rasterize_tiled(splats, camera, self.raster, background=over).image.clamp_(0, 1)
+        return render_gaussians(self.gaussians, camera, self.raster, over)
 
 
 def train(*given: str, **values: Any) -> TrainedRun:

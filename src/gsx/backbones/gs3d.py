@@ -84,10 +84,14 @@ class GS3D:
         """A Gaussian for each point that visibility starts from."""
         points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
+        return self.table_of(raw, columns, device)
+
+    def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
+        """A table of raw parameters and columns that nothing is known of yet."""
         return ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
-            gradient_statistics(len(points), device, self.absolute_gradient),
+            gradient_statistics(len(raw["means"]), device, self.absolute_gradient),
         )
 
     def go_on_from(self, gaussians: Gaussians) -> None:
@@ -100,11 +104,7 @@ class GS3D:
             raise InputError("init: a splat file says nothing of levels: choose backbone=gs3d or mip_splatting")
         raw, device = raw_parameters(gaussians, self.options.sh_degree), self.table["means"].device
         self.first_degree = self.options.sh_degree
-        self.table = ParameterTable(
-            {name: Parameter(value.to(device)) for name, value in raw.items()},
-            {},
-            gradient_statistics(len(gaussians.means), device, self.absolute_gradient),
-        )
+        self.table = self.table_of(raw, {}, device)
         self.filter.refresh(self.table, self.table["means"])
         if "filter" in self.table.columns:
             with torch.no_grad():

@@ -127,8 +127,8 @@ def verb_export(arguments: list[str]) -> int:
         type=positive(float),
         metavar="ZOOM",
         default=0.0,
-        help="one standard file for all "
-        "views of a model that decodes splats for each, as cameras see it at ZOOM times their resolution",
+        help="one standard file for all views of a model that decodes splats for each, as cameras see it at ZOOM times "
+        "their resolution",
     )
     parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import pinhole
 from gsx.core.data.images import PhotoSource, image_size
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
@@ -177,16 +177,7 @@ def _shot(frame: dict[str, Any], photo: Path, fov_x: float, file: Path) -> Shot:
     rotation, translation = pose_from_opengl(frame.get("transform_matrix"), f"Frame '{name}' of '{file}'")
     width, height = image_size(photo)
     focal = width / (2 * math.tan(fov_x / 2))
-    whole = Camera(
-        rotation=rotation,
-        translation=translation,
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=width,
-        height=height,
-    )
+    whole = pinhole(rotation, translation, focal, width, height)
     return Shot(name=name, photo=photo, whole=whole, expected_size=(width, height))
 
 

@@ -162,9 +162,21 @@ def look_at(
     forward, right = forward / forward.norm(), right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     focal = width / (2 * math.tan(fov_x / 2))
+    return pinhole(rotation, -rotation @ position, focal, width, height, near)
+
+
+def pinhole(
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    focal: float,
+    width: int,
+    height: int,
+    near: float = NEAR,
+) -> Camera:
+    """A camera of square pixels with its principal point at the middle of the raster; focal length in px."""
     return Camera(
         rotation=rotation,
-        translation=-rotation @ position,
+        translation=translation,
         fx=focal,
         fy=focal,
         cx=width / 2,

@@ -28,8 +28,6 @@ PALETTE = 64
 FIRST_LARGEST = 252
 """Alpha of quaternions whose first component is the largest."""
 MOST_SPLATS = 1 << 26
-PARTS = {"means": ("means_l.webp", "means_u.webp"), "scales": ("scales.webp",), "quats": ("quats.webp",),
-         "sh0": ("sh0.webp",)}  # fmt: skip
 HIGHER = ("shN_centroids.webp", "shN_labels.webp")
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
@@ -53,10 +51,10 @@ def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
         "version": VERSION,
         "asset": {"generator": "gsx"},
         "count": count,
-        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": list(PARTS["means"])},
-        "scales": {"codebook": scales.tolist(), "files": list(PARTS["scales"])},
-        "quats": {"files": list(PARTS["quats"])},
-        "sh0": {"codebook": constants.tolist(), "files": list(PARTS["sh0"])},
+        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": constants.tolist(), "files": ["sh0.webp"]},
     } | ({"model": "antialiased"} if antialiased else {})
     pictures = {
         "means_l.webp": raster(with_alpha(words & 255)),

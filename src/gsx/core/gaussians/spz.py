@@ -29,8 +29,6 @@ MOST_SPLATS = 10**9
 COLOUR_SCALE = 0.15
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 """By degree, beside the constant one."""
-BYTES = 9 + 1 + 3 + 3 + 4
-"""Of a splat of degree 0."""
 FLIPS = np.array([1.0, -1.0, -1.0])
 """Signs of x, y and z from RDF to RUB, and back."""
 ROOT_2 = 2**0.5

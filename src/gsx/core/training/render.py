@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import TILE_PIXELS, TiledRendering, rasterize_tiled
+from gsx.core.gaussians.splat_files import splats_of
+from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, TiledRendering, rasterize_tiled
+from gsx.core.shapes import Float
 from gsx.core.training.run import Run
 from gsx.core.training.supersampling import finer_raster, times_as_fine
 
@@ -15,6 +18,15 @@ from gsx.core.training.supersampling import finer_raster, times_as_fine
 def splats_for(run: Run, camera: Camera) -> Splats:
     """The splats of a camera after the run's steps."""
     return run.backbone.draw(camera, run.model_step).splats
+
+
+@torch.no_grad()
+def render_gaussians(
+    gaussians: Gaussians, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"]
+) -> Float[Tensor, "3 H W"]:
+    """The splats of a file by some rules, over a colour; colours clamped to [0, 1]."""
+    splats = splats_of(gaussians, camera.centre)
+    return rasterize_tiled(splats, camera, raster, background=background).image.clamp_(0, 1)
 
 
 @torch.no_grad()

@@ -160,6 +160,11 @@ def place_of(name: str, file: Path) -> str:
     return f"conf/{name}.yaml" if own else str(file)
 
 
+def key_of(word: str) -> str:
+    """The key of an override, without what is below it."""
+    return word.lstrip("+~").partition("=")[0].split(".")[0].split("/")[0].split("@")[0]
+
+
 def quoted(text: str) -> str:
     """A text as the value of an override, whatever characters it has.
 

@@ -11,10 +11,9 @@ from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import remove_partial
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of
-from gsx.core.rasterizer import rasterize_tiled
+from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.shapes import Float
-from gsx.core.training.render import render
+from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
@@ -67,13 +66,7 @@ def file_pictures(path: Path) -> Draw:
         InputError: it cannot be read.
     """
     gaussians, raster = read_gaussians(path), rules_of(path)
-
-    @torch.no_grad()
-    def draw(camera: Camera) -> Float[Tensor, "3 H W"]:
-        splats = splats_of(gaussians, camera.centre)
-        return rasterize_tiled(splats, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
-
-    return draw
+    return lambda camera: render_gaussians(gaussians, camera, raster, torch.zeros(3))
 
 
 def render_path(way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float) -> Path:

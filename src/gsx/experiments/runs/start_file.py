@@ -16,7 +16,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
-from gsx.experiments.runs.compose import quoted
+from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
         ConfigError: an override is about what the file is not, or no scene is given.
     """
     for word in overrides:
-        if word.lstrip("+~").partition("=")[0].partition(".")[0].partition("/")[0] in OWN_KEYS:
+        if key_of(word) in OWN_KEYS:
             raise ConfigError(f"gsx eval {path} draws the file as it is: leave out '{word}', or train with init={path}")
     if not any(word.startswith(("scene=", "dataset=")) for word in overrides):
         raise ConfigError(f"gsx eval {path} needs the photographs to compare with: scene=... scene.path=FOLDER")

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsx.core.cache import content_key, file_stamp
+from gsx.core.data.images import write_image
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
 from gsx.core.packages import require
@@ -50,7 +52,7 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
         raise InputError(f"'{path}' has {total} frames, too few to reconstruct a scene: film for at least some seconds")
     stretches = min(count, total)
     for number, pixels in sharpest(path, total, stretches):
-        write_png(folder / f"frame_{number:05d}.png", pixels)
+        write_image(folder / f"frame_{number:05d}.png", torch.from_numpy(pixels).permute(2, 0, 1))
     write_json(folder / INDEX, made_of)
     logger.info("%d of %d frames chosen, the sharpest of each stretch: %s", stretches, total, folder)
     return folder
@@ -93,12 +95,3 @@ def sharpness(grey: Float[np.ndarray, "H W"]) -> float:
     inner = grey[1:-1, 1:-1]
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
     return float(laplacian.var())
-
-
-def write_png(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
-    """A picture; it appears whole or not at all."""
-    import torch
-
-    from gsx.core.data.images import write_image
-
-    write_image(path, torch.from_numpy(pixels).permute(2, 0, 1).float() / 255)

@@ -15,7 +15,7 @@ from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed_name, left_behind
 from gsx.experiments.run_folder.files import reported
 from gsx.experiments.run_folder.run_key import sorted_items
-from gsx.experiments.runs.compose import Compositions, parse_overrides
+from gsx.experiments.runs.compose import Compositions, key_of, parse_overrides
 from gsx.experiments.runs.job import tidied
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
@@ -40,11 +40,6 @@ TAKEN = {
 """Keys that are set for each run, and what to say instead."""
 OWN = ("experiment", "dataset", "hydra")
 """Keys of the command line that are not handed on to every run as they are."""
-
-
-def key_of(word: str) -> str:
-    """The key of an override, without what is below it."""
-    return word.lstrip("+~").partition("=")[0].split(".")[0].split("/")[0].split("@")[0]
 
 
 def is_below_dataset(word: str) -> bool:

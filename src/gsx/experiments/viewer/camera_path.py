@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.data.camera import NEAR, Camera
+from gsx.core.data.camera import Camera, pinhole
 from gsx.core.errors import InputError
 from gsx.core.files import read_json, write_json
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
@@ -59,24 +59,14 @@ class CameraPath:
 
     def camera(self, frame: Keyframe) -> Camera:
         """The pinhole camera of a keyframe."""
-        return pinhole(frame.position, frame.wxyz, frame.fov, *self.size)
+        return posed(frame.position, frame.wxyz, frame.fov, *self.size)
 
 
-def pinhole(position: Sequence[float], wxyz: Sequence[float], fov: float, width: int, height: int) -> Camera:
+def posed(position: Sequence[float], wxyz: Sequence[float], fov: float, width: int, height: int) -> Camera:
     """A camera of square pixels; `wxyz`: camera to world, `fov`: vertical, radians."""
     rotation = rotation_matrices(torch.tensor([wxyz], dtype=torch.float64))[0].T
-    focal = height / (2 * math.tan(fov / 2))
-    return Camera(
-        rotation=rotation,
-        translation=-rotation @ torch.tensor(position, dtype=torch.float64),
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=width,
-        height=height,
-        near=NEAR,
-    )
+    translation = -rotation @ torch.tensor(position, dtype=torch.float64)
+    return pinhole(rotation, translation, height / (2 * math.tan(fov / 2)), width, height)
 
 
 def between(frames: Sequence[Keyframe], time: float) -> Keyframe:

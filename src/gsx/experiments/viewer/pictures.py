@@ -16,7 +16,7 @@ from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
-from gsx.experiments.viewer.camera_path import pinhole
+from gsx.experiments.viewer.camera_path import posed
 
 BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
 """What the right part of the picture may show: the photograph of the view one has jumped to, how far the render is
@@ -60,7 +60,7 @@ class Look:
 def camera_of(pose: Pose, width: int, zoom: float = 1.0) -> Camera:
     """The pinhole camera of a pose on a raster of that width, its field of view narrowed by `zoom`."""
     height = max(1, round(width * pose.height / pose.width))
-    return pinhole(pose.position, pose.wxyz, 2 * math.atan(math.tan(pose.fov / 2) / zoom), width, height)
+    return posed(pose.position, pose.wxyz, 2 * math.atan(math.tan(pose.fov / 2) / zoom), width, height)
 
 
 @dataclass(eq=False)
@@ -105,6 +105,8 @@ class FileModel:
     raster: RasterSettings
     height: int = 480
     """Of photographs that nobody knows."""
+    focal: float = 0.5
+    """Theirs, per px of their height."""
 
     @torch.no_grad()
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
@@ -140,7 +142,7 @@ def filtered(raster: RasterSettings, name: str) -> RasterSettings:
 
 def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float) -> Splats:
     """The splats in a cube."""
-    kept: Bool[Tensor, N] = ((splats.means - middle.to(splats.means)).abs() <= reach).all(1)
+    kept = ((splats.means - middle.to(splats.means)).abs() <= reach).all(1)
     return Splats(**{name: value[kept] for name, value in vars(splats).items()})
 
 
@@ -148,10 +150,10 @@ def picture(model: Model, pose: Pose, look: Look, width: int) -> Float[Tensor, "
     """What the browser is sent, of that width."""
     camera = camera_of(pose, width, look.zoom)
     shown = model.drawn(camera, look)
-    view = model.views().get(look.view)
     if look.beside == "x1, enlarged":
         return split(shown, enlarged(model, pose, look, shown), look.split)
-    if look.beside == "nothing" or view is None:
+    view = model.views().get(look.view) if look.beside != "nothing" else None
+    if view is None:
         return shown
     photo, covered = placed(view.image().to(shown), view.camera, camera)
     other = photo if look.beside == "photograph" else (ERROR_GAIN * (photo - shown).abs()).clamp_(0, 1)
@@ -168,7 +170,7 @@ def split(left: Float[Tensor, "3 H W"], right: Float[Tensor, "3 H W"], at: float
 
 def enlarged(model: Model, pose: Pose, look: Look, like: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """The same camera as fine as the photographs, before it is zoomed; enlarged by Keys bicubic."""
-    per_pixel = 2 * math.tan(pose.fov / 2) * (model.focal if isinstance(model, RunModel) else 0.5)
+    per_pixel = 2 * math.tan(pose.fov / 2) * model.focal
     height = max(2, round(model.height * per_pixel / look.zoom))
     small = camera_of(pose, max(2, round(height * pose.width / pose.height)), look.zoom)
     return bicubic(model.drawn(small, look), like.shape[2], like.shape[1])
