@@ -293,9 +293,19 @@ def test_path_may_be_the_file(tmp_path: Path) -> None:
         load(options(tmp_path))
 
 
-def test_masks_are_mentioned(tmp_path: Path) -> None:
-    write(tmp_path, frames=frame_changes(mask_path="masks/1.png"))
-    assert any("masks of 1 images" in note for note in load(options(tmp_path)).notes)
+def test_masks_of_frames(tmp_path: Path) -> None:
+    write(tmp_path, frames=frame_changes(mask_path="elsewhere/1.png"))
+    with pytest.raises(InputError, match=r"elsewhere/1\.png' of .*scene\.masks=none"):
+        load(options(tmp_path))
+    (tmp_path / "elsewhere").mkdir()
+    mask = torch.ones(3, HEIGHT, WIDTH)
+    mask[:, :10] = 0
+    write_image(tmp_path / "elsewhere" / "1.png", mask)
+    scene = load(options(tmp_path))
+    assert any("masks of 1 of" in note for note in scene.notes)
+    counted = [view.counted() for view in (*scene.train, *scene.test)]
+    (known,) = (found for found in counted if found is not None)
+    assert torch.equal(known, mask[0] > 0)
 
 
 def test_provenance_is_json(tmp_path: Path) -> None:

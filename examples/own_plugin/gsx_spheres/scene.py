@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import ImageCache, PhotoSource, image_size
+from gsx.core.data.images import ImageCache, image_size
+from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat

@@ -8,6 +8,7 @@ import torch
 from gsx.augmenters.cameras import centred_window, grid_window, moved, noise, random_window, window_size, worst_window
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera
+from gsx.core.data.masks import blacked
 from gsx.core.data.window import Window
 from gsx.core.seeds import derived_seed
 from gsx.core.training.render import render
@@ -149,7 +150,8 @@ class Planner:
             return grid_window(width, height, size, turn)
         if kind == "error":
             view = run.scene.train[parent]
-            return worst_window((render(run, pose).image - view.image()).abs().mean(0), size)
+            error = blacked(render(run, pose).image - view.image(), view.counted())
+            return worst_window(error.abs().mean(0), size)
         return centred_window(width, height, size)
 
 

@@ -15,9 +15,12 @@ from gsx.augmenters.pixel_weights import agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
 from gsx.augmenters.timing import ramp
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
+from gsx.core.data.masks import where_counted
 from gsx.core.data.reduction import Reduction, as_blocks
 from gsx.core.data.resize import to_uint8
+from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.checked_regenerator import CheckedRegenerator
@@ -72,7 +75,7 @@ class Redrawer:
         """What the regenerator is asked for."""
         run.refuse_if_stopping()
         view = run.scene.train[spec.parent]
-        image = render(run, spec.seen).image if spec.outer is None else spec.outer.cut(view.image())
+        image = render(run, spec.seen).image if spec.outer is None else photographed(run, view, spec.outer, spec.seen)
         return Request(
             image=image,
             scale=spec.scale,
@@ -132,7 +135,8 @@ class Redrawer:
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
         photo = self.options.base_source == "photo"
-        picture = view.image() if photo else render(run, view.camera).image
+        whole = Window(0, 0, *view.camera.size)
+        picture = photographed(run, view, whole, view.camera) if photo else render(run, view.camera).image
         reduction = run.scene.reduction if photo else Reduction()  # Mipmap-GS: bilinear, which is the mean of four
         target = to_uint8(reduction.reduce(Window(0, 0, *covered.size).cut(picture), factor))
         return PseudoView(
@@ -171,3 +175,9 @@ class Redrawer:
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.name, view), torch.cat([given, result, difference], 2))
+
+
+def photographed(run: Run, view: View, window: Window, camera: Camera) -> Float[Tensor, "3 h w"]:
+    """A window of a photograph, `camera` its own; where that does not count the render stands in."""
+    photo, counted = window.cut(view.image()), view.counted()
+    return photo if counted is None else where_counted(photo, render(run, camera).image.cpu(), counted[window.pixels])

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
+from gsx.core.data.masks import where_counted
 from gsx.core.data.window import Window
 from gsx.core.training.regenerator import RegeneratorContext
 
@@ -16,9 +17,11 @@ OWN_EVERY = 6
 
 
 def held_out_pairs(context: RegeneratorContext, share: float) -> list[Pair]:
-    """Every training view as a model shows it that was not fitted to it (`RegeneratorContext.held_out`)."""
+    """Every training view as a model shows it that was not fitted to it (`RegeneratorContext.held_out`); what of a
+    photograph does not count shows the render, so that nothing is learnt there."""
     renders = context.held_out(share)
-    return [(render, view.image()) for render, view in zip(renders, context.views, strict=True)]
+    shown = zip(renders, context.views, strict=True)
+    return [(render, where_counted(view.image(), render, view.counted())) for render, view in shown]
 
 
 def with_own(pairs: Sequence[Pair], context: RegeneratorContext, numbers: Sequence[int]) -> list[Pair]:

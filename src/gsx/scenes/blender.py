@@ -10,13 +10,15 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import pinhole
-from gsx.core.data.images import PhotoSource, image_size
+from gsx.core.data.images import image_size
+from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
+from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
@@ -89,9 +91,9 @@ def load(options: BlenderOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=Reduction() if list(options.scales) != [1] else reduction_of(options),
         extent=extent_of([view.camera for view in train]),
-        notes=[*train_notes, *test_notes, *_test_note(test_file), points_note],
+        notes=[*train_notes, *test_notes, *_test_note(test_file), *mask_notes(views, options), points_note],
         provenance=provenance(
-            options, len(views), test_file=test_file.name, points=options.points, **_scales_named(options)
+            options, views, test_file=test_file.name, points=options.points, **_scales_named(options)
         ),
     )
 

@@ -27,6 +27,7 @@ from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_model import model_folders
+from gsx.scenes.masked import mask_notes
 from gsx.scenes.points import grey_points, read_points
 from gsx.scenes.posed import Shot, pose_from_opengl, provenance, read_json, reduction_of, refuse_too_few, views_of
 from gsx.scenes.splits import Split, split_names
@@ -134,8 +135,8 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
         extent=extent_of([view.camera for view in views]),
-        notes=[f"Cameras come from {POSES_FILE}.", note],
-        provenance=provenance(options, len(views), points=options.points),
+        notes=[f"Cameras come from {POSES_FILE}.", *mask_notes(views, options), note],
+        provenance=provenance(options, views, points=options.points),
     )
 
 

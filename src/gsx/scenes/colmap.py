@@ -17,9 +17,9 @@ from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
+from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.posed import (
-    IMAGES,
     MIN_IMAGES,
     Shot,
     lens_notes,
@@ -79,8 +79,15 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
         extent=extent_of([views[index].camera for index in train]),
-        notes=[*notes, *model.notes, *_missing_note(model, present), *lens_notes(shots), fit],
-        provenance=_provenance(model, shots, options),
+        notes=[
+            *notes,
+            *model.notes,
+            *_missing_note(model, present),
+            *lens_notes(shots),
+            *mask_notes(views, options),
+            fit,
+        ],
+        provenance=_provenance(model, shots, views, options),
     )
 
 
@@ -178,11 +185,11 @@ def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
     return [f"Skipped {len(missing)} images whose photos are missing: {named(missing)}."] if missing else []
 
 
-def _provenance(model: Model, shots: Sequence[Shot], options: ColmapOptions) -> dict[str, Any]:
+def _provenance(model: Model, shots: Sequence[Shot], views: Sequence[View], options: ColmapOptions) -> dict[str, Any]:
     bent = any(shot.remap is not None for shot in shots)
     return provenance(
         options,
-        len(shots),
+        views,
         image_folder=Path(options.images).name,
         camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
         undistortion=METHOD if bent else None,

@@ -37,5 +37,7 @@ class SceneOptions:
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
     """Share of the images named by a file of poses that may be absent from the disk; more are refused."""
+    masks: str = "auto"
+    """auto | alpha | none: which pixels of photographs count (gsx.scenes.masked)."""
     split: str = "every:8"
     """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""

@@ -20,8 +20,9 @@ from gsx.core.files import own_mark
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
+from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions
-from gsx.scenes.posed import IMAGES, named
+from gsx.scenes.posed import named
 
 logger = logging.getLogger(__name__)
 
@@ -89,9 +90,9 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
 
 
 def photos_in(folder: Path, pattern: str) -> list[str]:
-    """Sorted names of photos below `folder` that match `pattern`; hidden files do not count."""
-    files = (file for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted(file.relative_to(folder).as_posix() for file in files if not file.name.startswith("."))
+    """Sorted names of photos below `folder` that match `pattern`; hidden files and masks do not count."""
+    files = (file.relative_to(folder) for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
+    return sorted(file.as_posix() for file in files if not file.name.startswith(".") and file.parts[0] != FOLDER)
 
 
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:

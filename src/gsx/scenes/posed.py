@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, centred
-from gsx.core.data.images import ImageCache, PhotoSource, checked_size
+from gsx.core.data.images import ImageCache, checked_size
+from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
@@ -18,11 +19,10 @@ from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.files import is_file
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
+from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
 
-IMAGES = "images"
-"""Folder of the photos, unless a scene says otherwise."""
 MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
 FARTHEST = 1e9
@@ -43,6 +43,8 @@ class Shot:
     expected_size: Size
     """(width, height) that the poses file states for the photo."""
     remap: StoredUndistortion | None = None
+    mask: Path | None = None
+    """Its mask, where the poses file names one."""
 
     def __post_init__(self) -> None:
         if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):
@@ -194,7 +196,8 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
     """Views at training size, in the order of `shots`, sharing one image cache.
 
     Raises:
-        ConfigError: an option of the resize rule or the principal point is unknown.
+        ConfigError: an option of the resize rule, of masks or the principal point is unknown.
+        InputError: a mask that the scene names is not there.
     """
     if options.principal_point not in PRINCIPAL_POINTS:
         hint = nearest(options.principal_point, PRINCIPAL_POINTS)
@@ -232,6 +235,7 @@ def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache
         whole=whole,
         expected_size=shot.expected_size,
         remap=shot.remap,
+        mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, options),
     )
     return View(shot.name, whole.resize(*size), source)
 
@@ -245,7 +249,7 @@ def refuse_too_few(train: Sequence[View], place: Path) -> None:
         )
 
 
-def provenance(options: SceneOptions, images: int, **details: Any) -> dict[str, Any]:
+def provenance(options: SceneOptions, views: Sequence[View], **details: Any) -> dict[str, Any]:
     """What an evaluation has to say about its images, for `Scene.provenance`."""
     return {
         "format": options.name,
@@ -256,7 +260,8 @@ def provenance(options: SceneOptions, images: int, **details: Any) -> dict[str, 
         "resize": {"filter": options.resize_filter, "light": options.resize_light},
         "split": options.split,
         "background": list(options.background),
-        "number_of_images": images,
+        "number_of_images": len(views),
+        **masks_named(views),
         **details,
     }
 

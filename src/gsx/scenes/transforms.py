@@ -7,7 +7,7 @@ those of COLMAP scenes are.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.core.ranges import Points, Seed
+from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
@@ -85,8 +86,8 @@ def load(options: TransformsOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
         extent=extent_of([view.camera for view in train]),
-        notes=[*notes, *lens_notes(shots), *_mask_note(frames), *split_notes, points_note],
-        provenance=provenance(options, len(views), points=options.points, undistortion=METHOD if bent else None),
+        notes=[*notes, *lens_notes(shots), *mask_notes(views, options), *split_notes, points_note],
+        provenance=provenance(options, views, points=options.points, undistortion=METHOD if bent else None),
     )
 
 
@@ -103,7 +104,9 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
-    return shot_through(lens_of(entry, photo, place), name, photo, rotation, translation)
+    shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation)
+    mask = entry.get("mask_path")
+    return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
 
 
 def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
@@ -234,11 +237,6 @@ def _points(
     generator = torch.Generator().manual_seed(options.seed)
     cloud = random_points(options.random_points, middle - half, middle + half, generator)
     return cloud, f"Starts from {len(cloud)} random points in the cube around the cameras."
-
-
-def _mask_note(frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    masked = sum("mask_path" in frame for frame in frames)
-    return [f"The masks of {masked} images are not used."] if masked else []
 
 
 FORMAT = SceneFormat(

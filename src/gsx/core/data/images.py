@@ -1,4 +1,4 @@
-"""Images in and out through OpenImageIO, prefiltered resizing, 8-bit rounding, and photographs as truth of views.
+"""Images in and out through OpenImageIO, and those kept in memory.
 
 Images are uint8 display values [C, H, W], red first, alpha (if any) straight and last.
 """
@@ -9,7 +9,6 @@ import shutil
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
-from gsx.core.data.resize import ResizeRule, Size, display_from_linear, resize, to_uint8
+from gsx.core.data.resize import Size, display_from_linear, to_uint8
 from gsx.core.errors import InputError
 from gsx.core.files import replacing
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import Float, Shaped, UInt8
 
-ZOOM_SLACK = 1.01  # sizes are rounded to whole pixels, so four times a quarter can be a little more than all
 JPEG_QUALITY = 95
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
     1: (False, ()),
@@ -75,7 +72,7 @@ def checked_size(path: str | Path, expected: Size) -> Size:
         InputError: the size differs by more than the rounding to whole pixels.
     """
     size = image_size(path)
-    _refuse_other_size(path, size, expected)
+    refuse_other_size(path, size, expected)
     return size
 
 
@@ -130,7 +127,7 @@ class ImageCache:
         self._used = 0
         self._images: OrderedDict[Hashable, Tensor] = OrderedDict()
 
-    def get(self, key: Hashable, make: Callable[[], UInt8[Tensor, "C H W"]]) -> UInt8[Tensor, "C H W"]:
+    def get(self, key: Hashable, make: Callable[[], Shaped[Tensor, "C H W"]]) -> Shaped[Tensor, "C H W"]:
         """The image stored under `key`, or else what `make` returns, which is then stored."""
         if key in self._images:
             self._images.move_to_end(key)
@@ -142,52 +139,6 @@ class ImageCache:
         while self._used > self._budget:
             self._used -= self._images.popitem(last=False)[1].numel()
         return image
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PhotoSource:
-    """A photograph as the truth of one view (implements `gsx.core.data.scene.ImageSource`)."""
-
-    path: Path
-    rule: ResizeRule
-    cache: ImageCache
-    whole: Camera
-    """The camera of the whole photograph, after `remap`, at its own resolution: the finest truth there is."""
-    expected_size: Size | None = None
-    """(width, height) that the camera model states for the stored file; None: any."""
-    remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C height width"]] | None = None
-    """Undistortion or a reduction, applied to the decoded file; those that do the same compare equal."""
-
-    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """The photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
-
-        Raises:
-            InputError: the file cannot be read or has another size than the camera model states.
-            ValueError: `camera` reaches past the photograph.
-        """
-        across, down = camera.fx / self.whole.fx, camera.fy / self.whole.fy
-        width, height = round(self.whole.width * across), round(self.whole.height * down)
-        left = round(self.whole.cx * across - camera.cx)
-        top = round(self.whole.cy * down - camera.cy)
-        if left < 0 or top < 0 or left + camera.width > width or top + camera.height > height:
-            raise ValueError(f"a {camera.size} window at {left, top} reaches past '{self.path}' at {width, height}")
-        made_by = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
-        image = self.cache.get(made_by, lambda: self._resized(width, height))
-        return image[:, top : top + camera.height, left : left + camera.width]
-
-    def max_zoom(self, camera: Camera) -> float:
-        """How many times finer the photograph is than `camera`, with 1% for rounded sizes."""
-        return ZOOM_SLACK * self.whole.fx / camera.fx
-
-    def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
-        image = read_image(self.path)
-        if self.expected_size is not None:
-            _refuse_other_size(self.path, (image.shape[2], image.shape[1]), self.expected_size)
-        if self.remap is not None:
-            image = self.remap(image)
-        if image.shape[0] == 4:
-            image = composite(image, self.rule.background)
-        return resize(image, width, height, self.rule.filter, self.rule.light)
 
 
 def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, float]) -> UInt8[Tensor, "3 H W"]:
@@ -272,7 +223,7 @@ def _orientation(spec: Any) -> int:
     return value if value in ORIENTATIONS else 1
 
 
-def _refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
+def refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
     """One factor of at least 1 must bring both expected sides to within a pixel of the file's."""
     (width, height), (model_width, model_height) = size, expected
     least = max(model_width / (width + 1), model_height / (height + 1))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import Bool, Float, UInt8
 
 
 @runtime_checkable
@@ -36,6 +36,15 @@ class FromFile(Protocol):
         ...
 
 
+@runtime_checkable
+class Masked(Protocol):
+    """A source of which some pixels may not count."""
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """Which pixels of `image(camera)` count; None: all."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A camera and the image it took. Images are decoded when asked for and kept as uint8."""
@@ -49,6 +58,10 @@ class View:
     def image(self) -> Float[Tensor, "3 H W"]:
         """The truth at the camera's resolution, display values in [0, 1]."""
         return self.source.image(self.camera).float() / 255.0
+
+    def counted(self) -> Bool[Tensor, "H W"] | None:
+        """Which pixels count in losses and figures; None: all. The others show what is not part of the scene."""
+        return self.source.counted(self.camera) if isinstance(self.source, Masked) else None
 
     def zoom(self, factor: float) -> "View | None":
         """The view sampled `factor` times as finely, or None where the data hold no such truth."""

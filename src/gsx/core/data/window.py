@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import Shaped
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,7 @@ class Window:
     width: int
     height: int
 
-    def cut(
-        self, image: Float[Tensor, "C H W"] | UInt8[Tensor, "C H W"]
-    ) -> Float[Tensor, "C h w"] | UInt8[Tensor, "C h w"]:
+    def cut(self, image: Shaped[Tensor, "C H W"]) -> Shaped[Tensor, "C h w"]:
         """The part of an image inside the window."""
         return image[:, *self.pixels]
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gsx.core.quality.losses import WINDOW, ssim_map
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 
 SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
 STRIP_PIXELS = 1 << 16
@@ -19,9 +19,12 @@ def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
     return (image * 255 + 0.5).clamp(0, 255).floor() / 255
 
 
-def psnr(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
-    """20 log10(1 / sqrt(MSE)) over all pixels and channels, dB; inf for equal images."""
-    return decibel(float((image.double() - target.double()).square().mean()))
+def psnr(
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None = None
+) -> float:
+    """20 log10(1 / sqrt(MSE)) over all channels of the pixels that count (None: all), dB; inf for equal images."""
+    squares = (image.double() - target.double()).square()
+    return decibel(float((squares if counted is None else squares[:, counted.to(squares.device)]).mean()))
 
 
 def decibel(mean_square: float) -> float:
@@ -29,25 +32,35 @@ def decibel(mean_square: float) -> float:
     return -10 * math.log10(mean_square) if mean_square > 0 else math.inf
 
 
-def ssim(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], variant: str) -> float:
-    """Structural similarity in [-1, 1].
+def ssim(
+    image: Float[Tensor, "C H W"],
+    target: Float[Tensor, "C H W"],
+    variant: str,
+    counted: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all).
 
     They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
     `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
     mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim.
     """
     if variant == "inria":
-        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4))
+        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted)
     if variant == "torchmetrics":
         half, mode = WINDOW // 2, "reflect" if min(image.shape[1:]) > WINDOW // 2 else "replicate"
-        return whole_windows(*(pad(picture, (half,) * 4, mode=mode) for picture in (image, target)))
+        padded_image, padded_target = (pad(picture, (half,) * 4, mode=mode) for picture in (image, target))
+        return whole_windows(padded_image, padded_target, counted)
     if variant == "valid":
-        return whole_windows(image, target)
+        inner = slice(WINDOW // 2, -(WINDOW // 2))
+        return whole_windows(image, target, None if counted is None else counted[inner, inner])
     raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
 
 
-def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"]) -> float:
-    """Mean SSIM where the window fits; pictures smaller than a window are extended by their border first.
+def whole_windows(
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "h w"] | None = None
+) -> float:
+    """Mean SSIM where the window fits, its middle counts; pictures smaller than a window are extended by their border
+    first, and then count everywhere.
 
     In strips of rows, so that its maps stay in the CPU's cache.
     """
@@ -55,12 +68,14 @@ def whole_windows(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"])
     margin = [half for size in missing for half in (size // 2, size - size // 2)]
     if any(missing):
         image, target = (pad(picture, margin, mode="replicate") for picture in (image, target))
+        counted = None
     count, rows = image.shape[1] - WINDOW + 1, max(1, STRIP_PIXELS // image.shape[2])
-    total = 0.0
+    weights = torch.ones(count, image.shape[2] - WINDOW + 1) if counted is None or not counted.any() else counted
+    weights, total = weights.to(image.device).double(), 0.0
     for top in range(0, count, rows):
         strip = slice(top, min(top + rows, count) + WINDOW - 1)
-        total += float(ssim_map(image[:, strip], target[:, strip], padding=0).double().sum())
-    return total / (len(image) * count * (image.shape[2] - WINDOW + 1))
+        total += float((ssim_map(image[:, strip], target[:, strip], padding=0) * weights[top : top + rows]).sum())
+    return total / (len(image) * float(weights.sum()))
 
 
 def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:

@@ -204,5 +204,5 @@ class Step:
 
     def psnr(self) -> float:
         """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
-        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target)
+        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target, self.view.counted())
         return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))

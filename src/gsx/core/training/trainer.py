@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
@@ -103,13 +104,14 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
     compared with its own render.
     """
-    target, seen = view.image().to(run.device), list[Observation]()
+    counted, seen = view.counted(), list[Observation]()
+    target = blacked(view.image().to(run.device), counted)
     divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
-    loss = photometric(rendering.image, target, run.training.ssim_weight)
+    loss = photometric(blacked(rendering.image, counted), target, run.training.ssim_weight)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra

@@ -17,13 +17,14 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from gsx.core.data.masks import blacked
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.rasterizer.compiled import path_of
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -71,7 +72,7 @@ def peak_memory_mb(device: torch.device) -> float | None:
 
 def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
     """What two results must share to be compared, and its hash."""
-    protocol = {
+    protocol: dict[str, Any] = {
         "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
         "test_views": [view.name for view in run.scene.test],
         "train_views": len(run.scene.train),
@@ -83,6 +84,8 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
         "lpips": lpips_name,
         "enlarged": "x1 render, antialiased Keys bicubic",
     }
+    if "masks" in protocol["scene"]:
+        protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
     text = json.dumps(protocol, sort_keys=True, default=str)
     # which zooms were looked at changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
@@ -116,6 +119,8 @@ class Zoomed:
     enlarged: Float[Tensor, "3 H W"]
     photograph: Float[Tensor, "3 H W"]
     """The truth at the training resolution, enlarged: the most that can be had without new detail."""
+    counted: Bool[Tensor, "H W"] | None = None
+    """Which pixels count, None: all; the others are black in every picture."""
 
 
 @runtime_checkable
@@ -171,13 +176,14 @@ class Evaluator:
         begun = time.perf_counter()
         tiled = self.rendered(view)
         self.times.append(time.perf_counter() - begun)
-        image, truth = self.measured(tiled.image), view.image()
-        self.kept[view] = to_uint8(image) if self.options.quantise else image
+        whole, counted = self.measured(tiled.image), view.counted()
+        self.kept[view] = to_uint8(whole) if self.options.quantise else whole
+        image, truth = blacked(whole, counted), blacked(view.image(), counted)
         return {
             "name": view.name,
             "group": view.group,
-            "psnr": psnr(image, truth),
-            "ssim": ssim(image, truth, self.options.ssim),
+            "psnr": psnr(image, truth, counted),
+            "ssim": ssim(image, truth, self.options.ssim, counted),
             "lpips": None if self.lpips is None else self.lpips.distance(image, truth),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
@@ -194,24 +200,27 @@ class Evaluator:
         if finer is None:
             return None
         whole, image = self.whole(view), self.rendered(finer, factor).image
+        counted = finer.counted()
+        enlarged, photograph = (bicubic(picture, *finer.camera.size) for picture in (whole, view.image()))
         return Zoomed(
             view=finer,
             factor=factor,
-            truth=finer.image(),
-            render=self.measured(image),
-            enlarged=self.measured(bicubic(whole, *finer.camera.size)),
-            photograph=self.measured(bicubic(view.image(), *finer.camera.size)),
+            truth=blacked(finer.image(), counted),
+            render=blacked(self.measured(image), counted),
+            enlarged=blacked(self.measured(enlarged), counted),
+            photograph=blacked(self.measured(photograph), counted),
+            counted=counted,
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
         """Figures of one view at a zoom, beside those of its competitors."""
-        kind = self.options.ssim
+        kind, truth, counted = self.options.ssim, zoomed.truth, zoomed.counted
         return {
-            "psnr": psnr(zoomed.render, zoomed.truth),
-            "ssim": ssim(zoomed.render, zoomed.truth, kind),
-            "enlarged_psnr": psnr(zoomed.enlarged, zoomed.truth),
-            "enlarged_ssim": ssim(zoomed.enlarged, zoomed.truth, kind),
-            "photograph_psnr": psnr(zoomed.photograph, zoomed.truth),
+            "psnr": psnr(zoomed.render, truth, counted),
+            "ssim": ssim(zoomed.render, truth, kind, counted),
+            "enlarged_psnr": psnr(zoomed.enlarged, truth, counted),
+            "enlarged_ssim": ssim(zoomed.enlarged, truth, kind, counted),
+            "photograph_psnr": psnr(zoomed.photograph, truth, counted),
         }
 
     def work(self) -> float:
@@ -293,4 +302,5 @@ def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
     """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
     stride = max(1, len(run.scene.test) // count)
     views = run.scene.test[::stride][:count]
-    return statistics.fmean(psnr(render(run, v.camera, options.tile_pixels).image, v.image()) for v in views)
+    renders = ((v, render(run, v.camera, options.tile_pixels).image) for v in views)
+    return statistics.fmean(psnr(image, v.image(), v.counted()) for v, image in renders)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.data.images import write_image
+from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.files import write_json
@@ -76,7 +77,11 @@ class Pictures:
         if number not in self.shown:
             return
         truth = view.image()
-        images = {"truth": truth, "render": render, "error": error_map(render, truth)}
+        images = {
+            "truth": truth,
+            "render": render,
+            "error": error_map(*(blacked(picture, view.counted()) for picture in (render, truth))),
+        }
         files = {kind: self.save(f"{self.names[number]}.{kind}", reduced(image)) for kind, image in images.items()}
         self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
 

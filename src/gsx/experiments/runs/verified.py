@@ -8,7 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsx.core.cache import cache_folder, content_key, enlist, file_stamp, whole
-from gsx.core.data.images import PhotoSource, read_image
+from gsx.core.data.images import read_image
+from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.files import write_json
@@ -22,13 +23,15 @@ LONG = 200
 
 
 def verified(scene: Scene) -> Scene:
-    """The scene, whose photographs can all be decoded; which ones could be is remembered by name, size and time.
+    """The scene, whose photographs and masks can be decoded; which ones could be is remembered by name, size and time.
 
     Raises:
         InputError: some are damaged or missing.
     """
-    sources = (view.source for view in (*scene.train, *scene.test))
-    paths = list(dict.fromkeys(source.path for source in sources if isinstance(source, PhotoSource)))
+    sources = [view.source for view in (*scene.train, *scene.test)]
+    photographs = [source for source in sources if isinstance(source, PhotoSource)]
+    masks = [source.mask.path for source in photographs if source.mask is not None]
+    paths = list(dict.fromkeys([*(source.path for source in photographs), *masks]))
     if not paths or whole(known := remembered(paths)):
         return scene
     if len(paths) >= LONG:

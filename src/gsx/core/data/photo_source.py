@@ -1,0 +1,89 @@
+"""Photographs as the truth of views: decoded, undistorted, reduced when asked for."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import ImageCache, composite, read_image, refuse_other_size
+from gsx.core.data.masks import Mask
+from gsx.core.data.resize import ResizeRule, Size, resize
+from gsx.core.data.window import Window
+from gsx.core.errors import InputError
+from gsx.core.shapes import Bool, UInt8
+
+ZOOM_SLACK = 1.01  # sizes are rounded to whole pixels, so four times a quarter can be a little more than all
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhotoSource:
+    """A photograph as the truth of one view (implements `gsx.core.data.scene.ImageSource`)."""
+
+    path: Path
+    rule: ResizeRule
+    cache: ImageCache
+    whole: Camera
+    """The camera of the whole photograph, after `remap`, at its own resolution: the finest truth there is."""
+    expected_size: Size | None = None
+    """(width, height) that the camera model states for the stored file; None: any."""
+    remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C height width"]] | None = None
+    """Undistortion or a reduction, applied to the decoded file; those that do the same compare equal."""
+    mask: Mask | None = None
+    """What of the photograph counts; None: all of it."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """The photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
+
+        Raises:
+            InputError: the file cannot be read or has another size than the camera model states.
+            ValueError: `camera` reaches past the photograph.
+        """
+        window, width, height = self.window_of(camera)
+        made_by = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
+        image = self.cache.get(made_by, lambda: self._resized(width, height))
+        return window.cut(image)
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
+        """Which pixels of `image(camera)` count; None: all.
+
+        Raises:
+            InputError: the mask cannot be read, or leaves nothing of the photograph.
+        """
+        if self.mask is None:
+            return None
+        window, width, height = self.window_of(camera)
+        mask, made_by = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
+        counted = self.cache.get(made_by, lambda: mask.reduced(width, height, self.rule.filter))
+        if not counted.any():
+            raise InputError(f"The mask '{mask.path}' leaves nothing of '{self.path}': remove the photograph.")
+        return window.cut(counted)[0]
+
+    def window_of(self, camera: Camera) -> tuple[Window, int, int]:
+        """(what the camera sees of the whole photograph on its raster, width and height of that).
+
+        Raises:
+            ValueError: it reaches past the photograph.
+        """
+        across, down = camera.fx / self.whole.fx, camera.fy / self.whole.fy
+        width, height = round(self.whole.width * across), round(self.whole.height * down)
+        left = round(self.whole.cx * across - camera.cx)
+        top = round(self.whole.cy * down - camera.cy)
+        if left < 0 or top < 0 or left + camera.width > width or top + camera.height > height:
+            raise ValueError(f"a {camera.size} window at {left, top} reaches past '{self.path}' at {width, height}")
+        return Window(left=left, top=top, width=camera.width, height=camera.height), width, height
+
+    def max_zoom(self, camera: Camera) -> float:
+        """How many times finer the photograph is than `camera`, with 1% for rounded sizes."""
+        return ZOOM_SLACK * self.whole.fx / camera.fx
+
+    def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
+        image = read_image(self.path)
+        if self.expected_size is not None:
+            refuse_other_size(self.path, (image.shape[2], image.shape[1]), self.expected_size)
+        if self.remap is not None:
+            image = self.remap(image)
+        if image.shape[0] == 4:
+            image = composite(image, self.rule.background)
+        return resize(image, width, height, self.rule.filter, self.rule.light)

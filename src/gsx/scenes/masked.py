@@ -1,0 +1,91 @@
+"""Masks of photographs: where loaders look for them, and which photographs have one."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from gsx.core.data.masks import Mask
+from gsx.core.data.photo_source import PhotoSource
+from gsx.core.data.scene import View
+from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.files import is_file
+from gsx.scenes.options import SceneOptions
+from gsx.scenes.undistort import StoredUndistortion
+
+IMAGES = "images"
+"""Folder of the photos, unless a scene says otherwise."""
+FOLDER = "masks"
+"""Beside the folder of the photographs (COLMAP)."""
+MASKS = ("auto", "alpha", "none")
+"""`auto`: what the scene names (`mask_path` of nerfstudio), else files in FOLDER. `alpha`: what is opaque counts,
+instead of compositing the rest. `none`: all pixels count."""
+
+
+def mask_of(photo: Path, name: str, given: Path | None, remap: Callable | None, options: SceneOptions) -> Mask | None:
+    """The mask of a photograph of that name; None: it has none.
+
+    Raises:
+        ConfigError: scene.masks has no such value.
+        InputError: a mask that the scene names is not there.
+    """
+    if options.masks not in MASKS:
+        raise ConfigError(
+            f"scene.masks is '{options.masks}', use one of {', '.join(MASKS)}.{nearest(options.masks, MASKS)}"
+        )
+    if options.masks == "none":
+        return None
+    if options.masks == "alpha":
+        return Mask(path=photo, alpha=True, remap=remap)
+    if given is not None and not is_file(given):
+        raise InputError(f"The mask '{given}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
+    path = given or next(filter(is_file, candidates(folder_of(options), name)), None)
+    bent = replace(remap, photo=path) if path is not None and isinstance(remap, StoredUndistortion) else None
+    return None if path is None else Mask(path=path, remap=bent)
+
+
+def folder_of(options: SceneOptions) -> Path:
+    """Where masks are looked for: in the scene's folder, or beside it where that may be the photographs' own."""
+    path = Path(options.path).expanduser()
+    own, beside = path / FOLDER, path.parent / FOLDER
+    return beside if not own.is_dir() and not (path / IMAGES).is_dir() else own
+
+
+def candidates(folder: Path, name: str) -> list[Path]:
+    """Files that may be the mask of a photograph: NAME.png (COLMAP), NAME, or NAME with another suffix; below the same
+    folders, or without the first of them."""
+    parts = PurePosixPath(name).parts
+    names = dict.fromkeys(PurePosixPath(*parts[first:]) for first in range(min(len(parts), 2)))
+    forms = [(f"{one}.png", str(one), str(one.with_suffix(".png")), str(one.with_suffix(".jpg"))) for one in names]
+    return [folder / form for several in forms for form in several]
+
+
+def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
+    """How many photographs have a mask.
+
+    Raises:
+        InputError: there are masks, and none belongs to a photograph.
+    """
+    found, folder = masked(views), folder_of(options)
+    if found:
+        where = "alpha" if options.masks == "alpha" else "masks"
+        return [f"What the {where} of {found} of {len(views)} photographs leave out counts in no loss and no figure."]
+    own = folder.parent == Path(options.path).expanduser()
+    if options.masks == "auto" and own and folder.is_dir() and any(map(is_file, folder.rglob("*.*"))):
+        raise InputError(
+            f"None of the masks in '{folder}' has the name of a photograph: call that of a.jpg a.jpg.png or a.png, or "
+            "set scene.masks=none."
+        )
+    return []
+
+
+def masked(views: Sequence[View]) -> int:
+    """How many photographs have a mask."""
+    sources = (view.source for view in views)
+    return sum(isinstance(source, PhotoSource) and source.mask is not None for source in sources)
+
+
+def masks_named(views: Sequence[View]) -> Mapping[str, Any]:
+    """For the provenance; nothing without masks, so that such a protocol keeps its hash."""
+    found = masked(views)
+    return {"masks": found} if found else {}

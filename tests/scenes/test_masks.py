@@ -1,0 +1,143 @@
+"""Masks: which pixels count, where they are looked for, and that the others change nothing."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import gsx
+from gsx.core.data.images import read_image, write_image
+from gsx.core.data.masks import Mask, blacked
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.quality.losses import ssim_map
+from gsx.core.quality.metrics import psnr, ssim
+from gsx.scenes.masked import candidates
+from tests.synthetic_colmap import synthesize, write_scene
+
+NOISE = torch.Generator().manual_seed(3)
+
+
+def stored_mask(path, excluded, size=(8, 8)):
+    """A white mask but for the pixels (row, column) in `excluded`."""
+    picture = torch.full((3, *size), 255, dtype=torch.uint8)
+    for row, column in excluded:
+        picture[:, row, column] = 0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, picture)
+    return path
+
+
+def places(mask, value=False):
+    return {tuple(place) for place in (mask[0] == value).nonzero().tolist()}
+
+
+def test_a_reduced_pixel_counts_where_nothing_it_was_made_from_is_masked(tmp_path):
+    mask = Mask(path=stored_mask(tmp_path / "m.png", [(0, 7)]))
+    assert places(mask.reduced(8, 8, "bicubic")) == {(0, 7)}, "as it is"
+    assert places(mask.reduced(4, 4, "area")) == {(0, 3)}
+    assert places(mask.reduced(4, 4, "bicubic")) == {(row, column) for row in range(3) for column in (1, 2, 3)}
+    assert places(mask.reduced(16, 16, "bicubic")) == {(0, 14), (0, 15), (1, 14), (1, 15)}, "larger than the mask"
+
+
+def test_no_masked_pixel_reaches_a_counted_one_through_any_filter(tmp_path):
+    """Against the resize itself: two photographs that differ where they are masked alone are equal where they count."""
+    from gsx.core.data.resize import resize
+
+    generator = torch.Generator().manual_seed(0)
+    for filter in ("area", "bicubic", "lanczos"):
+        excluded = torch.rand(40, 56, generator=generator) < 0.01
+        mask = Mask(path=stored_mask(tmp_path / f"{filter}.png", excluded.nonzero().tolist(), (40, 56)))
+        one = torch.randint(0, 256, (3, 40, 56), generator=generator, dtype=torch.uint8)
+        other = torch.where(excluded, 255 - one, one)
+        for width, height in ((56, 40), (28, 20), (17, 11)):
+            counted = mask.reduced(width, height, filter)[0]
+            same = (resize(one, width, height, filter) == resize(other, width, height, filter)).all(0)
+            assert bool(same[counted].all()), (filter, width)
+            assert 0 < counted.float().mean() < 1
+
+
+def test_alpha_counts_where_opaque(tmp_path):
+    picture = torch.full((4, 4, 4), 255, dtype=torch.uint8)
+    picture[3, 0, 0], picture[3, 1, 1] = 0, 254
+    write_image(tmp_path / "a.png", picture)
+    assert places(Mask(path=tmp_path / "a.png", alpha=True).reduced(4, 4, "area")) == {(0, 0), (1, 1)}
+
+
+def test_figures_are_over_what_counts():
+    image, truth = (torch.rand(3, 30, 40, generator=NOISE) for _ in range(2))
+    counted = torch.rand(30, 40, generator=NOISE) < 0.7
+    errors = ((image - truth) ** 2).numpy()[:, counted.numpy()].astype(np.float64)
+    assert psnr(image, truth, counted) == pytest.approx(-10 * np.log10(errors.mean()), abs=1e-4)
+    shown = [blacked(picture, counted) for picture in (image, truth)]
+    assert float(shown[0][:, ~counted].abs().sum()) == 0
+    padded = ssim_map(*shown)[:, counted].mean()
+    assert ssim(*shown, "inria", counted) == pytest.approx(float(padded), abs=1e-6)
+    inner = counted[5:-5, 5:-5]
+    assert ssim(*shown, "valid", inner.new_ones(30, 40)) == pytest.approx(ssim(*shown, "valid"), abs=1e-9)
+    assert ssim(*shown, "valid", counted) == pytest.approx(float(ssim_map(*shown, 0)[:, inner].mean()), abs=1e-6)
+
+
+def test_where_a_mask_may_lie(tmp_path):
+    names = [str(path.relative_to(tmp_path)) for path in candidates(tmp_path, "images/a.jpg")]
+    assert {"images/a.jpg.png", "images/a.jpg", "images/a.png", "a.jpg.png", "a.png"} <= set(names)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A COLMAP scene of noise of which a corner of every photograph is masked."""
+    folder = tmp_path_factory.mktemp("masked")
+    write_scene(synthesize(frames=5), folder)
+    for photo in sorted((folder / "images").rglob("*.*")):
+        height, width = read_image(photo).shape[1:]
+        corner = [(row, column) for row in range(height // 2) for column in range(width // 2)]
+        name = photo.relative_to(folder / "images").as_posix()
+        stored_mask(folder / "masks" / f"{name}.png", corner, (height, width))
+    return folder
+
+
+def trained(folder, output, *more):
+    return gsx.train(
+        "scene=colmap", "backbone=mip_splatting", "iterations=4", "device=cpu", "eval.zoom=[1]", *more,
+        **{"scene.path": str(folder), "folder": str(output)},
+    )  # fmt: skip
+
+
+def test_what_is_masked_changes_nothing(capture, tmp_path):
+    """Other pixels under the masks: the same model and the same figures, bit by bit. Without masks: another."""
+    runs = [trained(capture, tmp_path / "one")]
+    for photo in sorted((capture / "images").rglob("*.*")):
+        picture = read_image(photo)
+        picture[:, : picture.shape[1] // 2, : picture.shape[2] // 2] = 255 * (int(photo.stem[-1]) % 2)
+        write_image(photo, picture)
+    runs += [trained(capture, tmp_path / "two"), trained(capture, tmp_path / "three", "scene.masks=none")]
+    one, two, three = (
+        {name: value.detach() for name, value in run.run.backbone.table.parameters.items()} for run in runs
+    )
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert not all(torch.equal(one[name], three[name]) for name in one)
+    figures = [json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("one", "two", "three")]
+    assert figures[0]["psnr"] == figures[1]["psnr"] != figures[2]["psnr"]
+    assert figures[0]["protocol"]["scene"]["masks"] == 5
+    assert "masks" not in figures[2]["protocol"]["scene"]
+    assert any("masks of 5 of 5" in note for note in runs[0].scene.notes)
+
+
+def test_masks_that_belong_to_nothing_are_told(tmp_path):
+    write_scene(synthesize(frames=3), tmp_path)
+    stored_mask(tmp_path / "masks" / "other.png", [(0, 0)])
+    with pytest.raises(InputError, match=r"None of the masks .*a\.jpg\.png.*scene\.masks=none"):
+        trained(tmp_path, tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"scene\.masks is 'alfa'.*alpha"):
+        trained(tmp_path, tmp_path / "run", "scene.masks=alfa")
+
+
+def test_a_mask_that_leaves_nothing_is_told(tmp_path):
+    write_scene(synthesize(frames=3), tmp_path)
+    for photo in sorted((tmp_path / "images").rglob("*.*")):
+        black = torch.zeros_like(read_image(photo))
+        mask = tmp_path / "masks" / f"{photo.relative_to(tmp_path / 'images')}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        write_image(mask, black)
+    with pytest.raises(InputError, match="leaves nothing of"):
+        trained(tmp_path, tmp_path / "run")
