@@ -22,12 +22,20 @@ def verb_report(arguments: list[str]) -> int:
 
 def verb_scenes(arguments: list[str]) -> int:
     """gsx scenes PATH"""
-    parser = Parser(prog="gsx scenes", description="What a folder is: format, cameras, images, points, problems.")
+    parser = Parser(
+        prog="gsx scenes",
+        description="What a folder is: format, cameras, images, points, problems, and how good the capture is.",
+    )
     parser.add_argument("path", type=Path, metavar="PATH", help="folder of a scene")
+    parser.add_argument(
+        "--poses",
+        action="store_true",
+        help="find the poses of photographs that have none, which takes minutes, and judge the coverage",
+    )
     given = parser.parse_args(arguments)
     from gsx.experiments.runs.inspect import describe
 
-    lines = describe(given.path, plugins())
+    lines = describe(given.path, plugins(), given.poses)
     sys.stdout.write("\n".join(lines) + "\n")
     return 2 if any(line.startswith("problem") for line in lines) else 0
 

@@ -17,6 +17,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.files import own_mark
+from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
@@ -27,6 +28,7 @@ from gsx.scenes.posed import named
 logger = logging.getLogger(__name__)
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")  # what both pycolmap and gsx read
+HEIC = (".heic", ".heif")
 MATCHERS = ("auto", "exhaustive", "sequential")
 CAMERA_MODES = ("auto", "single", "per_image")
 MIN_PHOTOS = 2
@@ -82,6 +84,8 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     names = photos_in(folder, "*") or photos_in(folder, "**/*")
     if len(names) < MIN_PHOTOS:
         found = ", ".join(sorted({file.suffix for file in folder.rglob("*") if file.is_file()})) or "nothing"
+        if heic_in(folder):
+            raise InputError(f"{folder} holds {len(names)} photos in other formats, and {heic_sentence(folder)}")
         raise InputError(
             f"{folder} holds {len(names)} photos ({', '.join(PHOTO_SUFFIXES)}; found: {found}), but reconstruction "
             f"needs at least {MIN_PHOTOS}: name another folder or convert the photos to JPEG."
@@ -93,6 +97,19 @@ def photos_in(folder: Path, pattern: str) -> list[str]:
     """Sorted names of photos below `folder` that match `pattern`; hidden files and masks do not count."""
     files = (file.relative_to(folder) for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
     return sorted(file.as_posix() for file in files if not file.name.startswith(".") and file.parts[0] != FOLDER)
+
+
+def heic_in(folder: Path) -> int:
+    """How many photographs of phones, in the format that nothing here reads, lie in a folder."""
+    return sum(file.suffix.lower() in HEIC for file in folder.iterdir())
+
+
+def heic_sentence(folder: Path) -> str:
+    """What to do with them."""
+    return (
+        f"{heic_in(folder)} HEIC photos, which neither OpenImageIO nor COLMAP reads here: convert them, for example by "
+        "'magick mogrify -format jpg *.heic', and set the phone to take JPEG."
+    )
 
 
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
@@ -108,7 +125,8 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
     broken = [name for name in photos if name not in sizes]
     if len(sizes) < MIN_PHOTOS:
         raise InputError(f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: export them again.")
-    return sizes, [f"Skipped {len(broken)} photos that cannot be read: {named(broken)}."] if broken else []
+    notes = [f"Skipped {len(broken)} photos that cannot be read: {named(broken)}."] if broken else []
+    return sizes, [*notes, f"Passed over {heic_sentence(folder)}"] if heic_in(folder) else notes
 
 
 def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path:
@@ -200,6 +218,7 @@ def facts(path: Path) -> Iterator[str]:
     sizes, notes = readable_sizes(folder, names)
     for (width, height), count in sorted(Counter(sizes.values()).items()):
         yield f"images    {count} of {width}x{height} in {folder}"
+    yield sharpness_line([folder / name for name in sizes])
     yield from (f"note      {note}" for note in notes)
 
 

@@ -14,6 +14,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError
 from gsx.core.plugins import Component, Plugins
+from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session
 from gsx.experiments.runs.settings import typed
 
@@ -43,8 +44,9 @@ class Findings:
             self.problems.append(f"{type(problem).__name__}: {problem}")
 
 
-def describe(path: str | Path, plugins: Plugins) -> list[str]:
-    """Lines about a folder: format, cameras, images, points, problems and the command to train it. Never raises."""
+def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[str]:
+    """Lines about a folder: format, cameras, images, points, how good the capture is, problems and the command to train
+    it. A `patient` one loads what takes minutes, too. Never raises."""
     path, found = Path(path).expanduser(), Findings()
     loaders: Readable = []
 
@@ -56,7 +58,7 @@ def describe(path: str | Path, plugins: Plugins) -> list[str]:
     if loaders:
         loader, its = loaders[0]
         found.command = command(loader, path, {})
-        found.ask(lambda: scene_lines(loader, its, path, found, plugins))
+        found.ask(lambda: scene_lines(loader, its, path, found, plugins, patient))
     problems = [f"problem   {problem}" for problem in found.problems]
     label = "then" if problems else "train"
     return [*found.lines, *problems, *([f"{label:10}{found.command}"] if found.command else [])]
@@ -99,13 +101,19 @@ def unknown(path: Path, plugins: Plugins) -> InputError:
     return InputError(f"'{path}' is no scene: it has no {signs}.{below}")
 
 
-def scene_lines(loader: Component, its: SceneFormat, path: Path, found: Findings, plugins: Plugins) -> Iterator[str]:
+def scene_lines(
+    loader: Component, its: SceneFormat, path: Path, found: Findings, plugins: Plugins, patient: bool
+) -> Iterator[str]:
     """What lies in the folder, and what the loader makes of it."""
     yield from its.facts(path)
     overrides = its.overrides(path)
     found.command = command(loader, path, overrides)
-    if its.quick:
-        yield from loaded_lines(loader.factory(options_for(loader, path, overrides, plugins)))
+    if its.quick or patient:
+        scene = loader.factory(options_for(loader, path, overrides, plugins))
+        yield from loaded_lines(scene)
+        found.ask(lambda: capture_lines(scene))
+    else:
+        yield f"poses     not known yet: gsx scenes {shlex.quote(str(path))} --poses finds them and judges the coverage"
 
 
 def command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
