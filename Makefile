@@ -14,7 +14,7 @@ ANSWERS := $(BIN)/python -c 'from urllib.request import urlopen; urlopen("$(CPU_
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow test-faults test-faults-short test-times lint wheel clean
+.PHONY: demo test test-slow test-faults test-faults-short test-times site lint wheel clean
 
 demo: $(READY)
 	$(BIN)/gsx -m backbone=gs3d,gs3d_zoom 'eval.zoom=[1,2,4]'
@@ -43,7 +43,11 @@ test-faults-short: $(READY_DEV)
 test-times: $(READY_DEV)
 	$(PYTEST) --file-times
 
-lint: $(READY_DEV)
+# The documentation as a site; links that lead nowhere are errors.
+site: $(READY_DEV)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+lint: $(READY_DEV) site
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -1,6 +1,6 @@
 """Pictures of every backbone as it is trained from the command line, at x1 and x4: python benchmarks/gallery.py
 
-Trains the built-in scene by each backbone with its defaults, one seed, and writes docs/gallery.md with a held-out view as
+Trains the built-in scene by each backbone with its defaults, one seed, and writes docs/gallery.md: a held-out view as
 it is, and its middle four times as fine, beside the truth. Runs that are there (--runs) are gone on with and kept.
 """
 
@@ -87,8 +87,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Every backbone with its defaults, trained on the built-in scene from the command line (`gsx backbone=NAME`): a view that it never saw,",
-        "and the middle of it four times as fine, which is detail that no photograph showed.",
+        "Every backbone with its defaults, trained on the built-in scene from the command line (`gsx backbone=NAME`):",
+        "a view that it never saw, and the middle of it four times as fine, which is detail that no photograph showed.",
         "",
         "<!-- gallery: written by benchmarks/gallery.py -->",
     ]

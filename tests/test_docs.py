@@ -31,18 +31,47 @@ def test_source_files_named_in_backticks_exist(page: Path) -> None:
         assert (ROOT / name).exists(), name
 
 
-def test_commands_of_the_readme_are_accepted() -> None:
+@pytest.mark.parametrize("page", [page for page in PAGES if "```sh" in page.read_text()], ids=lambda page: page.name)
+def test_commands_of_pages_are_accepted(page: Path) -> None:
     from gsx.builtin import plugins
     from gsx.cli.dispatch import VERBS
     from gsx.experiments.runs.compose import compose
 
-    text = (ROOT / "README.md").read_text()
-    blocks = re.findall(r"```sh\n(.*?)```", text, re.S)
+    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.S)
     commands = [line.split("#")[0].strip() for block in blocks for line in block.splitlines() if line.startswith("gsx")]
-    assert commands
     for command in commands:
         words = [word.strip("'") for word in command.split()[1:]]
         if words and words[0] in (*VERBS, "FOLDER"):  # what stands for a path is told when it is given
             continue
         if not any(word.startswith("-") for word in words):
-            compose(words, plugins())
+            compose([word for word in words if word != "init=FILE"], plugins())
+
+
+def test_the_commands_of_the_readme_are_found() -> None:
+    assert (ROOT / "README.md").read_text().count("\ngsx ") > 10
+
+
+def test_keys_named_for_those_who_come_from_elsewhere_exist() -> None:
+    """In docs/coming-from.md: `a.b.c` is a key of some composition, words after it are its neighbours."""
+    from gsx.builtin import plugins
+    from gsx.experiments.runs.compose import Compositions
+
+    text = (ROOT / "docs" / "coming-from.md").read_text()
+    with Compositions(plugins()) as compositions:
+        backbones = compositions.choices("backbone")
+        words = [[f"backbone={name}", f"scene={scene}"] for name in backbones for scene in ("colmap", "blender")]
+        known = {key for one in words for key in compositions.keys(one)}
+    rows = [row.split("|")[-2] for row in text.splitlines() if row.startswith(("| `", "| -"))]
+    named = 0
+    for row in rows:
+        prefix = ""
+        for word in re.findall(r"`([\w.]+)(?:=[^`]*)?`", row):
+            if word.startswith(("backbone.", "training.", "scene.", "eval.", "rasterizer.")):
+                prefix, key = word.rpartition(".")[0], word
+            elif prefix and "." not in word and f"`{word}=" not in row:
+                key = f"{prefix}.{word}"
+            else:
+                continue
+            assert key in known, f"{key} ({row.strip()})"
+            named += 1
+    assert named > 30

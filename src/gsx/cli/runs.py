@@ -134,7 +134,8 @@ def verb_export(arguments: list[str]) -> int:
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
     given = parser.parse_args(arguments)
     from gsx.core.files import remove_partial
-    from gsx.experiments.runs.export import export, losses, refuse_export
+    from gsx.experiments.reports.report import write_report
+    from gsx.experiments.runs.export import export, is_page, losses, refuse_export
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.render import view_named
 
@@ -152,5 +153,7 @@ def verb_export(arguments: list[str]) -> int:
         views = [view] if view else run.scene.test
         for line in losses(run, settings, path, views, written, given.axes):
             logger.info("read back and rendered again: %s", line)
+    if is_page(path) and path.parent.resolve() == given.run.resolve():
+        write_report(given.run)  # it links to its pages
     sys.stdout.write(f"{path}\n")
     return 0

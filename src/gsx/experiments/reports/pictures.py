@@ -34,7 +34,7 @@ WINDOW_STEP = 8
 """Crops are looked for on a grid of this many px."""
 ERROR_FULL = 0.2
 """Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
-DRAWN = re.compile(r".+\.(truth|render|error|enlarged)\.(png|jpg)")
+DRAWN = re.compile(r".+\.(truth|render|error|enlarged|depth)\.(png|jpg)")
 """Names of pictures."""
 ERROR_COLOURS = (
     (0.00, (0, 0, 4)),
@@ -60,6 +60,8 @@ class Pictures:
         """Their file names."""
         self.views: list[dict[str, Any]] = []
         self.crops: list[dict[str, Any]] = []
+        self.flight: dict[str, Any] = {}
+        """From a whole view into its detail, frame below frame."""
 
     def choose(self, figures: Sequence[dict[str, Any]]) -> None:
         """Best and worst are among the views drawn; pictures of an earlier evaluation are removed."""
@@ -104,9 +106,9 @@ class Pictures:
             }
         )
 
-    def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False) -> str:
+    def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False, lossy: bool = False) -> str:
         """Write one picture and return its file name."""
-        small = image.shape[1] * image.shape[2] <= LOSSLESS_PIXELS
+        small = image.shape[1] * image.shape[2] <= LOSSLESS_PIXELS and not lossy
         file = f"{stem}.png" if lossless or small else f"{stem}.jpg"
         write_image(self.folder / file, image)
         return file
@@ -114,6 +116,7 @@ class Pictures:
     def write_index(self) -> None:
         """List what was drawn."""
         index = {"error_full": ERROR_FULL, "step": self.step, "views": self.views, "zoom": self.crops}
+        index |= {"flight": self.flight} if self.flight else {}
         write_json(self.folder / "index.json", index)
 
 

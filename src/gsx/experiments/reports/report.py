@@ -98,6 +98,8 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "views": [with_images(run, entry) for entry in drawn],
         "anchors": {str(entry.get("name")): f"view-{number}" for number, entry in enumerate(drawn, 1)},
         "crops": crops_by_factor(run),
+        "flight": flight_of(run),
+        "pages": pages_of(run.folder),
         "pseudo": [with_pseudo_images(run, entry) for entry in run.pseudo.get("views", [])],
         "error_full": run.pictures.get("error_full"),
         "ramp": ", ".join(f"rgb{colour} {place:.0%}" for place, colour in ERROR_COLOURS),
@@ -303,6 +305,20 @@ def crops_by_factor(run: RunFiles) -> dict[str, list[dict[str, Any]]]:
     crops = [with_images(run, entry) for entry in run.pictures.get("zoom", [])]
     factors = sorted({crop["factor"] for crop in crops})
     return {f"{factor:g}": [crop for crop in crops if crop["factor"] == factor] for factor in factors}
+
+
+def flight_of(run: RunFiles) -> dict[str, Any] | None:
+    """The flight into a view's detail with its frames embedded; None where there is none."""
+    known = part(run.pictures, "flight")
+    image = embedded(run.folder / "renders" / Path(str(known.get("file", ""))).name)
+    size, frames = known.get("size"), known.get("frames")
+    sound = isinstance(size, list) and len(size) == 2 and all(is_number(side) and side > 0 for side in size)
+    return known | {"image": image} if image and sound and is_number(frames) and frames > 1 else None
+
+
+def pages_of(folder: Path) -> list[str]:
+    """Pages beside the report that `gsx export RUN FILE.html` wrote."""
+    return sorted(path.name for path in folder.glob("*.html") if path.name != "report.html")
 
 
 def with_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:

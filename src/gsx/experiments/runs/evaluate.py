@@ -11,6 +11,7 @@ from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run
 from gsx.experiments.run_folder.run_key import evaluation_settings
+from gsx.experiments.runs.flight import add_depth, add_flight
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.pseudo_pictures import write_pseudo_pictures
 from gsx.experiments.runs.settings import Settings
@@ -24,6 +25,8 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
+    add_depth(run, pictures)
+    add_flight(run, pictures)
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}

@@ -238,3 +238,56 @@ def in_words(hint: Any) -> str:
     if hasattr(hint, "__metadata__"):
         return in_words(inner[0])
     return KINDS.get(hint, "")
+
+
+# -- all of it -----------------------------------------------------------------------------------------------------
+
+
+def reference(plugins: Plugins) -> list[str]:
+    """A page over all keys, in Markdown: of a run, then of each option of each group."""
+    lines = [
+        "# Configuration",
+        "",
+        "Every key, its value, what it may be, and what is written beside it where it is set. On the command line:",
+        "`gsx KEY=VALUE`, `gsx GROUP=OPTION`, `gsx explain KEY`.",
+    ]
+    with Compositions(plugins) as compositions:
+        groups = [group for group in compositions.groups() if compositions.choices(group)]
+        lines += ["", "## Of a run", "", *keys_table("", [], compositions, groups)]
+        for group in filter(LISTED.__contains__, groups):
+            for option in compositions.choices(group):
+                word = f"{group}=[{option}]" if group in ("augmenter", "tracker") else f"{group}={option}"
+                lines += ["", f"## {word}", "", head_of(compositions.file(f"{group}/{option}")) + ".", ""]
+                prefix = f"{group}.{option}" if group in ("augmenter", "tracker") else group.replace("/", ".")
+                lines += keys_table(prefix, [word], compositions, groups)
+    return [*lines, ""]
+
+
+LISTED = ("scene", "backbone", "augmenter", "regenerator/upscale", "regenerator/restore", "rasterizer", "tracker")
+"""Groups whose options have keys of their own; presets and variants set those of others."""
+
+
+def keys_table(prefix: str, words: Sequence[str], compositions: Compositions, groups: Sequence[str]) -> list[str]:
+    """The keys below a prefix, a row each; those of a run where there is none, but not those that groups bring."""
+    values = compositions.values(words)
+    try:
+        settings = compositions.settings(words)
+    except ConfigError:  # an option that cannot be used before it is told more, a model for example
+        settings = None
+    files = parsed(compositions.sources(words))
+    brought = tuple(f"{group.partition('/')[0]}." for group in groups)
+    rows = ["| key | value | may be | |", "|---|---|---|---|"]
+    for key in dotted(values):
+        node = value_at(key, values)
+        wanted = key.startswith(f"{prefix}.") if prefix else not key.startswith(brought)
+        if wanted and not isinstance(node, dict):
+            found = entries(files, key)
+            comment = next((entry.comment for entry in reversed(found) if entry.comment), "")
+            cells = (f"`{key}`", f"`{written(node)}`", kind_of(key, settings) if settings else "", comment)
+            rows.append("| " + " | ".join(map(in_cell, cells)) + " |")
+    return rows
+
+
+def in_cell(text: str) -> str:
+    """A text in a cell of a table, its marks shown as they are."""
+    return re.sub(r"([|*])", r"\\\1", text) if "`" in text else re.sub(r"([|*_<>])", r"\\\1", text)

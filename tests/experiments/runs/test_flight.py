@@ -1,0 +1,53 @@
+"""The flight into the detail, and depth as colours, against hand-worked cameras and distances."""
+
+import itertools
+
+import pytest
+import torch
+
+from gsx.core.data.camera import look_at
+from gsx.experiments.reports.pictures import colour_ramp
+from gsx.experiments.runs.flight import FRAMES, LONGEST, depth_colours, flight
+
+CAMERA = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=640, height=480)
+
+
+def test_a_flight_begins_with_the_whole_and_ends_in_the_window():
+    """A window of 64 x 48 px whose middle is at (480, 120) of 640 x 480, ten times as fine."""
+    cameras = flight(CAMERA, (0.75, 0.25), 10.0)
+    assert len(cameras) == FRAMES
+    assert {camera.size for camera in cameras} == {(LONGEST, 240)}
+    whole, last = CAMERA.resize(LONGEST, 240), cameras[-1]
+    assert (cameras[0].fx, cameras[0].cx, cameras[0].cy) == (whole.fx, whole.cx, whole.cy)
+    points = torch.tensor([[0.3, 0.2, 0.4], [-0.2, 0.5, 0.1]], dtype=torch.float64)
+    seen, expected = last.project(points)[0], (CAMERA.project(points)[0] - torch.tensor([448.0, 96.0])) * (LONGEST / 64)
+    assert (seen - expected).abs().max() < 1, "within the rounding of the crop to whole pixels"
+    focal = [camera.fx for camera in cameras]
+    assert all(
+        later / earlier == pytest.approx(10 ** (1 / (FRAMES - 1)), rel=0.02)
+        for earlier, later in itertools.pairwise(focal)
+    )
+
+
+def test_a_window_at_the_border_stays_inside():
+    for camera in flight(CAMERA, (1.0, 0.0), 4.0):
+        low, high = camera.cx - CAMERA.cx / CAMERA.fx * camera.fx, camera.fx / CAMERA.fx * CAMERA.width
+        assert -1 <= -low <= high - camera.width + 1
+
+
+def test_depth_is_coloured_by_its_inverse():
+    """Two halves, 2 and 8 units away, half covered pixels among them; nothing in one row."""
+    alpha = torch.ones(20, 20)
+    alpha[5], alpha[0] = 0.6, 0.3
+    depth = torch.full((20, 20), 2.0)
+    depth[:, 10:] = 8.0
+    picture, limits = depth_colours(depth * alpha, alpha)
+    assert limits == pytest.approx([2.0, 8.0], rel=1e-5)
+    bright, dark = colour_ramp(torch.tensor([[1.0, 0.1]]))[:, 0].T
+    assert torch.allclose(picture[:, 5, 3], bright, atol=1e-5), "covering counts for nothing"
+    assert torch.allclose(picture[:, 7, 15], dark, atol=1e-5)
+    assert picture[:, 0].abs().max() == 0
+
+
+def test_depth_of_nothing():
+    assert depth_colours(torch.zeros(4, 4), torch.zeros(4, 4)) == (pytest.approx(torch.zeros(3, 4, 4)), [])
