@@ -35,6 +35,8 @@ MEANING = {
 }
 VIEW, ZOOM, SIDE = "test_003", 4, (320, 240)
 """What is shown: a test view, and of it so many times as fine a window of that size, in the middle."""
+SOURCE = "<!-- figures: benchmarks/results/gallery_cpu.json gallery -->"
+"""Above figures: where they are from."""
 COLUMNS = [
     ["backbone", "backbone"],
     ["x1", "PSNR x1, dB"],
@@ -89,13 +91,11 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "",
         "Every backbone with its defaults, trained on the built-in scene from the command line (`gsx backbone=NAME`):",
         "a view that it never saw, and the middle of it four times as fine, which is detail that no photograph showed.",
-        "",
-        "<!-- gallery: written by benchmarks/gallery.py -->",
     ]
     for entry in rows:
         name = entry["backbone"]
-        lines += ["", f"## {name}", f"{MEANING[name]}: {entry['x1']:.2f} dB at x1, {entry['x4']:.2f} dB at x4, "
-                  f"{entry['primitives']:,} primitives.", "", pictures(name)]  # fmt: skip
+        figures = f"{entry['x1']:.2f} dB at x1, {entry['x4']:.2f} dB at x4, {entry['primitives']:,} primitives"
+        lines += ["", f"## {name}", "", SOURCE, f"{MEANING[name]}: {figures}.", "", pictures(name)]
     lines += ["", "## The truth", "", pictures("truth"), "", NOTE, ""]
     return "\n".join(lines)
 

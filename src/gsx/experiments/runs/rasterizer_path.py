@@ -2,13 +2,16 @@
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from threading import Thread
 
 import torch
 
 from gsx.core.data.camera import look_at
+from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.available import available, compiles
 
 logger = logging.getLogger(__name__)
@@ -43,6 +46,27 @@ def compile_now(settings: RasterSettings, device: torch.device) -> float:
     camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
     rasterize(splats, camera, replace(settings, training_focal=0.0)).image.sum().backward()  # as a camera of training
     return time.perf_counter() - begun
+
+
+def compile_beside(settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]) -> Thread:
+    """Have what draws pictures compiled in a thread, and hand over the settings by which that is used; nothing where
+    nothing compiles. Until then pictures are drawn by the eager path."""
+    compiled = replace(settings, path="compiled")
+
+    def draw_one() -> None:
+        splats = Splats(**{name: value.detach() for name, value in vars(warm_splats(device)).items()})
+        camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
+        try:
+            rasterize_tiled(splats, camera, compiled, background=torch.zeros(3, device=device))
+        except Exception as error:  # a compiler's; pictures come all the same
+            logger.info("pictures are drawn by the eager path (%s)", first_line(error))
+        else:
+            take(compiled)
+
+    thread = Thread(target=draw_one, name="compiling", daemon=True)
+    if settings.path != "eager" and available(device.type):
+        thread.start()
+    return thread
 
 
 def warm_splats(device: torch.device) -> Splats:

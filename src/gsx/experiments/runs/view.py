@@ -8,10 +8,12 @@ from pathlib import Path
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.plugins import Plugins
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.rasterizer_path import compile_beside
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.pictures import FileModel, RunModel
 from gsx.experiments.viewer.server import Viewer
@@ -26,7 +28,9 @@ class Watched:
 
     def __init__(self, folder: Path, plugins: Plugins) -> None:
         self.run, self.settings = open_run(folder, plugins)
-        self.run.raster = replace(self.run.raster, path="eager")  # compiling takes longer than most looks
+        asked = self.run.raster
+        self.run.raster = replace(asked, path="eager")  # the first pictures come at once
+        self.compiling = compile_beside(asked, self.run.device, self.faster)
         self.looked = time.monotonic()
 
     def refresh(self) -> bool:
@@ -43,6 +47,10 @@ class Watched:
             return False
         self.run.curves = read_curves(self.run.folder)
         return True
+
+    def faster(self, raster: RasterSettings) -> None:
+        """Draw by these rules from now on."""
+        self.run.raster = raster
 
     def told(self) -> str:
         """How it stands, in words."""

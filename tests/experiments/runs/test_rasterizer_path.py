@@ -1,0 +1,53 @@
+"""Compiling beside what is drawn: the settings are handed over when that is done, and only then."""
+
+from threading import Event
+
+import pytest
+import torch
+
+from gsx.core.rasterizer import RasterSettings
+from gsx.experiments.runs import rasterizer_path
+from gsx.experiments.runs.rasterizer_path import compile_beside
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def compiler(monkeypatch):
+    """A compiler that there is, and what it makes of the picture that has everything compiled."""
+    monkeypatch.setattr(rasterizer_path, "available", lambda _: True)
+
+    def set_to(draw):
+        monkeypatch.setattr(rasterizer_path, "rasterize_tiled", draw)
+
+    return set_to
+
+
+def test_compiled_settings_come_when_the_picture_is_drawn(compiler):
+    let, taken, drawn = Event(), [], []
+    compiler(
+        lambda splats, camera, settings, background: (drawn.append((len(splats.means), settings.path)), let.wait(30))
+    )
+    thread = compile_beside(RasterSettings(dilation=0.1, path="auto"), CPU, taken.append)
+    assert taken == []
+    let.set()
+    thread.join(30)
+    assert taken == [RasterSettings(dilation=0.1, path="compiled")]
+    assert drawn == [(rasterizer_path.WARM_SPLATS, "compiled")]
+
+
+def test_a_compiler_that_fails_changes_nothing(compiler, caplog):
+    def fail(*_, **__):
+        raise RuntimeError("no such instruction")
+
+    compiler(fail)
+    taken = []
+    with caplog.at_level("INFO"):
+        compile_beside(RasterSettings(path="auto"), CPU, taken.append).join(30)
+    assert taken == []
+    assert "eager path (no such instruction)" in caplog.text
+
+
+def test_who_asks_for_the_eager_path_keeps_it(compiler):
+    compiler(lambda *_, **__: pytest.fail("compiled"))
+    assert not compile_beside(RasterSettings(path="eager"), CPU, pytest.fail).is_alive()
