@@ -261,3 +261,24 @@ def test_a_damaged_photograph_is_told_before_a_folder_exists(
     for name in ("one", "two"):
         assert main([*command, f"folder={tmp_path / name}"]) == 0
     assert sorted(looked) == photographs, "each is looked at once for both runs"
+
+
+@pytest.mark.parametrize(
+    "change", [{"step": -1}, {"step": 5}, {"step": True}, {"seconds": -1.0}, {"seconds": 10**400}, {"orders": -3}]
+)
+def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    """The digest is that of the tensors: numbers beside it are looked at by themselves."""
+    from gsx.core.training.checkpoint import sound, step_of
+
+    sidecar = tmp_path / "step_0000004.json"
+    meta = {"step": 4, "seconds": 0.5, "orders": 1, "sampler": [0, 1], "views": {"train": ["a", "b"], "test": ["c"]}}
+    assert sound(meta, step_of(sidecar))
+    assert not sound(meta | change, step_of(sidecar))
+
+
+def test_other_files_beside_checkpoints_are_none(tmp_path: Path) -> None:
+    from gsx.core.training.checkpoint import sidecars
+
+    for name in ("step_0000004.json", "step_copy.json", "step_.json"):
+        (tmp_path / name).write_text("{}")
+    assert [path.name for path in sidecars(tmp_path)] == ["step_0000004.json"]

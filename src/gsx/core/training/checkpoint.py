@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 SCHEMA = 1
 GENERATOR = "run.generator"
+LONGEST = 1e12
+"""Seconds that no training takes."""
 
 
 def save(run: Run) -> Path:
@@ -76,7 +78,7 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
 
 def sidecars(folder: Path) -> list[Path]:
     """Sidecars of a checkpoint folder, oldest first."""
-    return sorted(folder.glob("step_*.json"))
+    return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdigit())
 
 
 def step_of(sidecar: Path) -> int:
@@ -107,7 +109,7 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
         raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
-    if not sound(meta):
+    if not sound(meta, step_of(sidecar)):
         raise CheckpointError(f"checkpoint {sidecar} is not what gsx writes: remove it to use an older one")
     try:
         return meta, from_bytes(data)
@@ -115,13 +117,15 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
 
 
-def sound(meta: dict[str, Any]) -> bool:
-    """Whether a sidecar has the form that `write` gives it."""
+def sound(meta: dict[str, Any], step: int) -> bool:
+    """Whether a sidecar has the form that `write` gives that of a step."""
     views, order = meta.get("views"), meta.get("sampler")
     if not (isinstance(views, dict) and isinstance(order, list)):
         return False
     named = all(is_list_of(str, views.get(part)) for part in ("train", "test"))
-    numbers = isinstance(meta.get("step"), int) and isinstance(meta.get("seconds"), int | float)
+    seconds, orders = meta.get("seconds"), meta.get("orders", 0)
+    timed = isinstance(seconds, int | float) and 0 <= seconds < LONGEST
+    numbers = meta.get("step") == step and timed and isinstance(orders, int) and orders >= 0
     return named and numbers and is_list_of(int, order) and all(0 <= view < len(views["train"]) for view in order)
 
 
