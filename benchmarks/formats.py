@@ -2,7 +2,8 @@
 
 Each run is exported to every format, which is read back and rendered from its test views. Independent readers are asked
 where they are: `--splat-transform PROGRAM` (npm's @playcanvas/splat-transform: turns the file into a plain PLY, which
-is rendered), trimesh (GLB: number of positions and their bounds). Models without a standard form are baked.
+is rendered), gsply (the same, of PLY, compressed PLY and SPZ), trimesh (GLB: number of positions and their bounds).
+Models without a standard form are baked.
 """
 
 import argparse
@@ -48,6 +49,8 @@ COLUMNS = [
     ["lost", "dB lost"],
     ["reader", "read by"],
     ["reader_alike", "its reading against the model, dB"],
+    ["second", "and by"],
+    ["second_alike", "its reading, dB"],
 ]
 NOTE = (
     "PSNR of renders from five test views, mean: of what is read back against the model's own, and against the "
@@ -90,7 +93,7 @@ def row(run: Run, name: str, path: Path, own: list[torch.Tensor], best: float, p
         "run": name, "format": path.name.removeprefix("model"), "splats": len(read.means),
         "bytes": size / len(read.means), "megabytes": size / 1e6, "seconds": seconds, "alike": mean(images, own),
         "truth": truth, "lost": best - truth, "baked": written.baked,
-    } | by_another(run, path, written, own, program)  # fmt: skip
+    } | by_another(run, path, written, own, program) | by_gsply(run, path, own)  # fmt: skip
 
 
 def pictures(run: Run, gaussians: Gaussians) -> list[torch.Tensor]:
@@ -122,6 +125,21 @@ def by_another(run: Run, path: Path, written: Exported, own: list[torch.Tensor],
         again = half_turn(again)
     reader = (told.stdout + told.stderr).split(" (")[0].strip()
     return {"reader": reader, "reader_alike": mean(pictures(run, again), own)}
+
+
+def by_gsply(run: Run, path: Path, own: list[torch.Tensor]) -> dict[str, Any]:
+    """What gsply makes of a file, written again as a plain PLY; nothing where it is not installed, or reads no such."""
+    if find_spec("gsply") is None or path.suffix not in (".ply", ".spz"):
+        return {}
+    import gsply
+
+    plain = path.with_name("by_gsply.ply")
+    gsply.plywrite(plain, gsply.read_spz(path) if path.suffix == ".spz" else gsply.plyread(path))
+    again = read_gaussians(plain)
+    turns = {"as told": again, "turned": half_turn(again)} if path.suffix == ".spz" else {"": again}
+    found = {how: mean(pictures(run, gaussians), own) for how, gaussians in turns.items()}
+    how = max(found, key=found.__getitem__)
+    return {"second": f"gsply {version('gsply')}{f', {how}' if how else ''}", "second_alike": found[how]}
 
 
 def half_turn(gaussians: Gaussians) -> Gaussians:

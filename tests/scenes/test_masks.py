@@ -34,10 +34,14 @@ def places(mask, value=False):
 
 def test_a_reduced_pixel_counts_where_nothing_it_was_made_from_is_masked(tmp_path):
     mask = Mask(path=stored_mask(tmp_path / "m.png", [(0, 7)]))
-    assert places(mask.reduced(8, 8, "bicubic")) == {(0, 7)}, "as it is"
-    assert places(mask.reduced(4, 4, "area")) == {(0, 3)}
-    assert places(mask.reduced(4, 4, "bicubic")) == {(row, column) for row in range(3) for column in (1, 2, 3)}
-    assert places(mask.reduced(16, 16, "bicubic")) == {(0, 14), (0, 15), (1, 14), (1, 15)}, "larger than the mask"
+    whole = (8, 8)
+    assert places(mask.reduced(8, 8, "bicubic", whole)) == {(0, 7)}, "as it is"
+    assert places(mask.reduced(4, 4, "area", whole)) == {(0, 3)}
+    assert places(mask.reduced(4, 4, "bicubic", whole)) == {(row, column) for row in range(3) for column in (1, 2, 3)}
+    enlarged = {(0, 14), (0, 15), (1, 14), (1, 15)}
+    assert places(mask.reduced(16, 16, "bicubic", (16, 16))) == enlarged, "a mask half as fine as its photograph"
+    assert len(places(mask.reduced(4, 4, "bicubic", (16, 16)))) == 9, "whose own size says nothing of the filter"
+    assert places(mask.reduced(1, 1, "area", whole)) == {(0, 0)}
 
 
 def test_no_masked_pixel_reaches_a_counted_one_through_any_filter(tmp_path):
@@ -46,12 +50,12 @@ def test_no_masked_pixel_reaches_a_counted_one_through_any_filter(tmp_path):
 
     generator = torch.Generator().manual_seed(0)
     for filter in ("area", "bicubic", "lanczos"):
-        excluded = torch.rand(40, 56, generator=generator) < 0.01
+        excluded = torch.rand(40, 56, generator=generator) < 0.002
         mask = Mask(path=stored_mask(tmp_path / f"{filter}.png", excluded.nonzero().tolist(), (40, 56)))
         one = torch.randint(0, 256, (3, 40, 56), generator=generator, dtype=torch.uint8)
         other = torch.where(excluded, 255 - one, one)
-        for width, height in ((56, 40), (28, 20), (17, 11)):
-            counted = mask.reduced(width, height, filter)[0]
+        for width, height in ((56, 40), (57, 41), (28, 20), (17, 11)):
+            counted = mask.reduced(width, height, filter, (56, 40))[0]
             same = (resize(one, width, height, filter) == resize(other, width, height, filter)).all(0)
             assert bool(same[counted].all()), (filter, width)
             assert 0 < counted.float().mean() < 1
@@ -61,7 +65,7 @@ def test_alpha_counts_where_opaque(tmp_path):
     picture = torch.full((4, 4, 4), 255, dtype=torch.uint8)
     picture[3, 0, 0], picture[3, 1, 1] = 0, 254
     write_image(tmp_path / "a.png", picture)
-    assert places(Mask(path=tmp_path / "a.png", alpha=True).reduced(4, 4, "area")) == {(0, 0), (1, 1)}
+    assert places(Mask(path=tmp_path / "a.png", alpha=True).reduced(4, 4, "area", (4, 4))) == {(0, 0), (1, 1)}
 
 
 def test_figures_are_over_what_counts():
@@ -81,6 +85,46 @@ def test_figures_are_over_what_counts():
 def test_where_a_mask_may_lie(tmp_path):
     names = [str(path.relative_to(tmp_path)) for path in candidates(tmp_path, "images/a.jpg")]
     assert {"images/a.jpg.png", "images/a.jpg", "images/a.png", "a.jpg.png", "a.png"} <= set(names)
+
+
+def test_a_photograph_is_not_its_own_mask(tmp_path):
+    """Names in a file of poses may be whole paths, or lead out of the folder."""
+    for name in ("/abs/images/0.png", "../images/0.png"):
+        assert all(path.is_relative_to(tmp_path) and ".." not in path.parts for path in candidates(tmp_path, name))
+
+
+def test_no_masked_pixel_reaches_a_counted_one_through_undistortion(tmp_path, monkeypatch):
+    """Two photographs through a bent lens that differ where they are masked alone."""
+    import pycolmap
+
+    from gsx.scenes.undistort import StoredUndistortion, pinhole_of, undistort
+
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=120, height=80, params=[90.0, 60.0, 40.0, -0.08])
+    pinhole, size = pinhole_of(lens), (112, 76)
+    generator = torch.Generator().manual_seed(1)
+    excluded = torch.rand(80, 120, generator=generator) < 0.003
+    path = stored_mask(tmp_path / "m.png", excluded.nonzero().tolist(), (80, 120))
+    mask = Mask(path=path, remap=StoredUndistortion(path, lens, pinhole, size))
+    one = torch.randint(0, 256, (3, 80, 120), generator=generator, dtype=torch.uint8)
+    straight = [undistort(photo, lens, pinhole, size) for photo in (one, torch.where(excluded, 255 - one, one))]
+    counted = mask.reduced(*size, "bicubic", size)[0]
+    assert bool((straight[0] == straight[1]).all(0)[counted].all())
+    assert 0.5 < counted.float().mean() < 1
+
+
+def test_masks_of_another_shape_are_refused(tmp_path):
+    write_scene(synthesize(frames=3), tmp_path)
+    for photo in sorted((tmp_path / "images").rglob("*.*")):
+        stored_mask(tmp_path / "masks" / f"{photo.relative_to(tmp_path / 'images')}.png", [], (64, 48))
+    with pytest.raises(InputError, match=r"64 x 48|48 x 64"):
+        trained(tmp_path, tmp_path / "run")
+
+
+def test_alpha_of_opaque_photographs_is_told(tmp_path):
+    write_scene(synthesize(frames=3), tmp_path)
+    with pytest.raises(InputError, match="no photograph has alpha"):
+        trained(tmp_path, tmp_path / "run", "scene.masks=alpha")
 
 
 @pytest.fixture(scope="module")

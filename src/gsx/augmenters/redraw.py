@@ -135,7 +135,6 @@ class Redrawer:
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
         photo = self.options.base_source == "photo"
-        whole = Window(0, 0, *view.camera.size)
         picture = photographed(run, view, whole, view.camera) if photo else render(run, view.camera).image
         reduction = run.scene.reduction if photo else Reduction()  # Mipmap-GS: bilinear, which is the mean of four
         target = to_uint8(reduction.reduce(Window(0, 0, *covered.size).cut(picture), factor))

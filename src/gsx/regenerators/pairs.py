@@ -21,13 +21,15 @@ def held_out_pairs(context: RegeneratorContext, share: float) -> list[Pair]:
     photograph does not count shows the render, so that nothing is learnt there."""
     renders = context.held_out(share)
     shown = zip(renders, context.views, strict=True)
-    return [(render, where_counted(view.image(), render, view.counted())) for render, view in shown]
+    return [(render, where_counted(view.image(), render.cpu(), view.counted())) for render, view in shown]
 
 
 def with_own(pairs: Sequence[Pair], context: RegeneratorContext, numbers: Sequence[int]) -> list[Pair]:
     """The pairs of training views of these numbers, and beside some of them the run's own renders."""
-    own = [(context.render(context.views[n].camera).cpu(), pairs[n][1]) for n in numbers[::OWN_EVERY]]
-    return [*(pairs[number] for number in numbers), *own]
+    views = [context.views[number] for number in numbers[::OWN_EVERY]]
+    own = [(context.render(view.camera).cpu(), view) for view in views]
+    learnt = [(render, where_counted(view.image(), render, view.counted())) for render, view in own]
+    return [*(pairs[number] for number in numbers), *learnt]
 
 
 def random_part(pairs: Sequence[Pair], size: tuple[int, int], generator: torch.Generator) -> Pair:

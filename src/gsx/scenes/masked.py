@@ -5,8 +5,10 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from gsx.core.data.images import checked_size, has_alpha
 from gsx.core.data.masks import Mask
 from gsx.core.data.photo_source import PhotoSource
+from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.files import is_file
@@ -22,12 +24,14 @@ MASKS = ("auto", "alpha", "none")
 instead of compositing the rest. `none`: all pixels count."""
 
 
-def mask_of(photo: Path, name: str, given: Path | None, remap: Callable | None, options: SceneOptions) -> Mask | None:
-    """The mask of a photograph of that name; None: it has none.
+def mask_of(
+    photo: Path, name: str, given: Path | None, remap: Callable | None, expected: Size | None, options: SceneOptions
+) -> Mask | None:
+    """The mask of a photograph of that name; None: it has none. `expected`: (width, height) of the whole photograph.
 
     Raises:
         ConfigError: scene.masks has no such value.
-        InputError: a mask that the scene names is not there.
+        InputError: a mask that the scene names is not there, or has another shape than its photograph.
     """
     if options.masks not in MASKS:
         raise ConfigError(
@@ -36,10 +40,15 @@ def mask_of(photo: Path, name: str, given: Path | None, remap: Callable | None, 
     if options.masks == "none":
         return None
     if options.masks == "alpha":
-        return Mask(path=photo, alpha=True, remap=remap)
+        return Mask(path=photo, alpha=True, remap=remap) if has_alpha(photo) else None
     if given is not None and not is_file(given):
         raise InputError(f"The mask '{given}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
-    path = given or next(filter(is_file, candidates(folder_of(options), name)), None)
+    found = (
+        path for path in candidates(folder_of(options), name) if is_file(path) and path.resolve() != photo.resolve()
+    )
+    path = given or next(found, None)
+    if path is not None and expected is not None:
+        checked_size(path, expected)
     bent = replace(remap, photo=path) if path is not None and isinstance(remap, StoredUndistortion) else None
     return None if path is None else Mask(path=path, remap=bent)
 
@@ -48,13 +57,14 @@ def folder_of(options: SceneOptions) -> Path:
     """Where masks are looked for: in the scene's folder, or beside it where that may be the photographs' own."""
     path = Path(options.path).expanduser()
     own, beside = path / FOLDER, path.parent / FOLDER
-    return beside if not own.is_dir() and not (path / IMAGES).is_dir() else own
+    photographs = options.name == "photos" and not (path / IMAGES).is_dir()
+    return beside if photographs and not own.is_dir() else own
 
 
 def candidates(folder: Path, name: str) -> list[Path]:
     """Files that may be the mask of a photograph: NAME.png (COLMAP), NAME, or NAME with another suffix; below the same
     folders, or without the first of them."""
-    parts = PurePosixPath(name).parts
+    parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     names = dict.fromkeys(PurePosixPath(*parts[first:]) for first in range(min(len(parts), 2)))
     forms = [(f"{one}.png", str(one), str(one.with_suffix(".png")), str(one.with_suffix(".jpg"))) for one in names]
     return [folder / form for several in forms for form in several]
@@ -70,6 +80,10 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
     if found:
         where = "alpha" if options.masks == "alpha" else "masks"
         return [f"What the {where} of {found} of {len(views)} photographs leave out counts in no loss and no figure."]
+    if options.masks == "alpha":
+        raise InputError(
+            "scene.masks=alpha, but no photograph has alpha: leave it out, or give files in a folder 'masks'"
+        )
     own = folder.parent == Path(options.path).expanduser()
     if options.masks == "auto" and own and folder.is_dir() and any(map(is_file, folder.rglob("*.*"))):
         raise InputError(

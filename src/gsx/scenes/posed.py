@@ -235,7 +235,7 @@ def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache
         whole=whole,
         expected_size=shot.expected_size,
         remap=shot.remap,
-        mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, options),
+        mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, shot.expected_size, options),
     )
     return View(shot.name, whole.resize(*size), source)
 

@@ -65,6 +65,18 @@ def image_size(path: str | Path, *, upright: bool = False) -> Size:
     return (spec.height, spec.width) if swapped else (spec.width, spec.height)
 
 
+def has_alpha(path: str | Path) -> bool:
+    """Whether an image has an alpha channel, from the header alone.
+
+    Raises:
+        InputError: the file is missing or is no image.
+    """
+    reader = _open(Path(path))
+    alpha = reader.spec().alpha_channel
+    reader.close()
+    return alpha >= 0
+
+
 def checked_size(path: str | Path, expected: Size) -> Size:
     """`image_size`, provided that the image is what the camera model was made for, or a uniform reduction of it.
 

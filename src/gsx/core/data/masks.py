@@ -10,16 +10,18 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import adaptive_max_pool2d, max_pool2d
 
 from gsx.core.data.images import read_image
-from gsx.core.data.resize import REACH, resize
+from gsx.core.data.resize import REACH
 from gsx.core.shapes import Bool, Float, UInt8
 
 WHITE = 128
 """Values of a mask from here on count: lossy formats leave no exact white."""
 OPAQUE = 255
 """Alpha that counts: less shows what is behind."""
+INTERPOLATED = 2
+"""Pixels that undistortion takes from on each side (Keys' cubic)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,27 +34,31 @@ class Mask:
     remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]] | None = None
     """What is done to the photograph, undistortion for example."""
 
-    def read(self) -> Bool[Tensor, "1 H W"]:
-        """Which pixels count, on the mask's own raster, undistorted.
+    def masked(self) -> Bool[Tensor, "1 H W"]:
+        """Which pixels do not count, on the mask's own raster, undistorted; with all that interpolation took from them.
 
         Raises:
             InputError: the file cannot be read.
         """
         picture = read_image(self.path)
-        if self.remap is not None:
-            picture = self.remap(picture)
-        if not self.alpha:
-            return picture[:1] >= WHITE
-        return picture[3:] >= OPAQUE if len(picture) == 4 else torch.ones_like(picture[:1], dtype=torch.bool)
+        if self.alpha:
+            picture = picture if self.remap is None else self.remap(picture)
+            out = picture[3:] < OPAQUE if len(picture) == 4 else torch.zeros_like(picture[:1], dtype=torch.bool)
+            return out if self.remap is None else grown(out, INTERPOLATED)
+        out = picture[:1] < WHITE
+        if self.remap is None:
+            return out
+        return grown(self.remap((out * 255).to(torch.uint8).repeat(3, 1, 1))[:1] > 0, INTERPOLATED)
 
-    def reduced(self, width: int, height: int, filter: str) -> Bool[Tensor, "1 height width"]:
-        """Which pixels of the photograph count once it is resized by a filter (`resize.FILTERS`)."""
-        masked = ~self.read()
-        smaller = masked.shape[2] > width or masked.shape[1] > height
-        touched = resize(masked.to(torch.uint8) * 255, width, height, "area") > 0
-        reach = REACH.get(filter, 0) if smaller else 0
-        spread = max_pool2d(touched.float()[None], 2 * reach + 1, 1, reach)[0]
-        return spread == 0
+    def reduced(self, width: int, height: int, filter: str, whole: tuple[int, int]) -> Bool[Tensor, "1 height width"]:
+        """Which pixels count of a photograph of the size `whole` resized by a filter (`resize.FILTERS`)."""
+        touched = adaptive_max_pool2d(self.masked().float()[None], (height, width))[0] > 0
+        return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
+
+
+def grown(masked: Bool[Tensor, "1 H W"], reach: int) -> Bool[Tensor, "1 H W"]:
+    """With all pixels within `reach` of a masked one."""
+    return max_pool2d(masked.float()[None], 2 * reach + 1, 1, reach)[0] > 0
 
 
 def where_counted(

@@ -55,7 +55,7 @@ class PhotoSource:
             return None
         window, width, height = self.window_of(camera)
         mask, made_by = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
-        counted = self.cache.get(made_by, lambda: mask.reduced(width, height, self.rule.filter))
+        counted = self.cache.get(made_by, lambda: mask.reduced(width, height, self.rule.filter, self.whole.size))
         if not counted.any():
             raise InputError(f"The mask '{mask.path}' leaves nothing of '{self.path}': remove the photograph.")
         return window.cut(counted)[0]

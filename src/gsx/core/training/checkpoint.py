@@ -78,7 +78,7 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
 
 def sidecars(folder: Path) -> list[Path]:
     """Sidecars of a checkpoint folder, oldest first."""
-    return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdigit())
+    return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdecimal())
 
 
 def step_of(sidecar: Path) -> int:

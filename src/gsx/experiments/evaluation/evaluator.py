@@ -252,7 +252,8 @@ class Evaluator:
                 elif zoomed := self.zoomed(view, factor):
                     figures.append(self.zoom_figures(zoomed))
                     shown = {name: getattr(zoomed, name) for name in DETAIL_OF}
-                    details[factor].append(details_of(shown, zoomed.truth, factor))
+                    whole = zoomed.counted is None  # the border of a mask would be detail
+                    details[factor].append(details_of(shown, zoomed.truth, factor) if whole else {})
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")

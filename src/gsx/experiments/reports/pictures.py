@@ -14,12 +14,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.data.images import write_image
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import blacked, grown
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.files import write_json
 from gsx.core.quality.metrics import psnr
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.experiments.evaluation.evaluator import Zoomed
 
 SHOWN = 6
@@ -91,7 +91,10 @@ class Pictures:
         """The window with most detail: truth, render and the x1 render resized."""
         if number not in self.shown:
             return
-        window = most_detailed(zoomed.truth, WINDOW)
+        window, counted = most_detailed(zoomed.truth, WINDOW, zoomed.counted), zoomed.counted
+        inside = None if counted is None else window.cut(counted[None])[0]
+        if inside is not None and not inside.any():
+            return
         whole = {"truth": zoomed.truth, "render": zoomed.render, "enlarged": zoomed.enlarged}
         images = {kind: window.cut(image) for kind, image in whole.items()}
         stem = f"{self.names[number]}.x{zoomed.factor:g}"
@@ -100,8 +103,8 @@ class Pictures:
                 "view": zoomed.view.name,
                 "factor": zoomed.factor,
                 "window": [window.left, window.top, window.width, window.height],
-                "psnr": psnr(images["render"], images["truth"]),
-                "enlarged_psnr": psnr(images["enlarged"], images["truth"]),
+                "psnr": psnr(images["render"], images["truth"], inside),
+                "enlarged_psnr": psnr(images["enlarged"], images["truth"], inside),
                 "files": {kind: self.save(f"{stem}.{kind}", image, True) for kind, image in images.items()},
             }
         )
@@ -179,10 +182,14 @@ def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
     return interpolate(image[None], size=size, mode="bilinear", antialias=True)[0].clamp(0, 1)
 
 
-def most_detailed(image: Float[Tensor, "3 H W"], edge: int) -> Window:
-    """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid."""
+def most_detailed(image: Float[Tensor, "3 H W"], edge: int, counted: Bool[Tensor, "H W"] | None = None) -> Window:
+    """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid; that
+    between pixels that count."""
     height, width = min(edge, image.shape[1]), min(edge, image.shape[2])
-    cells = avg_pool2d(gradient_energy(image)[None], WINDOW_STEP, ceil_mode=True)
+    energy = gradient_energy(image)
+    if counted is not None:
+        energy = energy * ~grown(~counted[None], 1)[0]
+    cells = avg_pool2d(energy[None], WINDOW_STEP, ceil_mode=True)
     reach = [min(edge // WINDOW_STEP, size) for size in cells.shape[1:]]
     means = avg_pool2d(cells, reach, stride=1)[0]
     row, column = divmod(int(means.argmax()), means.shape[1])

@@ -324,7 +324,9 @@ def pages_of(folder: Path) -> list[str]:
 def with_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:
     """An entry of renders/index.json with its pictures embedded; None for files that are gone."""
     images = {kind: embedded(run.folder / "renders" / Path(file).name) for kind, file in part(entry, "files").items()}
-    return entry | {"images": images}
+    depth = entry.get("depth")
+    sound = isinstance(depth, list) and len(depth) == 2 and all(map(is_number, depth))
+    return entry | {"images": images, "depth": depth if sound else []}
 
 
 def with_pseudo_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:

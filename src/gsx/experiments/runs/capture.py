@@ -50,12 +50,11 @@ def capture_lines(scene: Scene) -> Iterator[str]:
     photos = [view.source.path for view in views if isinstance(view.source, PhotoSource)]
     if photos:
         yield sharpness_line(list(dict.fromkeys(photos)))
-    gains = exposures(views, scene.points)
-    if gains is not None:
+    gains = exposures(views, scene.points) if len(scene.points) else None
+    if gains is not None:  # else points are not the scene's: random ones, for example
         yield exposure_line(views, gains)
-    points = scene.points.positions[:: max(1, len(scene.points) // POINTS)]
-    seen = torch.stack([in_view(view.camera, points) for view in views])
-    yield coverage_line(views, seen)
+        points = scene.points.positions[:: max(1, len(scene.points) // POINTS)]
+        yield coverage_line(views, torch.stack([in_view(view.camera, points) for view in views]))
     around = ring(views)
     if around is not None:
         yield ring_line(views, around)

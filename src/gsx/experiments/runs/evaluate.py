@@ -4,6 +4,7 @@ import logging
 import time
 from typing import Any
 
+from gsx.core.errors import InputError, first_line
 from gsx.core.files import write_json
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
@@ -25,8 +26,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
-    add_depth(run, pictures)
-    add_flight(run, pictures)
+    embellish(run, pictures, options.tile_pixels)
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
@@ -35,6 +35,15 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)
     return evaluation
+
+
+def embellish(run: Run, pictures: Pictures, pixels: int) -> None:
+    """Depth and a flight for the report; if they cannot be drawn, what was measured is kept all the same."""
+    try:
+        add_depth(run, pictures, pixels)
+        add_flight(run, pictures, pixels)
+    except (RuntimeError, InputError, MemoryError) as error:
+        logger.warning("the report has no depth or flight (%s)", first_line(error))
 
 
 def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:

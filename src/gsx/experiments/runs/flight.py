@@ -1,5 +1,7 @@
 """What a report shows beside held-out pictures: their depth, and a flight into the finest detail."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -25,12 +27,13 @@ ENOUGH = 1_000_000
 """Pixels that tell these."""
 
 
-def add_depth(run: Run, pictures: Pictures) -> None:
+def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
     """Beside each view that is shown its depth, near bright, far dark, black where nothing is."""
+    rules = replace(run.raster, path="eager")  # a picture with depth would be compiled for by itself
     for number, entry in zip(sorted(pictures.shown), pictures.views, strict=True):
         camera = run.scene.test[number].camera
         splats = splats_for(run, camera)
-        drawn = rasterize_tiled(splats, camera, run.raster, background=run.background, depth=True)
+        drawn = rasterize_tiled(splats, camera, rules, background=run.background, depth=True, pixels=pixels)
         assert drawn.depth is not None
         picture, limits = depth_colours(drawn.depth, drawn.alpha)
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
@@ -52,13 +55,13 @@ def depth_colours(
     return picture, [1 / near, 1 / far]
 
 
-def add_flight(run: Run, pictures: Pictures) -> None:
+def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
     """A strip of frames, one below the other, from a whole view into its most detailed window."""
     number = min(pictures.shown)
     view = run.scene.test[number]
     place, zoom = goal(view, pictures)
-    frames = [render(run, camera).image for camera in flight(view.camera, place, zoom)]
-    file = pictures.save("flight.render", torch.cat(frames, 1), lossy=True)
+    frames = [render(run, camera, pixels).image for camera in flight(view.camera, place, zoom)]
+    file = pictures.save("_flight.render", torch.cat(frames, 1), lossy=True)
     height, width = frames[0].shape[1:]
     pictures.flight = {"view": view.name, "file": file, "frames": FRAMES, "size": [width, height], "zoom": zoom}
 

@@ -57,6 +57,8 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
         splats = Splats(**{name: value.detach() for name, value in vars(warm_splats(device)).items()})
         camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
         try:
+            if not available(device.type):
+                return
             rasterize_tiled(splats, camera, compiled, background=torch.zeros(3, device=device))
         except Exception as error:  # a compiler's; pictures come all the same
             logger.info("pictures are drawn by the eager path (%s)", first_line(error))
@@ -64,7 +66,7 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
             take(compiled)
 
     thread = Thread(target=draw_one, name="compiling", daemon=True)
-    if settings.path != "eager" and available(device.type):
+    if settings.path != "eager":
         thread.start()
     return thread
 

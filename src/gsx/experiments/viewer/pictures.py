@@ -134,10 +134,10 @@ Model = RunModel | FileModel
 
 
 def filtered(raster: RasterSettings, name: str) -> RasterSettings:
-    """Rules of the rasterizer with another screen filter."""
+    """Rules of the rasterizer with another screen filter; eager, since nobody waits for a compiler to look once."""
     if name == "as trained":
         return raster
-    return replace(raster, dilation=0.3, compensate=name == "compensated", zoomed="plain", pixel="sample")
+    return replace(raster, dilation=0.3, compensate=name == "compensated", zoomed="plain", pixel="sample", path="eager")
 
 
 def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float) -> Splats:
