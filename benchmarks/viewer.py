@@ -142,6 +142,7 @@ def looked_at(name: str, when: str, words: Sequence[str], patience: float = 0.0)
         told = page.value("document.body.innerText")
         gaps = [after - before for before, after in itertools.pairwise(moving)]
         found = re.search(r"step [\d,]+ of [\d,]+, [\d,]+ primitives", told)
+        sys.stderr.writelines(f"console: {said}\n" for said in page.said)
         return {
             "run": name,
             "when": when.replace("_", " "),
@@ -149,14 +150,8 @@ def looked_at(name: str, when: str, words: Sequence[str], patience: float = 0.0)
             "rate": len(moving) / MOVING,
             "gap": max(gaps, default=MOVING),
             "sharp": sharp,
-            "console": len([said for said in page.said if told_of_page(said)]),
+            "console": len(page.said),
         }
-
-
-def told_of_page(said: str) -> bool:
-    """Whether a line of the console is about the page, which is told."""
-    sys.stderr.write(f"console: {said}\n")
-    return True
 
 
 def kept(page: Any, name: str) -> None:

@@ -15,7 +15,7 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import is_file
 from gsx.core.ranges import Range
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.options import SceneOptions
@@ -159,7 +159,7 @@ def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> F
 
 
 def _check_visible(model: Model, cameras: Sequence[Camera]) -> str:
-    visible = torch.stack([_in_view(camera, model.points.positions) for camera in cameras]).any(dim=0)
+    visible = torch.stack([camera.sees(model.points.positions) for camera in cameras]).any(dim=0)
     fraction = float(visible.double().mean())
     if fraction < MIN_VISIBLE_FRACTION:
         raise InputError(
@@ -167,12 +167,6 @@ def _check_visible(model: Model, cameras: Sequence[Camera]) -> str:
             f"{MIN_VISIBLE_FRACTION:.0%} should be): points and poses belong to different reconstructions."
         )
     return f"The model keeps no observations to check the cameras by; {fraction:.0%} of its points are in view."
-
-
-def _in_view(camera: Camera, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-    pixels, depth = camera.project(points)
-    inside = (pixels >= 0) & (pixels <= pixels.new_tensor(camera.size))
-    return inside.all(dim=1) & (depth > 0)
 
 
 def _missing(model: Model, present: Sequence[ModelImage]) -> list[str]:

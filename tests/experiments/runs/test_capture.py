@@ -18,7 +18,6 @@ from gsx.experiments.runs.capture import (
     coverage_line,
     exposure_line,
     exposures,
-    in_view,
     ring,
     ring_line,
     shared,
@@ -156,4 +155,4 @@ def test_a_walk_is_no_ring():
 def test_in_view():
     camera = look_at([0, -4, 0], [0, 0, 0], fov_x=math.pi / 2, width=10, height=10)
     points = torch.tensor([[0.0, 0, 0], [3.9, 0, 0], [4.1, 0, 0], [0, -5, 0]])
-    assert in_view(camera, points).tolist() == [True, True, False, False]
+    assert camera.sees(points).tolist() == [True, True, False, False]

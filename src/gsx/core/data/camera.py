@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 
 NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
 UPRIGHT = 0.05
@@ -117,6 +117,11 @@ class Camera:
             height=height,
             cut_from=replace(frame, left=frame.left + left, top=frame.top + top),
         )
+
+    def sees(self, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Which world points lie in front of it and within its raster, hidden or not."""
+        pixels, depth = self.project(points)
+        return ((pixels >= 0) & (pixels <= pixels.new_tensor(self.size))).all(dim=1) & (depth > 0)
 
     def narrow(self, fraction: float) -> "Camera":
         """The centre `fraction` of the raster at unchanged focal length."""

@@ -55,10 +55,7 @@ class PhotoSource:
             return None
         window, width, height = self.window_of(camera)
         mask, made_by = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
-        counted = self.cache.get(made_by, lambda: mask.reduced(width, height, self.rule.filter, self.whole.size))
-        if not counted.any():
-            raise InputError(f"The mask '{mask.path}' leaves nothing of '{self.path}': remove the photograph.")
-        return window.cut(counted)[0]
+        return window.cut(self.cache.get(made_by, lambda: self._counted(mask, width, height)))[0]
 
     def window_of(self, camera: Camera) -> tuple[Window, int, int]:
         """(what the camera sees of the whole photograph on its raster, width and height of that).
@@ -77,6 +74,12 @@ class PhotoSource:
     def max_zoom(self, camera: Camera) -> float:
         """How many times finer the photograph is than `camera`, with 1% for rounded sizes."""
         return ZOOM_SLACK * self.whole.fx / camera.fx
+
+    def _counted(self, mask: Mask, width: int, height: int) -> Bool[Tensor, "1 height width"]:
+        counted = mask.reduced(width, height, self.rule.filter, self.whole.size)
+        if not counted.any():
+            raise InputError(f"The mask '{mask.path}' leaves nothing of '{self.path}': remove the photograph.")
+        return counted
 
     def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
         image = read_image(self.path)

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from gsx.core.data.camera import Camera, upright
+from gsx.core.data.camera import upright
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import linear_from_display
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.shapes import Bool, Float
+from gsx.experiments.runs.orbit import axes_about, nearest_to_rays
 
 POINTS = 3000
 """Looked at, evenly drawn from all."""
@@ -54,16 +55,10 @@ def capture_lines(scene: Scene) -> Iterator[str]:
     if gains is not None:  # else points are not the scene's: random ones, for example
         yield exposure_line(views, gains)
         points = scene.points.positions[:: max(1, len(scene.points) // POINTS)]
-        yield coverage_line(views, torch.stack([in_view(view.camera, points) for view in views]))
+        yield coverage_line(views, torch.stack([view.camera.sees(points) for view in views]))
     around = ring(views)
     if around is not None:
         yield ring_line(views, around)
-
-
-def in_view(camera: Camera, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-    """Which points lie within a camera's picture, hidden or not."""
-    pixels, depth = camera.project(points)
-    return ((pixels >= 0) & (pixels <= pixels.new_tensor(camera.size))).all(1) & (depth > 0)
 
 
 def seen_colours(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
@@ -77,7 +72,7 @@ def seen_colours(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3
     pixels, _ = view.camera.project(points)
     places = 2 * pixels / pixels.new_tensor(view.camera.size) - 1
     found = grid_sample(planes, places.float()[None, None], align_corners=False)[0, :, 0]
-    usable = in_view(view.camera, points) & (found[3] > 0.5)
+    usable = view.camera.sees(points) & (found[3] > 0.5)
     return torch.where(usable, found[:3] / found[3], torch.nan).T
 
 
@@ -165,15 +160,13 @@ def ring(views: Sequence[View]) -> Ring | None:
     rotations = torch.stack([camera.rotation.double() for camera in cameras])
     centres = torch.stack([camera.centre.double() for camera in cameras])
     axes = rotations[:, 2]
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    middle = torch.linalg.lstsq(across.sum(0), (across @ centres[:, :, None]).sum(0)).solution[:, 0]
+    system, right = nearest_to_rays(centres, axes)
+    middle = torch.linalg.lstsq(system, right[:, None]).solution[:, 0]
     way = middle - centres
     cosines = (axes * way).sum(1) / way.norm(dim=1).clamp(min=1e-12)
     if len(views) < 4 or float(cosines.mean()) < CONVERGING:
         return None
-    up = upright(rotations)
-    east = torch.linalg.cross(up, way[0]) / torch.linalg.cross(up, way[0]).norm().clamp(min=1e-12)
-    north = torch.linalg.cross(east, up)
+    north, east, _ = axes_about(upright(rotations), way[0])
     angles = torch.rad2deg(torch.atan2(way @ east, way @ north))
     order = angles.argsort().tolist()
     sorted_angles = angles[order]

@@ -142,6 +142,14 @@ def scene_depth(
     return float(front.median()) if len(front) else max(extent, 1.0)
 
 
+def nearest_to_rays(
+    centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"]
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """A, b of A x = b, solved by the point nearest to all viewing rays; A is singular where they are parallel."""
+    across = torch.eye(3, dtype=centres.dtype) - forwards[:, :, None] * forwards[:, None, :]
+    return across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0]
+
+
 def look_at_point(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], depth: float
 ) -> tuple[Float[Tensor, "3"], bool]:
@@ -149,10 +157,10 @@ def look_at_point(
 
     Nearly parallel rays meet nowhere: then the point at `depth` in front of the mean camera.
     """
-    across = torch.eye(3, dtype=centres.dtype) - forwards[:, :, None] * forwards[:, None, :]
-    if float(torch.linalg.eigvalsh(across.mean(0))[0]) < PARALLEL:
+    system, right = nearest_to_rays(centres, forwards)
+    if float(torch.linalg.eigvalsh(system / len(centres))[0]) < PARALLEL:
         return centres.mean(0) + depth * forwards.mean(0) / forwards.mean(0).norm(), True
-    point = torch.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0])
+    point = torch.linalg.solve(system, right)
     ahead = ((point - centres) * forwards).sum(1).mean()
     return point, float(ahead) > OUTWARD * depth
 

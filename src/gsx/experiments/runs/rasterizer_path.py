@@ -8,7 +8,7 @@ from threading import Thread
 
 import torch
 
-from gsx.core.data.camera import look_at
+from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
@@ -43,8 +43,9 @@ def compile_now(settings: RasterSettings, device: torch.device) -> float:
     """Draw a small picture forward and backward, so that all loops get compiled; returns the seconds it took."""
     begun = time.perf_counter()
     splats = warm_splats(device)
-    camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
-    rasterize(splats, camera, replace(settings, training_focal=0.0)).image.sum().backward()  # as a camera of training
+    rasterize(
+        splats, warm_camera(), replace(settings, training_focal=0.0)
+    ).image.sum().backward()  # as a camera of training
     return time.perf_counter() - begun
 
 
@@ -55,11 +56,10 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
 
     def draw_one() -> None:
         splats = Splats(**{name: value.detach() for name, value in vars(warm_splats(device)).items()})
-        camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
         try:
             if not available(device.type):
                 return
-            rasterize_tiled(splats, camera, compiled, background=torch.zeros(3, device=device))
+            rasterize_tiled(splats, warm_camera(), compiled, background=torch.zeros(3, device=device))
         except Exception as error:  # a compiler's; pictures come all the same
             logger.info("pictures are drawn by the eager path (%s)", first_line(error))
         else:
@@ -69,6 +69,11 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
     if settings.path != "eager":
         thread.start()
     return thread
+
+
+def warm_camera() -> Camera:
+    """What looks at them."""
+    return look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
 
 
 def warm_splats(device: torch.device) -> Splats:
