@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from tiny import leave_results
 
 from gsx.builtin import plugins
@@ -60,6 +61,16 @@ def test_keys_of_an_old_run_have_their_new_names_wherever_it_is_read(folder: Pat
         assert not {"trunk_at", "trunk_gb", "sh_constant"} & found.keys()
     assert settings.general.disk_cache_gb == 20
     assert renamed({"init": "trunk", "backbone": None}) == {"init": "warm_start", "backbone": None}
+
+
+def test_an_old_run_without_a_form_of_densification_is_one_on_anchors(folder: Path) -> None:
+    path = folder / "config.yaml"
+    config = yaml.safe_load(path.read_text())
+    del config["backbone"]["densification"]
+    path.write_text(yaml.safe_dump(config))
+    run, _ = open_run(folder, plugins())
+    assert len(run.backbone.table) == 31
+    assert run.backbone.options.densification == "anchors"
 
 
 def test_diffusion_models_once_said_by_a_size_whether_results_are_kept() -> None:

@@ -358,7 +358,7 @@ def add_newer_settings(config: Any) -> None:
     density = OmegaConf.select(config, "backbone.clone_split.level_density")
     if isinstance(density, DictConfig) and "gate" in density:
         waits = density.pop("gate")
-        if config.backbone.densification == "clone_split":
+        if config.backbone.get("densification") == "clone_split":
             OmegaConf.update(config, "backbone.quirks.gate", "closed" if waits else "open", force_add=True)
 
 
