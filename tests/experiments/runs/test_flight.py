@@ -1,12 +1,15 @@
 """The flight into the detail, and depth as colours, against hand-worked cameras and distances."""
 
 import itertools
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 from gsx.core.data.camera import look_at
+from gsx.core.errors import InputError, TooManyPairs
 from gsx.experiments.reports.pictures import colour_ramp
+from gsx.experiments.runs import evaluate as evaluation
 from gsx.experiments.runs.flight import FRAMES, LONGEST, depth_colours, flight
 
 CAMERA = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=640, height=480)
@@ -47,6 +50,21 @@ def test_depth_is_coloured_by_its_inverse():
     assert torch.allclose(picture[:, 5, 3], bright, atol=1e-5), "covering counts for nothing"
     assert torch.allclose(picture[:, 7, 15], dark, atol=1e-5)
     assert picture[:, 0].abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "told"), [(TooManyPairs("4 pairs"), True), (MemoryError(), True), (InputError("disk full"), False)]
+)
+def test_what_cannot_be_drawn_is_done_without_and_what_cannot_be_written_ends_the_evaluation(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception, told: bool
+):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(evaluation, "add_depth", fails)
+    with nullcontext() if told else pytest.raises(InputError, match="disk full"):
+        evaluation.embellish(None, None, 1)
+    assert ("no depth or flight" in caplog.text) is told
 
 
 def test_depth_of_nothing():

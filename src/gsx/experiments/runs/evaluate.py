@@ -4,7 +4,7 @@ import logging
 import time
 from typing import Any
 
-from gsx.core.errors import InputError, first_line
+from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
@@ -38,11 +38,15 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
 
 
 def embellish(run: Run, pictures: Pictures, pixels: int) -> None:
-    """Depth and a flight for the report; if they cannot be drawn, what was measured is kept all the same."""
+    """Depth and a flight for the report; if they cannot be drawn, what was measured is kept all the same.
+
+    Raises:
+        InputError: they cannot be written, which is so of all that a run has to leave.
+    """
     try:
         add_depth(run, pictures, pixels)
         add_flight(run, pictures, pixels)
-    except (RuntimeError, InputError, MemoryError) as error:
+    except (RuntimeError, TooManyPairs, MemoryError) as error:
         logger.warning("the report has no depth or flight (%s)", first_line(error))
 
 
