@@ -1,6 +1,6 @@
 """A scene without photographs and gs3d on it: for tests of rules rather than pictures."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.resources import as_file, files
 
 import torch
@@ -46,7 +46,8 @@ def small_scene(
 def published_options(**density: float) -> GS3DOptions:
     """conf/backbone/gs3d.yaml, with changes to its density section."""
     with as_file(files("gsx.conf") / "backbone" / "gs3d.yaml") as path:
-        options = typed(GS3DOptions, OmegaConf.load(path), "backbone")
+        values = OmegaConf.masked_copy(OmegaConf.load(path), [f.name for f in fields(GS3DOptions)])
+        options = typed(GS3DOptions, values, "backbone")
     return replace(options, density=replace(options.density, **density))
 
 

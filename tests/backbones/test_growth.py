@@ -4,6 +4,7 @@ All lengths are powers of two and all positions their multiples, so that loops a
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -27,6 +28,7 @@ from gsx.backbones.growth import (
 )
 from gsx.backbones.growth_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
+from gsx.core.training.density import room_under
 from gsx.core.training.parameter_table import ParameterTable
 
 PUBLISHED = GrowthOptions(
@@ -65,6 +67,11 @@ def cloud(
     return ParameterTable(parameters, columns, statistics), representation
 
 
+def under(most: int, table: ParameterTable) -> Callable[[int], int]:
+    """Room up to a table of that many anchors."""
+    return lambda wanted: room_under(most, len(table))
+
+
 @pytest.fixture
 def keep_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """No candidate is left out by chance."""
@@ -76,7 +83,7 @@ def deepen(
 ) -> int:
     generator = torch.Generator().manual_seed(9)
     options = replace(PUBLISHED, **changes)
-    return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, most)[0]
+    return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, under(most, table))[0]
 
 
 def grown(table: ParameterTable, before: int) -> list[tuple[float, ...]]:
@@ -274,7 +281,9 @@ def level_up(
     """`changes` are of quirks or of growth options."""
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
     options = replace(PUBLISHED, **{name: value for name, value in changes.items() if name not in CHOICES})
-    return grow_by_level(table, representation, options, levels or three_levels(), 40.0, quirks, gate, most)[0]
+    return grow_by_level(
+        table, representation, options, levels or three_levels(), 40.0, quirks, gate, under(most, table)
+    )[0]
 
 
 def grown_levels(table: ParameterTable, before: int) -> list[tuple]:

@@ -1,6 +1,7 @@
 """Where anchors can be: on one grid (Scaffold-GS), or on a grid for each level of detail (Octree-GS)."""
 
 import logging
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -21,6 +22,9 @@ from gsx.core.training.schedule import Schedule
 
 logger = logging.getLogger(__name__)
 
+Room = Callable[[int], int]
+"""Of so many new anchors how many may come."""
+
 
 @runtime_checkable
 class AnchorGrid(Protocol):
@@ -36,7 +40,9 @@ class AnchorGrid(Protocol):
         """(rows that the camera draws at its distance, weight of each row's opacity)."""
         ...
 
-    def grow(self, table: ParameterTable, representation: Representation, least: float, step: int) -> tuple[int, int]:
+    def grow(
+        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+    ) -> tuple[int, int]:
         """Add anchors where offsets seen in more than `least` steps ask for them; (how many, how many had no room)."""
         ...
 
@@ -87,11 +93,12 @@ class VoxelGrid:
         anchors = table["anchors"]
         return torch.arange(len(anchors), device=anchors.device), torch.ones_like(anchors[:, 0])
 
-    def grow(self, table: ParameterTable, representation: Representation, least: float, step: int) -> tuple[int, int]:
+    def grow(
+        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+    ) -> tuple[int, int]:
         """Cells of three sizes in turn."""
-        stop, most = self.quirks.early_stop == "yes", self.options.max_primitives
-        growth = self.options.growth
-        return grow_by_depth(table, representation, growth, self.voxel, least, stop, self.generator, most)
+        growth, stop = self.options.growth, self.quirks.early_stop == "yes"
+        return grow_by_depth(table, representation, growth, self.voxel, least, stop, self.generator, room)
 
     def columns(self, table: ParameterTable) -> dict[str, Float[Tensor, "N"]]:
         """None."""
@@ -132,11 +139,12 @@ class LevelGrids:
         mask, weights = drawn(self.levels, anchors, level, bias, camera, self.levels.highest(step))
         return mask.nonzero()[:, 0], weights
 
-    def grow(self, table: ParameterTable, representation: Representation, least: float, step: int) -> tuple[int, int]:
+    def grow(
+        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+    ) -> tuple[int, int]:
         """Cells of each anchor's level, and of the next."""
         gate = self.quirks.gate == "open" or self.levels.highest(step) == self.levels.count - 1
-        growth, most = self.options.growth, self.options.max_primitives
-        return grow_by_level(table, representation, growth, self.levels, least, self.quirks, gate, most)
+        return grow_by_level(table, representation, self.options.growth, self.levels, least, self.quirks, gate, room)
 
     def columns(self, table: ParameterTable) -> dict[str, Float[Tensor, "N"]]:
         """Levels and their bias (Octree-GS, save_ply)."""

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, ClassVar
 
+from gsx.backbones.capacity_options import CapacityOptions
 from gsx.backbones.growth_options import GrowthOptions, Quirks, resolved
 from gsx.backbones.heads import HeadOptions
 from gsx.backbones.level_options import LevelOptions, checked_end
 from gsx.backbones.mip import MipOptions, checked_filter
-from gsx.core.ranges import Count, Interval, Range, Rate, Steps, Weight
+from gsx.core.ranges import Interval, Range, Rate, Steps, Weight
 from gsx.core.training.schedule import log_linear
 
 
@@ -64,7 +65,7 @@ class ExplicitRates:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnchorOptions:
+class AnchorOptions(CapacityOptions):
     """What all anchor backbones share; values in conf/backbone, with their sources."""
 
     name: str
@@ -72,8 +73,6 @@ class AnchorOptions:
     fidelity: str
     """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
     filter: str
-    max_primitives: Count
-    """No anchor is added beyond this number; 0: none is withheld."""
     volume_weight: Weight
     """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
     voxel: Annotated[float, Range(0, 1e6)]
@@ -88,6 +87,7 @@ class AnchorOptions:
     """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checked_filter(self.filter)
         checked_end(self.levels, self.published_iterations)
         self.switches()

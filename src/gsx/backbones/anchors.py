@@ -5,6 +5,7 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +15,16 @@ from torch.nn import Parameter
 
 from gsx.backbones.anchor_grids import grid_of
 from gsx.backbones.anchor_options import ExplicitOptions, HeadRates, NeuralOptions
+from gsx.backbones.capacity import Growing, mark_newborn, without_newborn
+from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
 from gsx.backbones.growth import clamp_scales, eligible, fresh_statistics, observe, prune, reset_offsets
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import filter_named
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import PointCloud
+from gsx.core.data.scene import PointCloud, View
+from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
@@ -89,6 +93,7 @@ class Anchors:
         self.schedule = context.schedule(options.published_iterations)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, options.growth.stop)
         self.raster = self.filter.rules(context.raster)
+        self.capacity = capacity_of(options, context, self.growing())
         self.grid = grid_of(options, context, self.schedule, points.positions.float())
         self.table = self.initial_table(points, networks, context.device)
         self.filter.refresh(self.table, self.table["anchors"])
@@ -99,12 +104,14 @@ class Anchors:
         colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
         squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
         rows = self.representation.rows(0.5 * squares.log(), colours)
-        return ParameterTable(
+        table = ParameterTable(
             {name: Parameter(value.to(device)) for name, value in rows.items()},
             {name: value.to(device) for name, value in (columns | {"anchors": positions}).items()},
             fresh_statistics(len(positions), self.representation.offsets, device),
             networks,
         )
+        self.capacity.begin(table)
+        return table
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
@@ -151,31 +158,44 @@ class Anchors:
         if seen:
             observe(self.table, **seen)
 
-    def densify_and_prune(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Grow and prune when due (Scaffold-GS, train.py)."""
-        if not self.growth_due(step) and step != self.finer_after:
+        due = self.growing().due(step)
+        if not due and step != self.finer_after:
             return {}
-        done = self.grow_and_prune(step) if self.growth_due(step) else {}
+        done = self.grow_and_prune(step) if due else {}
         self.filter.refresh(self.table, self.table["anchors"], step)
         return done
 
-    def growth_due(self, step: int) -> bool:
-        """After `start`, before `stop`, every interval."""
-        growth = self.options.growth
-        start, stop = self.schedule.step(growth.start), self.schedule.step(growth.stop)
-        return start < step < stop and step % self.schedule.interval(growth.every) == 0
+    def growing(self) -> Growing:
+        """When anchors grow and go."""
+        growth, steps = self.options.growth, self.schedule
+        return Growing(steps.step(growth.start), steps.step(growth.stop), steps.interval(growth.every))
 
-    def grow_and_prune(self, step: int) -> dict[str, int]:
+    def withheld(self, view: View, step: int) -> Window | None:
+        """What capacity is judged by."""
+        return self.capacity.withheld(self.table, view, step)
+
+    def grow_and_prune(self, step: int) -> dict[str, float]:
         """Grow, forget what was judged, prune, clamp: the order of the reference (Scaffold-GS)."""
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
-        enough, _ = eligible(self.table, visits / 2)
-        grown, without_room = self.grid.grow(self.table, self.representation, visits / 2, step)
+        found = self.capacity.judge(self, without_newborn, step)
+        enough, old = eligible(self.table, visits / 2)[0], len(self.table)
+        grown, without_room = self.grid.grow(
+            self.table,
+            self.representation,
+            visits / 2,
+            lambda wanted: self.capacity.room(self.table, wanted, step),
+            step,
+        )
+        mark_newborn(self.table, old)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
         unit = math.log(self.extent) if self.quirks.clamp == "extent" and self.extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
-        return {"grown": grown, "pruned": pruned} | ({"withheld": without_room} if without_room else {})
+        done = found | {"grown": grown, "pruned": pruned}
+        return done | ({"withheld": without_room} if without_room and not self.capacity.ranked else {})
 
     def set_rates(self, step: int) -> None:
         """Learning rates of a step (Scaffold-GS, training_setup)."""
@@ -250,8 +270,6 @@ class Anchors:
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run, and what was derived from the scene."""
-        growth, steps = self.options.growth, self.schedule
-        start, stop = steps.step(growth.start), steps.step(growth.stop)
-        return {"grow": {"from": start, "until": stop, "every": steps.interval(growth.every)}} | self.grid.plan(
-            self.table
-        )
+        when = self.growing()
+        grow = {"from": when.start, "until": when.stop, "every": when.every}
+        return {"grow": grow} | self.capacity.plan() | self.grid.plan(self.table)

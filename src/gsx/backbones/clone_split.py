@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from gsx.backbones.capacity import mark_newborn, without_newborn
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.growth_options import Quirks
@@ -24,7 +25,7 @@ from gsx.core.quality.losses import volume_loss
 from gsx.core.ranges import Range, Share, Weight
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.density import mean_gradient, withheld, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 
@@ -178,8 +179,9 @@ class CloneSplitAcrossLevels:
     def __init__(self, visibility: VisibleByLevel, options: LevelDensityOptions, quirks: Quirks) -> None:
         self.visibility, self.options, self.quirks = visibility, options, quirks
 
-    def densify(self, control: DensityControl, table: ParameterTable, step: int) -> dict[str, int]:
+    def densify(self, control: DensityControl, model: Backbone[Any], step: int) -> dict[str, float]:
         """Parents stay; what too few cameras would draw is not made."""
+        table = model.table
         levels, options, gradient = self.visibility.levels, self.options, mean_gradient(table)
         masks = densify_masks(
             gradient,
@@ -196,11 +198,19 @@ class CloneSplitAcrossLevels:
         parts = clones(raw, cloned), small_children(raw, split, levels, options.shrink, control.generator)
         new = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         seen = kept(levels, new["means"], new["level"])
-        keep = within_room(seen, gradient[torch.cat([cloned, split])], control.room(table))
+        keep = within_room(
+            seen, gradient[torch.cat([cloned, split])], control.capacity.room(table, int(seen.sum()), step)
+        )
         bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)
+        old = len(table)
         append_rows(table, {name: value[keep] for name, value in new.items()})
+        mark_newborn(table, old)
         done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum())}
-        return done | withheld(seen, keep)
+        return done | ({} if control.capacity.ranked else withheld(seen, keep))
+
+    def undone(self, table: ParameterTable) -> ParameterTable | None:
+        """Without the copies and children."""
+        return without_newborn(table)
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """Mean volume of what was drawn, 0 for nothing."""

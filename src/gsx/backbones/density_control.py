@@ -6,36 +6,43 @@ from typing import Any
 import torch
 from torch.nn.functional import logsigmoid
 
+from gsx.backbones.capacity import Capacity, Growing
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
 from gsx.backbones.mip import Filter
 from gsx.core.gaussians.smoothing import logit_of_log
-from gsx.core.training.backbone import BackboneContext
-from gsx.core.training.density import room_under, zero_statistics
+from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.density import zero_statistics
 from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column
 from gsx.core.training.schedule import Schedule
+
+
+def growing_of(options: Density, schedule: Schedule) -> Growing:
+    """When density control acts."""
+    return Growing(schedule.step(options.start), schedule.step(options.stop), schedule.interval(options.every))
 
 
 class DensityControl:
     """Densifies, prunes and resets opacities (Kerbl et al. 2023, section 5)."""
 
     def __init__(
-        self, options: Density, cap: int, context: BackboneContext, schedule: Schedule, densification: Densification
+        self, options: Density, capacity: Capacity, context: BackboneContext, schedule: Schedule, how: Densification
     ) -> None:
-        self.options, self.cap, self.schedule, self.densification = options, cap, schedule, densification
+        self.options, self.capacity, self.schedule, self.densification = options, capacity, schedule, how
         self.extent, self.generator = context.scene.extent, context.generator
+        self.views, self.background = context.scene.train, context.scene.background.to(context.device)
+        self.growing = growing_of(options, schedule)
         self.white = bool((context.scene.background == 1).all())
 
     # -- when ----------------------------------------------------------------------------------------------------
 
     def ends(self) -> int:
         """Step from which nothing is densified, pruned or observed."""
-        return self.schedule.step(self.options.stop)
+        return self.growing.stop
 
     def due(self, step: int) -> bool:
         """After `start`, before `stop`, every interval."""
-        begun = self.schedule.step(self.options.start) < step < self.ends()
-        return begun and step % self.schedule.interval(self.options.every) == 0
+        return self.growing.due(step)
 
     def reset_interval(self) -> int:
         """Steps between opacity resets."""
@@ -54,16 +61,14 @@ class DensityControl:
 
     # -- what ----------------------------------------------------------------------------------------------------
 
-    def densify(self, table: ParameterTable, step: int) -> dict[str, int]:
-        """Clone and split, then prune; begin to count anew (3D-GS, densify_and_prune: the order in one event)."""
-        done = self.densification.densify(self, table, step)
-        done["pruned"] = self.prune(table, step)
-        zero_statistics(table)
+    def densify(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Judge what there is; clone and split, then prune; begin to count anew (3D-GS, densify_and_prune: the order
+        in one event)."""
+        found = self.capacity.judge(model, self.densification.undone, step)
+        done = found | self.densification.densify(self, model, step)
+        done["pruned"] = self.prune(model.table, step)
+        zero_statistics(model.table)
         return done
-
-    def room(self, table: ParameterTable) -> int:
-        """Primitives that may be added under the cap."""
-        return room_under(self.cap, len(table))
 
     def prune(self, table: ParameterTable, step: int) -> int:
         """Remove faint primitives, and after the first reset huge ones; returns how many."""
@@ -84,11 +89,11 @@ class DensityControl:
 
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""
-        every = self.schedule.interval(self.options.every)
         resets = {"every": self.reset_interval(), "until": self.ends()}
         resets |= {"white_background": self.white_reset()} if self.white else {}
         return {
-            "densify": {"from": self.schedule.step(self.options.start), "until": self.ends(), "every": every},
+            "densify": {"from": self.growing.start, "until": self.ends(), "every": self.growing.every},
+            **self.capacity.plan(),
             **({"opacity_reset": resets} if self.densification.resets else {}),
             "prune_huge": {"from": self.reset_interval()},
         }

@@ -5,7 +5,7 @@ gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,7 +16,7 @@ from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.growth_options import GrowthOptions, Quirks
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import mean_of, room_under, within_room
+from gsx.core.training.density import mean_of, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, keep_rows
 
 LARGEST_CELL = 2.0**53
@@ -131,11 +131,11 @@ def candidate_anchors(
 
 
 def add_anchors(
-    table: ParameterTable, new: CandidateAnchors, representation: Representation, most: int
+    table: ParameterTable, new: CandidateAnchors, representation: Representation, room: Callable[[int], int]
 ) -> tuple[int, int]:
-    """Append new anchors with fresh statistics, up to a table of `most` anchors; (how many, how many found no room)."""
+    """Append new anchors with fresh statistics, as many as there is room for; (how many, how many found none)."""
     wanted = len(new.positions)
-    new = strongest(new, room_under(most, len(table)))
+    new = strongest(new, room(wanted))
     count, like = len(new.positions), table["anchors"]
     if count == 0:
         return 0, wanted
@@ -159,7 +159,7 @@ def grow_by_depth(
     least: float,
     early_stop: bool,
     generator: torch.Generator,
-    most: int,
+    room: Callable[[int], int],
 ) -> tuple[int, int]:
     """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (anchor_growing).
 
@@ -178,7 +178,7 @@ def grow_by_depth(
         size = voxel * multiple
         cells, taken = nodes_of(means[candidates], size), nodes_of(table["anchors"], size)
         found = candidate_anchors(table, candidates, gradient, cells, taken, 0.0, size)
-        added, left = add_anchors(table, found, representation, most)
+        added, left = add_anchors(table, found, representation, room)
         grown, without_room = grown + added, without_room + left
         if early_stop and grown == 0:
             break
@@ -203,7 +203,7 @@ def grow_by_level(
     least: float,
     quirks: Quirks,
     gate: bool,
-    most: int,
+    room: Callable[[int], int],
 ) -> tuple[int, int]:
     """Octree-GS: cells of the own level, and of the next one for the strongest gradients (anchor_growing).
 
@@ -224,7 +224,7 @@ def grow_by_level(
         for found in candidates_of_level(
             table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
         ):
-            added, left = add_anchors(table, found, representation, most)
+            added, left = add_anchors(table, found, representation, room)
             grown, without_room = grown + added, without_room + left
     return grown, without_room
 

@@ -8,12 +8,15 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import normalize
 
-from gsx.backbones.density_control import DensityControl
+from gsx.backbones.capacity_options import capacity_of
+from gsx.backbones.density_control import DensityControl, growing_of
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
+from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.core.data.camera import Camera, offsets_from
-from gsx.core.data.scene import PointCloud
+from gsx.core.data.scene import PointCloud, View
+from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
@@ -60,7 +63,8 @@ def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """The backbones gs3d, gs3d_zoom and mip_splatting."""
-    return GS3D(options, context, AllVisible(), CloneSplit())
+    how = CloneSplit() if options.capacity == "published" else LongAxis(options.looks)
+    return GS3D(options, context, AllVisible(), how)
 
 
 class GS3D:
@@ -72,10 +76,11 @@ class GS3D:
         density, scene = options.density, context.scene
         self.options, self.visibility, self.extent = options, visibility, scene.extent
         self.schedule = context.schedule(options.published_iterations)
-        self.control = DensityControl(density, options.max_primitives, context, self.schedule, densification)
+        self.capacity = capacity_of(options, context, growing_of(density, self.schedule))
+        self.control = DensityControl(density, self.capacity, context, self.schedule, densification)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, density.stop)
         self.raster = self.filter.rules(context.raster)
-        self.absolute_gradient, self.finer_after = density.absolute, context.finer_after
+        self.absolute_gradient, self.finer_after = density.absolute or self.capacity.ranked, context.finer_after
         self.first_degree = 0
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
@@ -88,11 +93,13 @@ class GS3D:
 
     def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
         """A table of raw parameters and columns that nothing is known of yet."""
-        return ParameterTable(
+        table = ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
             gradient_statistics(len(raw["means"]), device, self.absolute_gradient),
         )
+        self.capacity.begin(table)
+        return table
 
     def go_on_from(self, gaussians: Gaussians) -> None:
         """Take Gaussians of a file, which are drawn as they are: what the 3D filter adds is taken off them first.
@@ -149,9 +156,13 @@ class GS3D:
         if seen:
             add_statistics(self.table, seen)
 
-    def densify_and_prune(self, step: int) -> dict[str, int]:
+    def withheld(self, view: View, step: int) -> Window | None:
+        """What capacity is judged by."""
+        return self.capacity.withheld(self.table, view, step)
+
+    def densify_and_prune(self, step: int) -> dict[str, float]:
         """Clone, split, prune and reset when due."""
-        done = self.control.densify(self.table, step) if self.control.due(step) else {}
+        done = self.control.densify(self, step) if self.control.due(step) else {}
         if done or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from gsx.backbones.capacity_options import CapacityOptions
 from gsx.backbones.mip import MipOptions, checked_filter
-from gsx.core.ranges import Count, Gradient, Interval, Range, Rate, Share, Steps
+from gsx.core.ranges import Gradient, Interval, Range, Rate, Share, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ class Density:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GS3DOptions:
+class GS3DOptions(CapacityOptions):
     """Options of the backbone; values in conf/backbone/gs3d.yaml, gs3d_zoom.yaml and mip_splatting.yaml."""
 
     name: str
@@ -60,8 +61,6 @@ class GS3DOptions:
     sh_degree: Annotated[int, Range(0, 3)]
     sh_every: Interval
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
-    max_primitives: Count
-    """No primitive is added beyond this number; 0: none is withheld."""
     rates: Rates
     density: Density
     mip: MipOptions
@@ -69,6 +68,7 @@ class GS3DOptions:
     """Published step at which the rate of the means has come down; 0: at the end of the run."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checked_filter(self.filter)
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")

@@ -14,7 +14,7 @@ from gsx.backbones.sampling import quantile, sampled_means
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.density import mean_absolute, mean_gradient, withheld, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
 
@@ -114,8 +114,12 @@ class Densification(Protocol):
     resets: bool
     """Whether opacities are reset while it runs."""
 
-    def densify(self, control: "DensityControl", table: ParameterTable, step: int) -> dict[str, int]:
-        """Clone and split; returns how many of each, and how many a cap has withheld."""
+    def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
+        """Make new ones; returns how many in which way, and how many a cap has withheld."""
+        ...
+
+    def undone(self, table: ParameterTable) -> ParameterTable | None:
+        """The table as it would be had the last event added nothing; None: it did. Asked where capacity is adaptive."""
         ...
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
@@ -128,15 +132,21 @@ class CloneSplit:
 
     resets = True
 
-    def densify(self, control: "DensityControl", table: ParameterTable, step: int) -> dict[str, int]:
+    def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
         """Split parents go; each leaves two children (3D-GS, densify_and_clone and densify_and_split)."""
+        table = model.table
         options, gradient = control.options, mean_gradient(table)
         wanted = candidates(table, gradient, options)
-        chosen = within_room(wanted, gradient, control.room(table))  # each adds one
+        room = control.capacity.room(table, int(wanted.sum()), step)  # each adds one
+        chosen = within_room(wanted, gradient, room)
         large = largest_scales(table) > options.split_extent * control.extent
         cloned, split = chosen & ~large, chosen & large
         clone_and_split(table, cloned, split, options.split_shrink, control.generator)
         return {"cloned": int(cloned.sum()), "split": int(split.sum())} | withheld(wanted, chosen)
+
+    def undone(self, table: ParameterTable) -> ParameterTable | None:
+        """Not told: capacity is never adaptive with it."""
+        return None
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """None."""

@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import PointCloud, Scene
+from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.core.data.window import Window
 from gsx.core.errors import InputError, LostModel
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, drawable
@@ -124,7 +125,7 @@ class Backbone(Protocol[D]):
         """Count an observation in by its weight: one of this process, or of another that trains the same model."""
         ...
 
-    def densify_and_prune(self, step: int) -> dict[str, int]:
+    def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Change the number of rows; returns what was done, for the log, empty when nothing."""
         ...
 
@@ -147,6 +148,15 @@ class Planned(Protocol):
 
     def plan(self) -> dict[str, Any]:
         """The rescaled schedule in absolute steps, for the log and the report."""
+        ...
+
+
+@runtime_checkable
+class Withholding(Protocol):
+    """A backbone that keeps parts of training views from being learnt for a while, to judge by them."""
+
+    def withheld(self, view: View, step: int) -> Window | None:
+        """The window of the view that is to count in no loss at this step; None: all of it counts."""
         ...
 
 

@@ -16,6 +16,9 @@ from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
 
+GATHERED = frozenset({"gradient", "count", "absolute"})
+"""Statistics of renders since the last density event."""
+
 
 def room_under(cap: int, count: int) -> int:
     """Rows that may be added to `count` of them under a cap; a cap of 0 is none."""
@@ -30,7 +33,7 @@ def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: i
     return torch.zeros_like(chosen).index_fill_(0, ranked, True)
 
 
-def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, int]:
+def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, float]:
     """How many of the rows wanted a cap has kept out, for the changes of a step; nothing where it let all in."""
     count = int(wanted.sum()) - int(chosen.sum())
     return {"withheld": count} if count else {}
@@ -80,8 +83,8 @@ def add_statistics(table: ParameterTable, seen: dict[str, Tensor]) -> None:
 
 def zero_statistics(table: ParameterTable) -> None:
     """Begin to count anew."""
-    for name, sums in table.statistics.items():
-        table.statistics[name] = torch.zeros_like(sums)
+    for name in GATHERED & table.statistics.keys():
+        table.statistics[name] = torch.zeros_like(table.statistics[name])
 
 
 def mean_gradient(table: ParameterTable) -> Float[Tensor, "N"]:

@@ -63,6 +63,8 @@ class ParameterTable:
     statistics: dict[str, Tensor] = field(default_factory=dict)
     """Values with N rows that density control gathers; new rows begin with 0."""
     networks: Networks | None = None
+    record: dict[str, Tensor] = field(default_factory=dict)
+    """What density control has found and decided so far, without rows."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -205,6 +207,7 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     """Everything of a table, by the names it is saved under."""
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
+    out |= {f"record.{name}": found for name, found in table.record.items()}
     for name, parameter in table.parameters.items():
         out[f"parameters.{name}"] = parameter.detach()
         out |= adam_tensors(name, parameter, table.optimiser)
@@ -227,7 +230,8 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     device = next(iter(like.parameters.values())).device
     rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
-    table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks)
+    record = {name: tensors.get(f"record.{name}", found).to(found) for name, found in like.record.items()}
+    table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks, record)
     for name, parameter in table.parameters.items():
         table.set_rate(name, like.group(name)["lr"])
         restore_adam(name, parameter, table.optimiser, tensors, device)

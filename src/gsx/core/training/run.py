@@ -15,7 +15,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.ranges import Interval, Range, Share
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
@@ -187,13 +187,15 @@ class Step:
     rendering: Rendering
     loss: Float[Tensor, ""]
     """Mean over the batch."""
+    counted: Bool[Tensor, "H W"] | None = None
+    """Which pixels of the target counted; None: all."""
     seen: Sequence[Observation] = ()
     """What density control learns from the renders of the batch, in its order."""
     dropped: int = 0
     """Splats that renders of training views left out because a value of theirs is not finite."""
     others: Sequence["Step"] = ()
     """This rank's other views, as steps of their own."""
-    changes: dict[str, int] = field(default_factory=dict)
+    changes: dict[str, float] = field(default_factory=dict)
     """What density control did."""
     terms: dict[str, float] = field(default_factory=dict)
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
@@ -204,5 +206,5 @@ class Step:
 
     def psnr(self) -> float:
         """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
-        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target, self.view.counted())
+        own = psnr(self.rendering.image.detach().clamp(0, 1), self.target, self.counted)
         return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))

@@ -16,8 +16,8 @@ from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
-from gsx.core.shapes import Float
-from gsx.core.training.backbone import Drawn, Observation, remove_nonfinite
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.backbone import Drawn, Observation, Withholding, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
@@ -104,7 +104,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
     compared with its own render.
     """
-    counted, seen = view.counted(), list[Observation]()
+    counted, seen = counted_in_loss(run, view, number), list[Observation]()
     target = blacked(view.image().to(run.device), counted)
     divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
@@ -131,11 +131,23 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         target=target,
         # the picture alone: steps of a batch do not hold on to what made theirs
         rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
+        counted=counted,
         loss=loss.detach() + sum(parts.values()),
         terms=named,
         seen=seen,
         dropped=rendering.dropped,
     )
+
+
+def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | None:
+    """Pixels that count: all but those masked, and those of a window that the backbone keeps to judge by."""
+    counted = view.counted()
+    window = run.backbone.withheld(view, number) if isinstance(run.backbone, Withholding) else None
+    if window is None:
+        return counted
+    left = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
+    left[window.pixels] = False
+    return left
 
 
 def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:

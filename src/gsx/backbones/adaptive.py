@@ -1,0 +1,174 @@
+"""As many primitives as pay for themselves: growth goes on while windows that are withheld from the loss say so.
+
+Between two events of density control a window of some training views counts in no loss. At the next event these windows
+are drawn twice: by the model as it is, and as it would be had the last event added nothing. What the error differs by
+is the gain of what was added, told in dB per doubling of the primitives, the unit of the price. Growth that stays
+below the price for several events in turn has ended. No step sees the windows while they are withheld; they move to
+other views and places with every event, so that all pixels are learnt from in the end. Test views play no part.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from gsx.backbones.capacity import Growing, Undone, worth_in_training
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.ranges import Range, Share
+from gsx.core.seeds import derived_seed
+from gsx.core.shapes import Float
+from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.density import room_under
+from gsx.core.training.evidence import window_errors
+from gsx.core.training.parameter_table import ParameterTable, keep_rows
+
+logger = logging.getLogger(__name__)
+
+ROUNDING = 1 / (12 * 255**2)
+"""Squared error of a photograph's own rounding to 8 bits: what lies below it is no evidence."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveOptions:
+    """Growth while it pays; values in conf/backbone/parts/capacity.yaml."""
+
+    price: Annotated[float, Range(0, 100)] = 0.2
+    """dB on withheld windows that a doubling of the primitives has to bring."""
+    share: Share = 0.4
+    """Of the primitives that ask for it by the published threshold, those with most of the error: so many grow."""
+    patience: Annotated[int, Range(1, 1000)] = 2
+    """Growth ends when so many events in turn have added what gains less than the price."""
+    views: Annotated[int, Range(1, 1000)] = 6
+    """Of which a window is withheld at a time."""
+    window: Annotated[float, Range(0.05, 1)] = 0.5
+    """Its sides as shares of the view's."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was found of the primitives that one event added, at the event after it."""
+
+    step: int
+    primitives: int
+    added: int
+    gain: float
+    """dB per doubling."""
+    error: float
+    """Its standard error over the windows."""
+
+
+class Adaptive:
+    """Judges what each event has added."""
+
+    ranked, choosy = True, True
+
+    def __init__(self, options: AdaptiveOptions, context: BackboneContext, growing: Growing, most: int) -> None:
+        self.options, self.growing, self.most = options, growing, most
+        self.context = context
+        self.views, self.background = context.scene.train, context.scene.background.to(context.device)
+
+    def begin(self, table: ParameterTable) -> None:
+        """Nothing has been added or found yet."""
+        table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
+        table.record["trials"] = torch.zeros(0, 5, dtype=torch.float64)
+
+    # -- what is withheld ----------------------------------------------------------------------------------------
+
+    def windows(self, interval: int) -> dict[View, Window]:
+        """The windows that are withheld during an interval between events, counted from 0."""
+        generator = torch.Generator().manual_seed(derived_seed("withheld", interval))
+        order = torch.randperm(len(self.views), generator=generator)[: self.options.views].tolist()
+        corners = torch.rand(len(order), 2, generator=generator).tolist()
+        chosen = zip([self.views[index] for index in order], corners, strict=True)
+        return {view: part_of(view, self.options.window, *corner) for view, corner in chosen}
+
+    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+        """That of the interval which the step belongs to, while there is something to judge."""
+        if not self.growing.start < step < self.growing.stop or self.ended(table):
+            return None
+        return self.windows((step - 1) // self.growing.every).get(view)
+
+    # -- what is found -------------------------------------------------------------------------------------------
+
+    def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
+        """Find what the primitives added by the event before this one have gained; at the last event remove what is
+        not worth the price."""
+        found = self.tried(model, undone, step)
+        return found | (self.removed(model, step) if self.growing.share(step) == 1 else {})
+
+    def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
+        """Draw the withheld windows with and without what the last event added."""
+        table = model.table
+        before = None if self.ended(table) else undone(table)
+        if before is None:
+            return {}
+        windows = self.windows((step - 1) // self.growing.every)
+        has, had = (window_errors(model, rows, windows, self.background, step).cpu() for rows in (table, before))
+        floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
+        gain, error = decibels(has + floor, had + floor)
+        doublings = math.log2(len(table) / len(before))
+        trial = Trial(step, len(table), len(table) - len(before), gain / doublings, error / doublings)
+        row = torch.tensor([list(vars(trial).values())], dtype=torch.float64)
+        table.record["trials"] = torch.cat([table.record["trials"], row])
+        self.tell(trial, table)
+        return {"gain_per_doubling": trial.gain, "gain_error": trial.error, "price": self.options.price}
+
+    def removed(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Remove rows without which the error of the training views would grow by less than their share of the price.
+
+        One of N rows may cost lambda / (N ln 2) dB, lambda being the price: a share of lambda ln 10 / (10 N ln 2) of
+        the squared error.
+        """
+        found = worth_in_training(model, self.context, step)
+        least = self.options.price * math.log(10) / (10 * math.log(2)) * found.error_share
+        doomed = (found.shown > 0) & (found.squares < least)
+        if bool(doomed.all()):
+            return {}
+        logger.info(
+            "step %d: %d of %d primitives are removed: each adds less than %.3g to the squared error",
+            *(step, int(doomed.sum()), len(doomed), least),
+        )
+        keep_rows(model.table, ~doomed)
+        return {"removed": int(doomed.sum())}
+
+    def tell(self, trial: Trial, table: ParameterTable) -> None:
+        """Log what was decided, because of which number and threshold."""
+        verdict = "has ended" if self.ended(table) else "goes on"
+        gain, price = f"{trial.gain:.2f} +- {trial.error:.2f} dB per doubling in withheld windows", self.options.price
+        told = trial.step, verdict, trial.primitives, trial.added, gain, price
+        logger.info("step %d: growth %s at %d primitives: the last %d gained %s, price %.2f", *told)
+
+    def ended(self, table: ParameterTable) -> bool:
+        """Whether so many events in turn gained less than the price."""
+        gains = table.record["trials"][:, 3]
+        failed = (gains < self.options.price).tolist()
+        run = self.options.patience
+        return any(all(failed[i : i + run]) for i in range(len(failed) - run + 1))
+
+    def room(self, table: ParameterTable, wanted: int, step: int) -> int:
+        """A share of those that ask for it while growth pays."""
+        if self.ended(table):
+            return 0
+        return min(math.ceil(self.options.share * wanted), room_under(self.most, len(table)))
+
+    def plan(self) -> dict[str, Any]:
+        """The price."""
+        return {"capacity": {"price_db_per_doubling": self.options.price, "events": self.growing.events()}}
+
+
+def part_of(view: View, share: float, right: float, down: float) -> Window:
+    """A window with that share of a view's sides; where it lies, from 0 (left, top) to 1."""
+    width, height = (max(1, round(share * side)) for side in view.camera.size)
+    left, top = round(right * (view.camera.width - width)), round(down * (view.camera.height - height))
+    return Window(left, top, width, height)
+
+
+def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:
+    """(gain in dB from the squared errors `had` to `has`, summed over windows; its standard error over the windows)."""
+    gain = 10 * math.log10(float(had.sum() / has.sum()))
+    spread = float((had - has).std(correction=1)) * math.sqrt(len(has)) if len(has) > 1 else math.inf
+    return gain, 10 / math.log(10) * spread / float(had.sum())

@@ -1,0 +1,174 @@
+"""How many primitives a model may have: under a cap as published, or towards a budget."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch.nn import Parameter
+
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.ranges import Count, Share
+from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.density import room_under
+from gsx.core.training.evidence import Removal, some_of, worth_of_rows
+from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetOptions:
+    """Growth towards a number; values in conf/backbone/parts/capacity.yaml."""
+
+    primitives: Count = 0
+    """How many there are to be when growth ends."""
+    power: Share = 0.5
+    """At a share t of the growth there may be first + (primitives - first) t^power (Improved-GS: a square root)."""
+
+
+@dataclass(frozen=True)
+class Growing:
+    """The steps at which density control acts: multiples of `every` between `start` and `stop`, both left out."""
+
+    start: int
+    stop: int
+    every: int
+
+    def due(self, step: int) -> bool:
+        """Whether it acts at a step."""
+        return self.start < step < self.stop and step % self.every == 0
+
+    def events(self) -> int:
+        """How often it acts, at least once."""
+        return max(1, (self.stop - 1) // self.every - self.start // self.every)
+
+    def share(self, step: int) -> float:
+        """How much of the events is over after the one at a step, from 0 to 1."""
+        return min(1.0, max(0.0, (step // self.every - self.start // self.every) / self.events()))
+
+
+LOOKS = 48
+"""Training views, at most, that say what a row is worth."""
+Undone = Callable[[ParameterTable], ParameterTable | None]
+"""The table as it would be had the last event added nothing; None: it added nothing."""
+
+
+@runtime_checkable
+class Capacity(Protocol):
+    """Decides at each event of density control how many primitives may come."""
+
+    ranked: bool
+    """Whether those that draw most of the error come first."""
+    choosy: bool
+    """Whether only those come that ask for it by the published threshold."""
+
+    def begin(self, table: ParameterTable) -> None:
+        """Give a fresh table what is kept there."""
+        ...
+
+    def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
+        """Look at the model before an event; what was found, for the log."""
+        ...
+
+    def room(self, table: ParameterTable, wanted: int, step: int) -> int:
+        """How many of the primitives `wanted` may be added now."""
+        ...
+
+    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+        """The window of a view that counts in no loss at a step; None: all of it counts."""
+        ...
+
+    def plan(self) -> dict[str, Any]:
+        """What is decided before training, for the log and the report."""
+        ...
+
+
+class Cap:
+    """As published: whatever density control asks for, up to a cap."""
+
+    ranked, choosy = False, True
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+
+    def begin(self, table: ParameterTable) -> None:
+        """Nothing."""
+
+    def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
+        """Nothing."""
+        return {}
+
+    def room(self, table: ParameterTable, wanted: int, step: int) -> int:
+        """Up to the cap."""
+        return room_under(self.most, len(table))
+
+    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+        """Nothing."""
+        return None
+
+    def plan(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+
+class Budget(Cap):
+    """Growth along a curve to a number of primitives (Taming-3DGS; the curve of Improved-GS)."""
+
+    ranked, choosy = True, False
+
+    def __init__(self, options: BudgetOptions, context: BackboneContext, growing: Growing) -> None:
+        super().__init__(options.primitives)
+        self.options, self.context, self.growing = options, context, growing
+
+    def begin(self, table: ParameterTable) -> None:
+        """Where the curve begins."""
+        table.record["first"] = torch.tensor(float(len(table)), dtype=torch.float64)
+
+    def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
+        """Remove what is beyond the curve, which falls where there are more points than primitives asked for."""
+        excess = len(model.table) - self.target(int(model.table.record["first"]), step)
+        if excess <= 0:
+            return {}
+        found = worth_in_training(model, self.context, step)
+        kept = torch.ones_like(found.squares, dtype=torch.bool)
+        kept[found.squares.argsort(stable=True)[:excess]] = False
+        keep_rows(model.table, kept)
+        return {"removed": excess}
+
+    def room(self, table: ParameterTable, wanted: int, step: int) -> int:
+        """Up to the curve."""
+        return max(0, self.target(int(table.record["first"]), step) - len(table))
+
+    def target(self, first: int, step: int) -> int:
+        """How many there may be after the event of a step, of a model that began with `first`."""
+        return math.floor(first + (self.most - first) * self.growing.share(step) ** self.options.power)
+
+    def plan(self) -> dict[str, Any]:
+        """The number."""
+        return {"budget": {"primitives": self.most}}
+
+
+def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
+    """What training views lose without each row."""
+    views = some_of(context.scene.train, LOOKS, context.generator)
+    return worth_of_rows(model, views, context.scene.background.to(context.device), step, context.generator)
+
+
+def mark_newborn(table: ParameterTable, old: int) -> None:
+    """Remember that the rows behind the `old` first ones were added by this event, where that is asked for."""
+    if "born" in table.statistics:
+        table.statistics["born"] = (torch.arange(len(table), device=table.statistics["born"].device) >= old).float()
+
+
+def without_newborn(table: ParameterTable) -> ParameterTable | None:
+    """The table without the rows that the last event added; None: it added none."""
+    old = table.statistics["born"] == 0
+    if bool(old.all()) or not bool(old.any()):
+        return None
+    rows = {name: value[old] for name, value in detached_rows(table).items()}
+    return ParameterTable(
+        {name: Parameter(rows[name], requires_grad=False) for name in table.parameters},
+        {name: rows[name] for name in table.columns},
+        networks=table.networks,
+    )

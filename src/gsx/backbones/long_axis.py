@@ -1,0 +1,125 @@
+"""Splits along the longest axis: two halves side by side in the place of one Gaussian (Improved-GS)."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.nn.functional import normalize
+
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.backbone import Backbone, DrawnSplats
+from gsx.core.training.density import mean_absolute, mean_gradient, within_room
+from gsx.core.training.evidence import drawn_errors, some_of
+from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
+
+if TYPE_CHECKING:
+    from gsx.backbones.density_control import DensityControl
+
+STEP, LENGTH, OPACITY = 1.35, 0.55, 0.6
+"""Of the halves: distance from the whole's centre and length, times its largest scale; share of its opacity."""
+ACROSS = math.sqrt(1 - 0.45**2)
+"""Of the halves, along the other axes."""
+LARGEST_OPACITY = 1 - 1e-6
+
+
+def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+    """Two halves of each Gaussian, given by raw parameters, on either side of its centre along its longest axis
+    (Improved-GS, long-axis split)."""
+    longest = rows["log_scales"].argmax(1, keepdim=True)
+    along = torch.zeros_like(rows["log_scales"]).scatter_(1, longest, 1.0)
+    size = rows["log_scales"].gather(1, longest).exp()
+    offset = (rotation_matrices(rows["quats"]) @ (STEP * size * along)[:, :, None])[:, :, 0]
+    changed = {
+        "log_scales": rows["log_scales"] + torch.where(along > 0, math.log(LENGTH), math.log(ACROSS)),
+        "opacity_logits": torch.logit(OPACITY * rows["opacity_logits"].sigmoid(), eps=1e-6),
+    }
+    return [rows | changed | {"means": rows["means"] + side * offset} for side in (1, -1)]
+
+
+def covariances(rows: dict[str, Tensor]) -> Float[Tensor, "N 3 3"]:
+    """Of Gaussians by raw parameters, world units squared."""
+    spread = rotation_matrices(rows["quats"]) * rows["log_scales"].exp()[:, None]
+    return spread @ spread.mT
+
+
+def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Tensor]:
+    """One Gaussian for each two: of fresh halves what they were made from, of others what would be split into the like.
+
+    Means of both, and covariances of both with what their distance adds, less what a split adds.
+    """
+    whole = {name: (value + second[name]) / 2 for name, value in first.items() if value.is_floating_point()}
+    apart = (first["means"] - second["means"])[:, :, None].double() / 2
+    covariance = (covariances(first) + covariances(second)).double() / 2 + apart @ apart.mT
+    variances, axes = torch.linalg.eigh(covariance)  # ascending
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
+    grown = variances.new_tensor([ACROSS**2, ACROSS**2, LENGTH**2 + STEP**2])
+    opacities = (first["opacity_logits"].sigmoid() + second["opacity_logits"].sigmoid()) / 2 / OPACITY
+    changed = {
+        "log_scales": ((variances / grown).clamp_min(1e-30).log() / 2).to(whole["log_scales"]),
+        "quats": normalize(quaternions_of(axes), dim=1).to(whole["quats"]),
+        "opacity_logits": torch.logit(opacities.clamp_max(LARGEST_OPACITY)),
+    }
+    return first | whole | changed
+
+
+def split_along(table: ParameterTable, chosen: Bool[Tensor, "N"]) -> None:
+    """Two halves in the place of each chosen row: survivors, first halves, second halves."""
+    twins = halves({name: value[chosen] for name, value in detached_rows(table).items()})
+    append_rows(table, {name: torch.cat([twin[name] for twin in twins]) for name in twins[0]})
+    new = torch.ones(len(table) - len(chosen), dtype=torch.bool, device=chosen.device)
+    keep_rows(table, torch.cat([~chosen, new]))
+
+
+def twins_of(born: Float[Tensor, "N"]) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
+    """(rows of first halves, of second ones) of the pairs of which both are still there, by the numbers they bear."""
+    order = born.argsort(stable=True)
+    number = born[order]
+    paired = ((number[:-1] == number[1:]) & (number[1:] > 0)).nonzero()[:, 0]
+    return order[paired], order[paired + 1]
+
+
+class LongAxis:
+    """The Gaussians that draw most of the error, and whose pixels pull at them the most, become two halves each."""
+
+    resets = False
+
+    def __init__(self, views: int) -> None:
+        self.views = views
+
+    def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
+        """As many as there is room for."""
+        table = model.table
+        views = some_of(control.views, self.views, control.generator)
+        score = drawn_errors(model, views, control.background, step) * mean_absolute(table)
+        wanted = (score > 0) & (mean_gradient(table) >= (control.options.gradient if control.capacity.choosy else 0))
+        chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
+        count = int(chosen.sum())
+        split_along(table, chosen)
+        if "born" in table.statistics:
+            numbers = torch.arange(1, count + 1).to(score)
+            old = torch.zeros(len(table) - 2 * count).to(score)
+            table.statistics["born"] = torch.cat([old, numbers, numbers])
+        return {"split": count}
+
+    def undone(self, table: ParameterTable) -> ParameterTable | None:
+        """With the whole in the place of each two halves that the last event made; None: there are none."""
+        first, second = twins_of(table.statistics["born"])
+        if len(first) == 0:
+            return None
+        rows = detached_rows(table)
+        whole = wholes(*({name: value[half] for name, value in rows.items()} for half in (first, second)))
+        others = torch.ones(len(table), dtype=torch.bool, device=first.device).index_fill_(
+            0, torch.cat([first, second]), False
+        )
+        values = {name: torch.cat([value[others], whole[name]]) for name, value in rows.items()}
+        return ParameterTable(
+            {name: Parameter(values[name], requires_grad=False) for name in table.parameters},
+            {name: values[name] for name in table.columns},
+        )
+
+    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
+        """None."""
+        return None

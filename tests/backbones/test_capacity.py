@@ -1,0 +1,195 @@
+"""How many primitives there are: curves by hand, budgets met, what is withheld, what ends growth, resume."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import published_options, small_context, small_gs3d, small_scene, spread
+from tiny import final_tensors, tiny_run, tiny_settings
+from torch import Tensor
+
+from gsx.backbones.adaptive import Adaptive, AdaptiveOptions, decibels, part_of
+from gsx.backbones.capacity import Budget, BudgetOptions, Growing
+from gsx.backbones.gs3d_options import GS3DOptions
+from gsx.builtin import plugins
+from gsx.core.data.scene import Scene, View
+from gsx.core.data.window import Window
+from gsx.core.errors import ConfigError
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+
+PUBLISHED = Growing(500, 15000, 100)
+"""3D-GS: steps 600, 700, ... 14900."""
+
+
+def options_of(capacity: str, **more: object) -> GS3DOptions:
+    return replace(published_options(), capacity=capacity, **more)
+
+
+# -- when, how many ----------------------------------------------------------------------------------------------------
+
+
+def test_events_of_the_published_run() -> None:
+    due = [step for step in range(1, 30001) if PUBLISHED.due(step)]
+    assert due == list(range(600, 15000, 100))
+    assert PUBLISHED.events() == len(due) == 144
+    assert [PUBLISHED.share(step) for step in (500, 600, 7700, 14900, 20000)] == [0, 1 / 144, 0.5, 1, 1]
+
+
+@pytest.mark.parametrize(("start", "stop", "every"), [(17, 500, 43), (20, 600, 100), (0, 10, 3), (5, 7, 9), (0, 9, 3)])
+def test_events_are_counted_for_any_schedule(start: int, stop: int, every: int) -> None:
+    growing = Growing(start, stop, every)
+    due = [step for step in range(stop + 50) if growing.due(step)]
+    assert growing.events() == max(1, len(due))
+    assert [growing.share(step) for step in due] == [(i + 1) / len(due) for i in range(len(due))]
+
+
+def test_the_curve_of_a_budget_by_hand() -> None:
+    """From 100 to 1,000: a quarter of the events, half of the way."""
+    budget = Budget(BudgetOptions(primitives=1000), small_context(small_scene(spread(1))), Growing(0, 17, 2))
+    assert [budget.target(100, step) for step in (0, 4, 16)] == [100, 550, 1000]
+    assert budget.target(2000, 4) == 1500  # more points than primitives: the curve falls
+
+
+@pytest.mark.parametrize(("points", "primitives"), [(300, 500), (300, 120)])
+def test_a_budget_is_met(points: int, primitives: int, tmp_path: Path) -> None:
+    words = ("iterations=40", "backbone.capacity=budget", f"backbone.budget.primitives={primitives}", "eval.zoom=[1]")
+    run = tiny_run(tmp_path, (*words, f"scene.points={points}", "backbone.density.prune_opacity=0"))
+    assert len(run.backbone.table) == primitives
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("backbone.capacity=most",), "backbone.capacity is 'most'; choose published, budget or adaptive"),
+        (("backbone.capacity=budget",), "capacity=budget and a number above 0"),
+        (("backbone.budget.primitives=9",), "capacity=budget and a number above 0"),
+        (("backbone.adaptive.window=0",), r"backbone.adaptive.window is 0.0; give a number from 0.05 to 1"),
+        (("backbone.adaptive.price=-1",), "backbone.adaptive.price is -1.0; give a number from 0 to 100"),
+    ],
+)
+def test_options_are_checked(words: tuple[str, ...], complaint: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        tiny_settings(tmp_path, *words)
+
+
+@pytest.mark.parametrize("backbone", ["mip_splatting", "gs3d_zoom", "octree_gs3d", "scaffold", "octree_scaffold"])
+def test_every_backbone_takes_every_capacity(backbone: str, tmp_path: Path) -> None:
+    for words in (("backbone.capacity=adaptive",), ("backbone.capacity=budget", "backbone.budget.primitives=900")):
+        tiny_settings(tmp_path, f"backbone={backbone}", *words)
+
+
+# -- what is withheld --------------------------------------------------------------------------------------------------
+
+
+def adaptive(scene: Scene, growing: Growing = PUBLISHED, **more: float) -> Adaptive:
+    return Adaptive(AdaptiveOptions(**more), small_context(scene), growing, 0)  # type: ignore[arg-type]
+
+
+def test_windows_move_with_every_event_and_stay_between() -> None:
+    scene = small_scene(spread(5), views=9)
+    judge, model = adaptive(scene, views=3), small_gs3d(scene, options=options_of("adaptive"))
+
+    def all_at(step: int) -> dict[str, Window]:
+        found = {view.name: judge.withheld(model.table, view, step) for view in scene.train}
+        return {name: window for name, window in found.items() if window is not None}
+
+    assert len(all_at(601)) == 3
+    assert all_at(601) == all_at(700) != all_at(701)
+    assert all_at(500) == {} == all_at(15000)
+    for window in all_at(601).values():
+        assert (window.width, window.height) == (12, 8)
+        assert 0 <= window.left <= 12
+        assert 0 <= window.top <= 8
+
+
+def test_a_window_lies_where_it_is_told() -> None:
+    view = small_scene(spread(5)).train[0]
+    assert part_of(view, 0.5, 0.0, 1.0) == Window(0, 8, 12, 8)
+    assert part_of(view, 1.0, 0.7, 0.2) == Window(0, 0, 24, 16)
+
+
+def test_training_does_not_see_what_is_withheld(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs white where they are withheld train to the same bits, until the windows move."""
+    words = ("iterations=30", "backbone.capacity=adaptive", "backbone.density.stop=29000", "rasterizer=eager")
+    plain = tiny_run(tmp_path / "plain", words, stop_after=5)
+    model, image = plain.backbone, View.image
+
+    def disturbed(self: View) -> Tensor:
+        out = image(self).clone()
+        window = model.withheld(self, 2)  # type: ignore[attr-defined]
+        if window is not None and out.shape[1:] == (self.camera.height, self.camera.width):
+            out[:, *window.pixels] = 1
+        return out
+
+    monkeypatch.setattr(View, "image", disturbed)
+    tiny_run(tmp_path / "white", words, stop_after=5)
+    before, after = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "white")
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    tiny_run(tmp_path / "later", words, stop_after=14)
+    monkeypatch.undo()
+    tiny_run(tmp_path / "whole", words, stop_after=14)
+    later, whole = final_tensors(tmp_path / "later"), final_tensors(tmp_path / "whole")
+    assert not torch.equal(later["parameters.sh_dc"], whole["parameters.sh_dc"])
+
+
+# -- what ends growth --------------------------------------------------------------------------------------------------
+
+
+def test_gain_in_decibels_by_hand() -> None:
+    """Errors 8 + 2 instead of 9 + 1: nothing gained, and a spread of 1, -1: sqrt(2) over one window."""
+    gain, error = decibels(torch.tensor([5.0, 5.0]).double(), torch.tensor([10.0, 10.0]).double())
+    assert gain == pytest.approx(10 * math.log10(2))
+    assert error == 0
+    gain, error = decibels(torch.tensor([9.0, 1.0]).double(), torch.tensor([8.0, 2.0]).double())
+    assert gain == 0
+    assert error == pytest.approx(10 / math.log(10) * math.sqrt(2) * math.sqrt(2) / 10)
+
+
+def test_growth_ends_after_as_many_events_below_the_price_as_there_is_patience() -> None:
+    scene = small_scene(spread(5))
+    judge, table = adaptive(scene, price=0.5, patience=2), small_gs3d(scene, options=options_of("adaptive")).table
+    for gains, ended in (([], False), ([0.4], False), ([0.4, 0.6, 0.3], False), ([0.4, 0.3, 0.9], True)):
+        table.record["trials"] = torch.tensor([[600.0, 10, 2, gain, 0.1] for gain in gains]).view(-1, 5)
+        assert judge.ended(table) == ended
+        assert (judge.room(table, 10, 700) == 0) == ended
+
+
+def test_a_share_of_those_that_ask_may_grow_up_to_the_cap() -> None:
+    scene = small_scene(spread(5))
+    table = small_gs3d(scene, options=options_of("adaptive")).table
+    assert adaptive(scene, share=0.4).room(table, 11, 700) == 5
+    capped = Adaptive(AdaptiveOptions(share=1.0), small_context(scene), PUBLISHED, 7)
+    assert capped.room(table, 11, 700) == 2
+
+
+DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
+"""Events at steps 6, 12 and, of backbones published with 30,000 steps, 18 of 24."""
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("backbone=gs3d",), "density"),
+        (("backbone=octree_gs3d", "backbone.densification=clone_split"), "clone_split.density"),
+        (("backbone=scaffold", "backbone.growth.observe_from=0", "backbone.growth.success=0.1"), "growth"),
+    ],
+    ids=["free", "levels", "anchors"],
+)
+def test_adaptive_runs_resume_bit_for_bit(words: tuple[str, ...], part: str, tmp_path: Path) -> None:
+    """What was found and decided is in the checkpoint."""
+    dense = [f"backbone.{part}.{word}" for word in DENSE]
+    words = (*words, *dense, "iterations=24", "backbone.capacity=adaptive", "rasterizer=eager")
+    tiny_run(tmp_path / "whole", words)
+    expected = final_tensors(tmp_path / "whole")
+    assert len(expected["record.trials"]) > 0
+    for stop in (9, 13):
+        tiny_run(tmp_path / f"parts{stop}", words, stop_after=stop)
+        again, settings = open_run(tmp_path / f"parts{stop}", plugins(), ())
+        execute(again, settings, plugins())
+        found = final_tensors(tmp_path / f"parts{stop}")
+        assert expected.keys() == found.keys()
+        assert all(torch.equal(expected[name], found[name]) for name in expected)

@@ -1,0 +1,86 @@
+"""What each Gaussian has to do with an error, against renders with one of them painted, and without one of them."""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import View
+from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.training.evidence import error_sums, look, random_signs, removal_squares
+
+RULES = RasterSettings(evaluation="float64", accumulation="float64", alpha_min=1e-9, transmittance_stop=0, cull="tight")
+BACKGROUND = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph of noise."""
+
+    seed: int = 1
+
+    def image(self, camera: Camera) -> Tensor:
+        return torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(self.seed)).double()
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+def view_of(width: int, height: int) -> View:
+    camera = look_at([0, -3, 0.5], [0, 0, 0], fov_x=0.8, width=width, height=height)
+    return View(name="noise", camera=camera, source=Shot())
+
+
+def cloud(count: int) -> Splats:
+    """Large splats, one behind the other, with opacities below the bound of alphas."""
+    generator = torch.Generator().manual_seed(3)
+    draws = [torch.rand(count, size, generator=generator, dtype=torch.float64) for size in (3, 3, 4, 1, 3)]
+    return Splats(
+        means=draws[0] - 0.5,
+        scales=0.2 + 0.3 * draws[1],
+        quats=draws[2] - 0.5,
+        log_opacities=(0.2 + 0.6 * draws[3][:, 0]).log(),
+        colours=draws[4],
+    )
+
+
+def without(splats: Splats, row: int) -> Splats:
+    kept = torch.arange(len(splats)) != row
+    return Splats(**{name: value[kept] for name, value in vars(splats).items()})
+
+
+def test_errors_are_shared_by_blending_weights() -> None:
+    """Against renders in which one splat is white and all else black: these are its weights."""
+    splats, view = cloud(5), view_of(12, 9)
+    seen = look(splats, view, RULES, BACKGROUND)
+    error = (rasterize(splats, view.camera, RULES, background=BACKGROUND).image - view.image()).square().sum(0)
+    for row, found in enumerate(error_sums(seen)):
+        white = torch.zeros(5, 3, dtype=torch.float64)
+        white[row] = 1
+        weights = rasterize(replace(splats, colours=white), view.camera, RULES).image[0]
+        assert float(found) == pytest.approx(float((weights * error).sum()), rel=1e-9)
+    assert seen.squared_error == pytest.approx(float(error.sum()), rel=1e-12)
+
+
+def test_what_the_picture_loses_without_a_splat() -> None:
+    """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
+    splats, view = cloud(4), view_of(2, 1)
+    seen = look(splats, view, RULES, BACKGROUND)
+    patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
+    found = torch.stack([removal_squares(seen, signs) for signs in patterns]).mean(0)
+    for row in range(4):
+        less = rasterize(without(splats, row), view.camera, RULES, background=BACKGROUND).image
+        expected = float((less - seen.rendering.image.detach()).square().sum())
+        assert float(found[row]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_signs_come_from_the_generator_alone() -> None:
+    seen = look(cloud(3), view_of(8, 8), RULES, BACKGROUND)
+    one, again, other = (random_signs(seen, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    assert set(one.unique().tolist()) == {-1, 1}
