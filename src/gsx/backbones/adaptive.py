@@ -36,9 +36,9 @@ ROUNDING = 1 / (12 * 255**2)
 class AdaptiveOptions:
     """Growth while it pays; values in conf/backbone/parts/capacity.yaml."""
 
-    price: Annotated[float, Range(0, 100)] = 0.2
+    price: Annotated[float, Range(0, 100)] = 0.15
     """dB on withheld windows that a doubling of the primitives has to bring."""
-    share: Share = 0.4
+    share: Share = 0.35
     """Of the primitives that ask for it by the published threshold, those with most of the error: so many grow."""
     patience: Annotated[int, Range(1, 1000)] = 2
     """Growth ends when so many events in turn have added what gains less than the price."""
@@ -150,8 +150,8 @@ class Adaptive:
         return any(all(failed[i : i + run]) for i in range(len(failed) - run + 1))
 
     def room(self, table: ParameterTable, wanted: int, step: int) -> int:
-        """A share of those that ask for it while growth pays."""
-        if self.ended(table):
+        """A share of those that ask for it while growth pays; none at the last event, which nothing would judge."""
+        if self.ended(table) or self.growing.share(step) == 1:
             return 0
         return min(math.ceil(self.options.share * wanted), room_under(self.most, len(table)))
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
+from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging, unheard
@@ -28,6 +29,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
   gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
   gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
+  gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
@@ -110,6 +112,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "eval": verb_eval,
     "render": verb_render,
     "export": verb_export,
+    "compact": verb_compact,
     "view": verb_view,
     "report": verb_report,
     "trade": verb_trade,

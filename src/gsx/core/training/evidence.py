@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
@@ -27,41 +28,37 @@ from gsx.core.training.parameter_table import ParameterTable
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Look:
-    """A render of M splats whose colours and log-opacities are leaves, and how it differs from the photograph."""
+    """A render of M splats whose colours and log-opacities are leaves."""
 
     rendering: Rendering
     colours: Float[Tensor, "M 3"]
     log_opacities: Float[Tensor, "M"]
-    difference: Float[Tensor, "3 H W"]
-    """Render minus photograph; 0 where the photograph does not count."""
-
-    @property
-    def squared_error(self) -> float:
-        """Sum over pixels and channels."""
-        return float(self.difference.double().square().sum())
 
 
-def look(splats: Splats, view: View, raster: RasterSettings, background: Float[Tensor, "3"]) -> Look:
-    """Render splats for a view of the training set, at its own resolution."""
+def look(splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"]) -> Look:
+    """Render splats for a camera, at its own resolution."""
     values = {name: value.detach() for name, value in vars(splats).items()}
     colours, log_opacities = (values[name].requires_grad_() for name in ("colours", "log_opacities"))
-    rendering = rasterize(replace(splats, **values), view.camera, raster, background=background)
-    shown = rendering.image.detach()
-    difference = blacked(shown - view.image().to(shown), view.counted())
-    return Look(rendering=rendering, colours=colours, log_opacities=log_opacities, difference=difference)
+    rendering = rasterize(replace(splats, **values), camera, raster, background=background)
+    return Look(rendering=rendering, colours=colours, log_opacities=log_opacities)
 
 
-def error_sums(seen: Look) -> Float[Tensor, "M"]:
-    """Sum over pixels of blending weight times squared error, summed over channels: they add up to the squared error
-    where splats cover everything (Rota Bulo et al. 2024, for maxima over views)."""
-    upstream = seen.difference.square().sum(0, keepdim=True).expand(3, -1, -1) / 3
+def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
+    """A render less the photograph of its view; 0 where that does not count."""
+    return blacked(image.detach() - view.image().to(image), view.counted())
+
+
+def error_sums(seen: Look, off: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+    """Sum over pixels of blending weight times squared difference, summed over channels: they add up to the squared
+    error where splats cover everything (Rota Bulo et al. 2024, for maxima over views)."""
+    upstream = off.square().sum(0, keepdim=True).expand(3, -1, -1) / 3
     (gradient,) = torch.autograd.grad(seen.rendering.image, [seen.colours], upstream, retain_graph=True)
     return gradient.sum(1)
 
 
-def random_signs(seen: Look, generator: torch.Generator) -> Float[Tensor, "3 H W"]:
-    """1 or -1 for each value of the picture."""
-    return torch.randint(0, 2, seen.difference.shape, generator=generator).to(seen.difference) * 2 - 1
+def random_signs(image: Float[Tensor, "3 H W"], generator: torch.Generator) -> Float[Tensor, "3 H W"]:
+    """1 or -1 for each value of a picture."""
+    return torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
 
 
 def removal_squares(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
@@ -93,7 +90,8 @@ def drawn_errors(
     for view in views:
         with torch.no_grad():
             drawn = model.draw(view.camera, step)
-        add_by_row(sums, drawn, error_sums(look(drawn.splats, view, model.raster, background)))
+        seen = look(drawn.splats, view.camera, model.raster, background)
+        add_by_row(sums, drawn, error_sums(seen, difference(seen.rendering.image, view)))
     return sums
 
 
@@ -121,13 +119,14 @@ def worth_of_rows(
     for view in views:
         with torch.no_grad():
             drawn = model.draw(view.camera, step)
-        seen = look(drawn.splats, view, model.raster, background)
-        add_by_row(squares, drawn, removal_squares(seen, random_signs(seen, generator)))
+        seen = look(drawn.splats, view.camera, model.raster, background)
+        image = seen.rendering.image
+        add_by_row(squares, drawn, removal_squares(seen, random_signs(image.detach(), generator)))
         screen = seen.rendering.screen
         visible = torch.zeros_like(seen.log_opacities).detach()
         visible[screen.ids[screen.visible]] = 1.0
         add_by_row(shown, drawn, visible)
-        error += seen.squared_error
+        error += float(difference(image, view).double().square().sum())
     return Removal(squares=squares / shown.clamp_min(1), shown=shown, error_share=error / max(1.0, float(shown.sum())))
 
 

@@ -1,0 +1,40 @@
+"""gsx compact."""
+
+import sys
+from pathlib import Path
+
+from gsx.builtin import plugins
+from gsx.cli.arguments import Parser, positive, whole
+from gsx.core.errors import InputError
+
+
+def verb_compact(arguments: list[str]) -> int:
+    """gsx compact RUN|FILE [KEY=VALUE ...] [--max-drop-db DB] [--steps N] [--to FOLDER]"""
+    parser = Parser(
+        prog="gsx compact",
+        usage="%(prog)s RUN|FILE [KEY=VALUE ...] [options]",
+        description="Make the smallest model that looks the same: primitives and bands of colour that the pictures do "
+        "not need go, the rest learns on for a while. A run folder comes out, with splat files and a page that shows "
+        "both. FILE: of any program, with the scene that judges it (scene=colmap scene.path=FOLDER).",
+    )
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder or splat file")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values in place of the run's own")
+    parser.add_argument(
+        "--max-drop-db",
+        type=positive(float),
+        default=0.1,
+        metavar="DB",
+        help="PSNR that may be lost, at any zoom (0.1)",
+    )
+    parser.add_argument("--steps", type=whole, metavar="N", help="of learning on, in each try (a tenth of the run's)")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="new run folder (RUN_compact)")
+    given = parser.parse_intermixed_args(arguments)
+    if not given.target.exists():
+        raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
+    from gsx.experiments.compact.compact import compact
+
+    target = given.target.resolve()
+    to = given.to or target.with_name(f"{target.name.split('.')[0] if target.is_file() else target.name}_compact")
+    page = compact(given.target, to, given.max_drop_db, given.steps, given.overrides, plugins())
+    sys.stdout.write(f"{page}\n")
+    return 0

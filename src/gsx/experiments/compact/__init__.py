@@ -1,0 +1,1 @@
+"""Smaller models that look the same: `gsx compact`."""

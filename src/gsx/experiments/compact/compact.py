@@ -1,0 +1,181 @@
+"""gsx compact: a run or a splat file in, a smaller run folder out, with what was tried and what it cost."""
+
+import logging
+import shutil
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsx.core.errors import ConfigError, InputError, first_line
+from gsx.core.files import read_json, write_json
+from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.suffixes import STANDARD
+from gsx.core.plugins import Plugins
+from gsx.core.quality.metrics import psnr
+from gsx.core.seeds import derived_seed
+from gsx.core.training import checkpoint
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, told
+from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.run_folder.claims import claimed
+from gsx.experiments.runs.build import build
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.execute import finish
+from gsx.experiments.runs.export import notes, own_columns, render_mode
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import as_trained, open_run, refuse_used
+from gsx.experiments.runs.rasterizer_path import warm
+from gsx.experiments.runs.settings import Settings, write_config
+from gsx.experiments.runs.start_file import composition_of, starting_splats
+from gsx.experiments.runs.verified import verified
+
+logger = logging.getLogger(__name__)
+
+FORMATS = (".sog", ".compressed.ply", ".spz")
+"""Quantised files that are tried, beside the standard one."""
+FILE_STEPS = 2000
+"""Of a run that a splat file stands at the end of: its learning rates are those of such a run's last step."""
+SHARE = 0.1
+"""Of a run's steps that are taken to learn on, where nothing is said."""
+NAME, COMPARED = "compact.json", "compared"
+"""What was tried; folder of the page with the model before and after."""
+
+
+def compact(
+    target: Path, to: Path, max_drop: float, steps: int | None, overrides: Sequence[str], plugins: Plugins
+) -> Path:
+    """Write a smaller run of a run folder or splat file to a new folder; returns its report.
+
+    Raises:
+        ConfigError, InputError: the folder is in use, or the target is neither, or no scene is given for a file.
+    """
+    refuse_used(str(to))
+    run, settings = opened(target, overrides, plugins)
+    warm(run.raster, run.device)
+    steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
+    generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
+    shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)
+    logger.info("judged by %d training views: %s", len(shrinking.judging), shrinking.before)
+    best = shrinking.smallest()
+    if best not in shrinking.tried:
+        logger.warning("nothing could be taken away within %.3g dB: the new folder holds the model as it was", max_drop)
+    shrinking.take(best)
+    with ExitStack() as claims:
+        begin(run, settings, target, to, claims)
+        found = {
+            "from": str(target.resolve()),
+            "max_drop_db": max_drop,
+            "judges": [view.name for view in shrinking.judging],
+            "learnt_on_steps": steps,
+            "before": {"primitives": len(shrinking.worth), "psnr": shrinking.before},
+            "tries": told(shrinking.tried),
+            "chosen": told([best])[0],
+        }
+        evaluation = finish(run, settings, plugins)
+        found["formats"] = formats(run, shrinking, evaluation, max_drop)
+        write_json(to / NAME, found)
+    tell(target, evaluation, found)
+    return overview(target, to)
+
+
+def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Run, Settings]:
+    """The run to make smaller: of a folder, or one that a splat file stands at the end of."""
+    if target.is_dir():
+        run, settings = open_run(target, plugins, overrides)
+        run.raster = as_trained(run)
+        return run, settings
+    words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
+    settings = compose([*words, f"iterations={FILE_STEPS}"], plugins)
+    run = build(settings, verified(load_scene(settings)), Path(), training=True, start=starting_splats(settings))
+    run.step = run.iterations
+    return run, settings
+
+
+def begin(run: Run, settings: Settings, target: Path, to: Path, claims: ExitStack) -> None:
+    """The new folder, with the smaller model as its checkpoint."""
+    to.mkdir(parents=True, exist_ok=True)
+    claims.enter_context(claimed(to))
+    refuse_used(str(to))
+    run.folder = to
+    write_config(to / "config.yaml", settings.resolved | {"folder": str(to)})
+    for name in ("environment.json", "metrics.jsonl"):
+        if (target / name).is_file():
+            shutil.copyfile(target / name, to / name)
+    checkpoint.save(run)
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def formats(run: Run, shrinking: Shrinking, evaluation: dict[str, Any], max_drop: float) -> dict[str, dict[str, Any]]:
+    """Bytes and what is lost of every file of the model, by suffix; of the quantised ones only the smallest within the
+    budget is left. None for models without a standard form."""
+    if own_columns(run) is not None:
+        return {}
+    gaussians = run.backbone.explicit(None, run.model_step)
+    standard = run.folder / f"point_cloud{STANDARD}"
+    out = {STANDARD: {"bytes": standard.stat().st_size, "drop": drop_of(run, shrinking, gaussians)}}
+    for suffix in FORMATS:
+        path = run.folder / f"point_cloud{suffix}"
+        try:
+            comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
+            write_gaussians(path, detached(gaussians), comments, run.raster.compensate)
+            out[suffix] = {"bytes": path.stat().st_size, "drop": drop_of(run, shrinking, read_gaussians(path))}
+        except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
+            logger.info("no %s: %s", suffix, first_line(error))
+    within = [suffix for suffix, facts in out.items() if facts["drop"] <= max_drop]
+    smallest = min(within or [STANDARD], key=lambda suffix: out[suffix]["bytes"])
+    for suffix in out:
+        out[suffix]["kept"] = suffix in (STANDARD, smallest)
+        if not out[suffix]["kept"]:
+            (run.folder / f"point_cloud{suffix}").unlink()
+    return out
+
+
+def detached(gaussians: Gaussians) -> Gaussians:
+    """On the CPU, without gradients."""
+    return Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
+
+
+def drop_of(run: Run, shrinking: Shrinking, gaussians: Gaussians) -> float:
+    """The largest loss at any zoom, dB, of Gaussians in place of the model before."""
+    found = {}
+    for zoom, before in shrinking.before.items():
+        views = [closer for view in shrinking.judging if (closer := view.zoom(float(zoom))) is not None]
+        pictures = (render(run, v.camera, splats=splats_of(gaussians, v.camera.centre)).image for v in views)
+        values = [psnr(a, v.image().to(a), v.counted()) for a, v in zip(pictures, views, strict=True)]
+        found[zoom] = before - sum(values) / len(values)
+    return max(found.values())
+
+
+# -- what is told ------------------------------------------------------------------------------------------------------
+
+
+def tell(target: Path, evaluation: dict[str, Any], found: dict[str, Any]) -> None:
+    """What became of it, beside what it was where that is known."""
+    chosen, before = found["chosen"], found["before"]
+    logger.info("%d primitives of %d", evaluation["primitives"], before["primitives"])
+    for suffix, facts in found["formats"].items():
+        note = "" if facts["kept"] else " (not kept)"
+        logger.info(
+            "%s: %.2f MB, %.2f dB lost in views that judge%s", suffix, facts["bytes"] / 1e6, facts["drop"], note
+        )
+    if (target / "evaluation.json").is_file():
+        was = read_json(target / "evaluation.json")
+        logger.info(
+            "test views: %.2f dB, before %.2f: %.2f lost; promised %.3g, %.2f in views that judge",
+            *(evaluation["psnr"], was["psnr"], was["psnr"] - evaluation["psnr"], found["max_drop_db"], chosen["drop"]),
+        )
+
+
+def overview(target: Path, to: Path) -> Path:
+    """A page with the model before and after side by side, where there was a run before; else the report."""
+    if not target.is_dir():
+        return to / "report.html"
+    (to / COMPARED).mkdir(exist_ok=True)
+    return write_overview(to / COMPARED, [target, to])

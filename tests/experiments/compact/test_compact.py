@@ -1,0 +1,210 @@
+"""gsx compact: what pictures do not need goes, what is promised is kept, a run folder comes out."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import tiny_run, tiny_settings
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.cli.dispatch import main
+from gsx.core.gaussians.ply import read_ply
+from gsx.core.quality.metrics import psnr
+from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.compact.compact import compact
+from gsx.experiments.compact.shrink import (
+    Shrinking,
+    ShrinkOptions,
+    Try,
+    closer_window,
+    figures,
+    judges,
+    learn_on,
+    without_least,
+    worth_of,
+)
+from gsx.experiments.run_folder.files import read_run, state_of
+from gsx.experiments.runs.build import build
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import open_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 60 steps."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    words = ("iterations=60", "backbone.sh_degree=2", "backbone.density.gradient=0.003", "rasterizer=eager")
+    tiny_run(path, (*words, "eval.zoom=[1,2]"))
+    return path
+
+
+def opened(folder: Path) -> Run:
+    return open_run(folder, plugins())[0]
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(1)
+
+
+def add_faint(run: Run) -> Tensor:
+    """Copies of all rows with an opacity of 1e-6; which these are."""
+    old = len(run.backbone.table)
+    append_rows(run.backbone.table, detached_rows(run.backbone.table) | {"opacity_logits": torch.full((old,), -13.8)})
+    return torch.arange(2 * old) >= old
+
+
+def test_what_cannot_be_seen_is_worth_least(folder: Path) -> None:
+    run = opened(folder)
+    faint = add_faint(run)
+    worth = worth_of(run, run.scene.train, generator())
+    assert float(worth[faint].max()) < 1e-9 * float(worth.max())
+    assert int(without_least(worth, 0.5).sum()) == len(faint) // 2
+    pictures = [render(run, view.camera).image for view in run.scene.train]
+    keep_rows(run.backbone.table, without_least(worth, 0.5))
+    for picture, view in zip(pictures, run.scene.train, strict=True):
+        assert psnr(render(run, view.camera).image, picture) > 60
+
+
+def test_worth_is_what_pictures_lose() -> None:
+    """Renders without each of a few splats, at the views' own size; the mean over many signs."""
+    run = opened_small()
+    seeds = [torch.Generator().manual_seed(seed) for seed in range(40)]
+    worth = torch.stack([worth_of(run, run.scene.train, seed) for seed in seeds]).mean(0)
+    changes = []
+    for row in range(len(worth)):
+        less = opened_small(without=row)
+        pairs = [(render(run, v.camera).image, render(less, v.camera).image) for v in run.scene.train]
+        changes.append(sum(float((a - b).square().sum()) for a, b in pairs))
+    seen = torch.tensor(changes) > 0.1
+    assert int(seen.sum()) > 4
+    logs = torch.stack([worth[seen].log(), torch.tensor(changes)[seen].log()])
+    assert float(torch.corrcoef(logs)[0, 1]) > 0.9
+
+
+def opened_small(without: int | None = None) -> Run:
+    """A model of 12 large splats."""
+    settings = tiny_settings(Path("unused"), "scene.points=12")
+    run = build(settings, load_scene(settings), Path())
+    with torch.no_grad():
+        run.backbone.table["log_scales"].fill_(-1.0)
+        run.backbone.table["opacity_logits"].copy_(torch.linspace(-3, 3, 12))
+    if without is not None:
+        keep_rows(run.backbone.table, torch.arange(12) != without)
+    return run
+
+
+def test_views_that_judge_are_not_learnt_from(folder: Path) -> None:
+    run = opened(folder)
+    learnt, judging = judges(run)
+    assert [len(learnt), len(judging)] == [4, 2]
+    assert not {view.name for view in learnt} & {view.name for view in judging}
+    few = replace(run.scene, train=run.scene.train[:2])
+    run.scene = few
+    assert judges(run) == (few.train, few.train)
+
+
+def test_a_window_is_the_middle_at_twice_the_focal_length(folder: Path) -> None:
+    camera = opened(folder).scene.train[0].camera
+    closer = closer_window(camera)
+    assert closer.fx == 2 * camera.fx
+    assert closer.size == camera.size
+    middle = torch.tensor([[24.0, 18.0]]).double()
+    torch.testing.assert_close(closer.project(ahead(camera))[0], middle, atol=1e-6, rtol=0)
+
+
+def ahead(camera) -> Tensor:
+    return (camera.centre + camera.rotation[2])[None].double()
+
+
+def test_learning_on_moves_no_rate_and_counts_no_step(folder: Path) -> None:
+    run = opened(folder)
+    rows, step = len(run.backbone.table), run.step
+    before = run.backbone.table["means"].detach().clone()
+    learn_on(run, judges(run)[0], 1, 3, plugins())
+    assert (run.step, len(run.backbone.table), len(run.scene.train)) == (step, rows, 6)
+    assert not torch.equal(run.backbone.table["means"], before)
+    assert not run.backbone.table["sh_rest"][:, 3:].any()  # bands above degree 1
+    assert run.backbone.table["sh_rest"][:, :3].any()
+    rates = run.backbone.options.rates
+    assert run.backbone.table.group("means")["lr"] == pytest.approx(rates.means_last * run.scene.extent)
+
+
+def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(folder: Path) -> None:
+    run = opened(folder)
+    before = run.backbone.table["means"].detach().clone()
+    options = ShrinkOptions(max_drop=-5.0, steps=0, tries=2, zooms=(1.0,))
+    shrinking = Shrinking(run, options, plugins(), generator())
+    best = shrinking.smallest()
+    assert best not in shrinking.tried
+    shrinking.take(best)
+    assert torch.equal(run.backbone.table["means"], before)
+
+
+def test_the_smallest_within_the_budget_is_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drops that grow with the share: 0.3 dB is met up to 60 %, which five halvings find to 1 / 32."""
+    run = opened(folder)
+    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.3, steps=0, tries=5), plugins(), generator())
+
+    def judged(share: float, degree: int) -> Try:
+        drop = 0.5 * share + {2: 0.0, 1: 0.01, 0: 0.4}[degree]
+        made = Try(removed=share, degree=degree, primitives=1, megabytes=1.0, psnr={"1": 30.0}, drop=drop)
+        shrinking.tried.append(made)
+        return made
+
+    monkeypatch.setattr(shrinking, "attempt", judged)
+    best = shrinking.smallest()
+    assert [made.removed for made in shrinking.tried[:5]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
+    assert (best.removed, best.degree) == (0.59375, 2)  # a drop of 0.297; degree 1 adds 0.01
+
+
+def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:
+    """With a checkpoint that opens, figures, files within the promise, and a page with both."""
+    to = tmp_path / "small"
+    page = compact(folder, to, 0.5, 4, ["eval.zoom=[1,2]"], plugins())
+    assert page == to / "compared" / "report.html"
+    assert page.is_file()
+    assert state_of(read_run(to)) == ("ok", "")
+    found = json.loads((to / "compact.json").read_text())
+    small, big = opened(to), opened(folder)
+    assert len(small.backbone.table) == found["chosen"]["primitives"] < len(big.backbone.table)
+    assert found["chosen"]["drop"] <= 0.5
+    assert read_run(to).evaluation["primitives"] == len(small.backbone.table)
+    for suffix, facts in found["formats"].items():
+        path = to / f"point_cloud{suffix}"
+        assert path.exists() == facts["kept"]
+        assert facts["kept"] is False or path.stat().st_size == facts["bytes"]
+        assert facts["drop"] <= 0.5 or not facts["kept"] or suffix == ".ply"
+    columns = read_ply(to / "point_cloud.ply")
+    assert len(columns["x"]) == len(small.backbone.table)
+    learnt = figures(small, judges(big)[1], [1.0])["1"]
+    assert learnt == pytest.approx(figures(big, judges(big)[1], [1.0])["1"], abs=1.0)
+
+
+def test_a_splat_file_is_made_smaller(folder: Path, tmp_path: Path) -> None:
+    scene = [f"scene.{key}" for key in ("width=48", "height=36", "train_views=6", "test_views=2", "samples=1")]
+    words = ["compact", str(folder / "point_cloud.ply"), "scene=demo", *scene, "rasterizer=eager", "device=cpu"]
+    assert main([*words, "--max-drop-db", "1", "--steps", "2", "--to", str(tmp_path / "small")]) == 0
+    found = json.loads((tmp_path / "small" / "compact.json").read_text())
+    assert found["chosen"]["primitives"] < found["before"]["primitives"]
+    assert (tmp_path / "small" / "report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["nowhere"], "does not exist: give a run folder or a splat file"),
+        (["{folder}", "--max-drop-db", "0"], "is no number above 0"),
+        (["{folder}", "--to", "{folder}"], "is not empty"),
+        (["{folder}/point_cloud.ply"], "needs the photographs to compare with"),
+    ],
+)
+def test_mistakes_are_told(
+    words: list[str], complaint: str, folder: Path, capsys: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert main(["compact", *(word.format(folder=folder) for word in words)]) == 2
+    assert complaint in capsys.readouterr().err + caplog.text
