@@ -389,7 +389,7 @@ def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: boo
 def test_growth_comes_134_times_in_the_published_run_and_234_with_levels() -> None:
     for name, calls, last in (("scaffold", 134, 14900), ("octree_scaffold", 234, 24900)):
         backbone = small_anchors(name)
-        due = [step for step in range(1, 40001) if backbone.growth_due(step)]
+        due = [step for step in range(1, 40001) if backbone.growing().due(step)]
         assert (len(due), due[0], due[-1]) == (calls, 1600, last)
 
 
