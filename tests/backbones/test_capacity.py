@@ -67,7 +67,7 @@ def test_a_budget_is_met(points: int, primitives: int, tmp_path: Path) -> None:
         (("backbone.capacity=budget",), "capacity=budget and a number above 0"),
         (("backbone.budget.primitives=9",), "capacity=budget and a number above 0"),
         (("backbone.adaptive.window=0",), r"backbone.adaptive.window is 0.0; give a number from 0.05 to 1"),
-        (("backbone.adaptive.price=-1",), "backbone.adaptive.price is -1.0; give a number from 0 to 100"),
+        (("backbone.adaptive.price=-1",), "backbone.adaptive.price is -1.0; give a number from 1e-06 to 100"),
     ],
 )
 def test_options_are_checked(words: tuple[str, ...], complaint: str, tmp_path: Path) -> None:
@@ -149,21 +149,58 @@ def test_gain_in_decibels_by_hand() -> None:
     assert error == pytest.approx(10 / math.log(10) * math.sqrt(2) * math.sqrt(2) / 10)
 
 
-def test_growth_ends_after_as_many_events_below_the_price_as_there_is_patience() -> None:
-    scene = small_scene(spread(5))
-    judge, table = adaptive(scene, price=0.5, patience=2), small_gs3d(scene, options=options_of("adaptive")).table
-    for gains, ended in (([], False), ([0.4], False), ([0.4, 0.6, 0.3], False), ([0.4, 0.3, 0.9], True)):
-        table.record["trials"] = torch.tensor([[600.0, 10, 2, gain, 0.1] for gain in gains]).view(-1, 5)
-        assert judge.ended(table) == ended
-        assert (judge.room(table, 10, 700) == 0) == ended
+def trials(*rates: float) -> Tensor:
+    """Rows of a record: step, primitives, added, gain, error, rate."""
+    return torch.tensor([[600.0, 100, 10, 1, 0, rate] for rate in rates], dtype=torch.float64).view(-1, 6)
 
 
-def test_a_share_of_those_that_ask_may_grow_up_to_the_cap() -> None:
-    scene = small_scene(spread(5))
+def test_growth_is_as_fast_as_the_last_event_has_earned() -> None:
+    scene = small_scene(spread(50))
+    judge, table = adaptive(scene, rate=0.1), small_gs3d(scene, options=options_of("adaptive")).table
+    for rates, room in (((), 5), ((0.2,), 10), ((0.2, 0.3), 15), ((0.2, 0.009), 0)):
+        table.record["trials"] = trials(*rates)
+        assert judge.room(table, 50, 700) == room
+        assert judge.ended(table) == (room == 0)
+    assert adaptive(scene).room(table, 50, 14900) == 0  # the last event
+
+
+def test_the_cap_holds_growth() -> None:
+    scene = small_scene(spread(50))
     table = small_gs3d(scene, options=options_of("adaptive")).table
-    assert adaptive(scene, share=0.4).room(table, 11, 700) == 5
-    capped = Adaptive(AdaptiveOptions(share=1.0), small_context(scene), PUBLISHED, 7)
-    assert capped.room(table, 11, 700) == 2
+    capped = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
+    assert capped.room(table, 50, 700) == 7
+
+
+@pytest.mark.parametrize(("had", "price", "rate"), [(2.0, 0.6, 0.15), (1.0, 0.6, 0.05), (10**0.06, 0.2, 0.1)])
+def test_the_rate_follows_the_gain(had: float, price: float, rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice as many primitives; a third of what they gain counts. Half the error: 1.67 times the price, 1.5 at most.
+    The same error: nothing, half of the rate at least. 0.6 dB: the price."""
+    scene = small_scene(spread(50))
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    judge = Adaptive(AdaptiveOptions(price=price, discount=1 / 3, rate=0.1), small_context(scene), PUBLISHED, 0)
+    half = small_gs3d(small_scene(spread(25)), options=options_of("adaptive")).table
+    errors = {50: torch.full((4,), 1e9).double(), 25: torch.full((4,), had * 1e9).double()}
+    monkeypatch.setattr("gsx.backbones.adaptive.window_errors", lambda model, table, *more: errors[len(table)])
+    found = judge.judge(model, lambda table: half, 700)
+    assert judge.rate(model.table) == pytest.approx(rate, rel=1e-5)
+    assert found["gain"] == pytest.approx(10 * math.log10(had) / 3, abs=1e-5)
+    assert model.table.record["trials"][0, :3].tolist() == [700, 50, 25]
+
+
+def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
+    """Half of the Gaussians are too faint to be seen: they go, and of the others those that make a difference stay."""
+    scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    with torch.no_grad():
+        model.table["opacity_logits"][:20] = -1
+        model.table["opacity_logits"][20:] = -15
+        model.table["log_scales"].fill_(-1.5)
+    judge = adaptive(scene, price=0.2)
+    assert judge.judge(model, lambda table: None, 700) == {}
+    done = judge.judge(model, lambda table: None, 14900)
+    assert done["removed"] >= 20
+    assert len(model.table) == 40 - done["removed"] > 0
+    assert bool((model.table["opacity_logits"] > -15).all())
 
 
 DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")

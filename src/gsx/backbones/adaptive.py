@@ -2,9 +2,10 @@
 
 Between two events of density control a window of some training views counts in no loss. At the next event these windows
 are drawn twice: by the model as it is, and as it would be had the last event added nothing. What the error differs by
-is the gain of what was added, told in dB per doubling of the primitives, the unit of the price. Growth that stays
-below the price for several events in turn has ended. No step sees the windows while they are withheld; they move to
-other views and places with every event, so that all pixels are learnt from in the end. Test views play no part.
+is the gain of what was added, told in dB per doubling of the primitives, the unit of the price. Growth is the faster
+the more it gains, and ends where that stays below the price; then, and at the last event, goes what is not worth it.
+No step sees the windows while they are withheld; they move to other views and places with every event, so that all
+pixels are learnt from in the end. Test views play no part.
 """
 
 import logging
@@ -18,7 +19,7 @@ from torch import Tensor
 from gsx.backbones.capacity import Growing, Undone, worth_in_training
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.ranges import Range, Share
+from gsx.core.ranges import Range
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, BackboneContext
@@ -28,6 +29,8 @@ from gsx.core.training.parameter_table import ParameterTable, keep_rows
 
 logger = logging.getLogger(__name__)
 
+SLOWER, FASTER = 0.5, 1.5
+"""By how much the rate of growth changes from one event to the next, at most."""
 ROUNDING = 1 / (12 * 255**2)
 """Squared error of a photograph's own rounding to 8 bits: what lies below it is no evidence."""
 
@@ -36,12 +39,15 @@ ROUNDING = 1 / (12 * 255**2)
 class AdaptiveOptions:
     """Growth while it pays; values in conf/backbone/parts/capacity.yaml."""
 
-    price: Annotated[float, Range(0, 100)] = 0.15
-    """dB on withheld windows that a doubling of the primitives has to bring."""
-    share: Share = 0.35
-    """Of the primitives that ask for it by the published threshold, those with most of the error: so many grow."""
-    patience: Annotated[int, Range(1, 1000)] = 2
-    """Growth ends when so many events in turn have added what gains less than the price."""
+    price: Annotated[float, Range(1e-6, 100)] = 1.0
+    """dB that a doubling of the primitives has to bring in the end."""
+    discount: Annotated[float, Range(1e-6, 1)] = 0.2
+    """In the end so much is left of what is gained at once, over a model whose other primitives count on the new."""
+    rate: Annotated[float, Range(1e-6, 10)] = 0.15
+    """Share of the primitives that the first event adds."""
+    fastest: Annotated[float, Range(1e-6, 10)] = 0.3
+    slowest: Annotated[float, Range(1e-6, 10)] = 0.01
+    """Growth that slows down to less has ended."""
     views: Annotated[int, Range(1, 1000)] = 6
     """Of which a window is withheld at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
@@ -56,15 +62,17 @@ class Trial:
     primitives: int
     added: int
     gain: float
-    """dB per doubling."""
+    """dB per doubling, discounted."""
     error: float
     """Its standard error over the windows."""
+    rate: float
+    """Share of the primitives that the next event adds."""
 
 
 class Adaptive:
     """Judges what each event has added."""
 
-    ranked, choosy = True, True
+    ranked = True
 
     def __init__(self, options: AdaptiveOptions, context: BackboneContext, growing: Growing, most: int) -> None:
         self.options, self.growing, self.most = options, growing, most
@@ -74,7 +82,7 @@ class Adaptive:
     def begin(self, table: ParameterTable) -> None:
         """Nothing has been added or found yet."""
         table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
-        table.record["trials"] = torch.zeros(0, 5, dtype=torch.float64)
+        table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
 
     # -- what is withheld ----------------------------------------------------------------------------------------
 
@@ -95,10 +103,12 @@ class Adaptive:
     # -- what is found -------------------------------------------------------------------------------------------
 
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
-        """Find what the primitives added by the event before this one have gained; at the last event remove what is
-        not worth the price."""
+        """Find what the primitives added by the event before this one have gained; when growth ends, and at the last
+        event, remove what is not worth the price."""
+        grew = not self.ended(model.table)
         found = self.tried(model, undone, step)
-        return found | (self.removed(model, step) if self.growing.share(step) == 1 else {})
+        last = self.growing.share(step) == 1
+        return found | (self.removed(model, step) if last or (grew and self.ended(model.table)) else {})
 
     def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Draw the withheld windows with and without what the last event added."""
@@ -110,12 +120,14 @@ class Adaptive:
         has, had = (window_errors(model, rows, windows, self.background, step).cpu() for rows in (table, before))
         floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
         gain, error = decibels(has + floor, had + floor)
-        doublings = math.log2(len(table) / len(before))
-        trial = Trial(step, len(table), len(table) - len(before), gain / doublings, error / doublings)
+        each = self.options.discount / math.log2(len(table) / len(before))
+        rate = self.rate(table) * min(FASTER, max(SLOWER, each * gain / self.options.price))
+        added = len(table) - len(before)
+        trial = Trial(step, len(table), added, each * gain, each * error, min(rate, self.options.fastest))
         row = torch.tensor([list(vars(trial).values())], dtype=torch.float64)
         table.record["trials"] = torch.cat([table.record["trials"], row])
         self.tell(trial, table)
-        return {"gain_per_doubling": trial.gain, "gain_error": trial.error, "price": self.options.price}
+        return {"judged": len(table), "gain": trial.gain, "gain_error": trial.error, "price": self.options.price}
 
     def removed(self, model: Backbone[Any], step: int) -> dict[str, float]:
         """Remove rows without which the error of the training views would grow by less than their share of the price.
@@ -137,23 +149,25 @@ class Adaptive:
 
     def tell(self, trial: Trial, table: ParameterTable) -> None:
         """Log what was decided, because of which number and threshold."""
-        verdict = "has ended" if self.ended(table) else "goes on"
+        verdict = "has ended" if self.ended(table) else f"goes on by {trial.rate:.1%}"
         gain, price = f"{trial.gain:.2f} +- {trial.error:.2f} dB per doubling in withheld windows", self.options.price
         told = trial.step, verdict, trial.primitives, trial.added, gain, price
         logger.info("step %d: growth %s at %d primitives: the last %d gained %s, price %.2f", *told)
 
+    def rate(self, table: ParameterTable) -> float:
+        """Share of the primitives that the next event adds: more while a doubling gains more than its price."""
+        trials = table.record["trials"]
+        return float(trials[-1, 5]) if len(trials) else self.options.rate
+
     def ended(self, table: ParameterTable) -> bool:
-        """Whether so many events in turn gained less than the price."""
-        gains = table.record["trials"][:, 3]
-        failed = (gains < self.options.price).tolist()
-        run = self.options.patience
-        return any(all(failed[i : i + run]) for i in range(len(failed) - run + 1))
+        """Whether growth has become too slow to go on."""
+        return self.rate(table) < self.options.slowest
 
     def room(self, table: ParameterTable, wanted: int, step: int) -> int:
-        """A share of those that ask for it while growth pays; none at the last event, which nothing would judge."""
+        """A share of the primitives while growth pays; none at the last event, which nothing would judge."""
         if self.ended(table) or self.growing.share(step) == 1:
             return 0
-        return min(math.ceil(self.options.share * wanted), room_under(self.most, len(table)))
+        return min(math.ceil(self.rate(table) * len(table)), room_under(self.most, len(table)))
 
     def plan(self) -> dict[str, Any]:
         """The price."""

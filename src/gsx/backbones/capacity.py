@@ -60,8 +60,6 @@ class Capacity(Protocol):
 
     ranked: bool
     """Whether those that draw most of the error come first."""
-    choosy: bool
-    """Whether only those come that ask for it by the published threshold."""
 
     def begin(self, table: ParameterTable) -> None:
         """Give a fresh table what is kept there."""
@@ -87,7 +85,7 @@ class Capacity(Protocol):
 class Cap:
     """As published: whatever density control asks for, up to a cap."""
 
-    ranked, choosy = False, True
+    ranked = False
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -115,7 +113,7 @@ class Cap:
 class Budget(Cap):
     """Growth along a curve to a number of primitives (Taming-3DGS; the curve of Improved-GS)."""
 
-    ranked, choosy = True, False
+    ranked = True
 
     def __init__(self, options: BudgetOptions, context: BackboneContext, growing: Growing) -> None:
         super().__init__(options.primitives)

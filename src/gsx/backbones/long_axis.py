@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.density import mean_absolute, mean_gradient, within_room
+from gsx.core.training.density import mean_absolute, within_room
 from gsx.core.training.evidence import drawn_errors, some_of
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
 
@@ -94,7 +94,7 @@ class LongAxis:
         table = model.table
         views = some_of(control.views, self.views, control.generator)
         score = drawn_errors(model, views, control.background, step) * mean_absolute(table)
-        wanted = (score > 0) & (mean_gradient(table) >= (control.options.gradient if control.capacity.choosy else 0))
+        wanted = score > 0
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
         count = int(chosen.sum())
         split_along(table, chosen)

@@ -92,6 +92,8 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "headline": headline(evaluation),
         "zoom": zoom_rows(evaluation),
         "zoom_chart": zoom_chart(evaluation),
+        "growth_chart": growth_chart(run.lines),
+        "removals": [line for line in run.lines if is_number(line.get("removed"))],
         "curves": curves(run),
         "resets": any(line.get("opacity_resets") for line in run.lines),
         "skipped": any(line.get("skipped") for line in run.lines),
@@ -216,6 +218,15 @@ def zoom_chart(evaluation: dict[str, Any]) -> str:
         Series(name="resized ×1 render", x=zooms, y=enlarged, kind="test", dots=True),
     ]
     return line_chart(both, x_label="zoom, times the training resolution", x_ticks=zooms)
+
+
+def growth_chart(lines: Sequence[dict[str, Any]]) -> str:
+    """What each event of growth gained, and the price, over the primitives; empty where nothing was judged."""
+    judged = [line for line in lines if all(is_number(line.get(name)) for name in ("judged", "gain", "price"))]
+    count = [line["judged"] for line in judged]
+    gain = Series(name="gain", x=count, y=[line["gain"] for line in judged], dots=True)
+    price = Series(name="price", x=count, y=[line["price"] for line in judged], kind="test")
+    return line_chart([gain, price], x_label="primitives")
 
 
 # -- curves --------------------------------------------------------------------------------------------------------
