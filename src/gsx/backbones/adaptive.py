@@ -39,13 +39,14 @@ ROUNDING = 1 / (12 * 255**2)
 class AdaptiveOptions:
     """Growth while it pays; values in conf/backbone/parts/capacity.yaml."""
 
-    price: Annotated[float, Range(1e-6, 100)] = 1.0
+    price: Annotated[float, Range(1e-6, 100)] = 0.8
     """dB that a doubling of the primitives has to bring in the end."""
     discount: Annotated[float, Range(1e-6, 1)] = 0.2
-    """In the end so much is left of what is gained at once, over a model whose other primitives count on the new."""
-    rate: Annotated[float, Range(1e-6, 10)] = 0.15
+    """So much of what is found during growth is left in the end: of gains, since other primitives count on the new
+    ones and nothing has learnt without them; of errors, since learning goes on."""
+    rate: Annotated[float, Range(1e-6, 10)] = 0.1
     """Share of the primitives that the first event adds."""
-    fastest: Annotated[float, Range(1e-6, 10)] = 0.3
+    fastest: Annotated[float, Range(1e-6, 10)] = 0.15
     slowest: Annotated[float, Range(1e-6, 10)] = 0.01
     """Growth that slows down to less has ended."""
     views: Annotated[int, Range(1, 1000)] = 6
@@ -133,10 +134,11 @@ class Adaptive:
         """Remove rows without which the error of the training views would grow by less than their share of the price.
 
         One of N rows may cost lambda / (N ln 2) dB, lambda being the price: a share of lambda ln 10 / (10 N ln 2) of
-        the squared error.
+        the squared error, as it will be in the end.
         """
         found = worth_in_training(model, self.context, step)
-        least = self.options.price * math.log(10) / (10 * math.log(2)) * found.error_share
+        lasting = self.options.discount * found.error_share
+        least = self.options.price * math.log(10) / (10 * math.log(2)) * lasting
         doomed = (found.shown > 0) & (found.squares < least)
         if bool(doomed.all()):
             return {}

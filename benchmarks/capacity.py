@@ -1,0 +1,133 @@
+"""How many primitives a scene needs: published growth, budgets, and growth that pays for itself (docs/capacity.md).
+
+    python benchmarks/capacity.py [--scenes FOLDER] [--only fox,lego] [--backbones gs3d,mip_splatting] [--seeds 0,1,2]
+
+FOLDER holds `fox` (COLMAP), `lego` (NeRF-Synthetic), `castle` (photographs alone); without it only the built-in scene
+is measured. Every scene is trained as published, adaptively, and with a budget of as many primitives as published ends
+with, and of fewer, beside published growth held at that cap; the same steps. Finished runs below --runs are not trained
+again. A quarter of an hour of two cores for a scene, a backbone and a seed.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from measuring.machine import describe_machine, shown_command, told_load
+from measuring.results import read_sections, stamped, text_table, write_results
+from measuring.runs import train
+from zoom import numbers, over_seeds, told
+
+RESULTS = Path(__file__).parent / "results"
+SUBJECTS = {
+    "fox": ("scene=colmap", "scene.downscale=8", "iterations=1000"),
+    "fox_4": ("scene=colmap", "scene.downscale=4", "iterations=1500"),
+    "lego": ("scene=blender", "scene.downscale=4", "iterations=1200"),
+    "castle": ("scene=photos", "scene.downscale=8", "iterations=800"),
+    "demo": ("scene=demo", "iterations=900"),
+}
+FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000}
+"""Primitives of the smaller budget."""
+ARMS = ("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer")
+ZOOMS = ("1", "2", "4")
+
+
+def arguments(words: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
+    parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
+    parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
+    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
+    parser.add_argument("--runs", type=Path, default=Path("outputs/capacity"), help="where the runs are kept")
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
+    return parser.parse_args(words)
+
+
+def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
+    """What makes an arm; `published`: evaluation of the published arm with the same seed."""
+    number = published["primitives"] if arm == "budget as published" else FEWER[scene]
+    return {
+        "published": [],
+        "adaptive": ["backbone.capacity=adaptive"],
+        "published, held at fewer": [f"backbone.max_primitives={number}"],
+    }.get(arm, ["backbone.capacity=budget", f"backbone.budget.primitives={number}"])
+
+
+def evaluation_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+    """Of the run of an arm, which is trained unless it is there."""
+    published = {} if arm in ("published", "adaptive") else evaluation_of("published", scene, backbone, seed, given)
+    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
+    folder = given.runs / "_".join([backbone, scene, arm.replace(",", "").replace(" ", "_"), str(seed)])
+    print(time.strftime("%H:%M"), folder.name, flush=True)
+    words = [f"backbone={backbone}", *overrides_of(arm, scene, published or {"primitives": 0}), *SUBJECTS[scene]]
+    threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
+    more = [*where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    return train(folder, [*words, *more], threads, folder.with_name(f"{folder.name}.log"))
+
+
+def row_of(scene: str, arm: str, own: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Means over seeds, and what is different from the published arm, seed by seed."""
+    pairs = list(zip(own, first, strict=True))
+    row = {"scene": scene, "arm": arm, "seeds": len(own)}
+    for factor in ZOOMS:
+        row[f"x{factor}"] = told([run["zoom"][factor]["psnr"] for run in own], ".2f")
+        row[f"more{factor}"] = told([a["zoom"][factor]["psnr"] - b["zoom"][factor]["psnr"] for a, b in pairs], "+.2f")
+    row["primitives"] = round(statistics.mean(run["primitives"] for run in own))
+    row["share"] = f"{statistics.mean(a['primitives'] / b['primitives'] for a, b in pairs):.2f}"
+    row["seconds"] = round(statistics.median(run["train_seconds"] for run in own))
+    row["times"] = f"{statistics.median(a['train_seconds'] / b['train_seconds'] for a, b in pairs):.2f}"
+    return row
+
+
+COLUMNS = [
+    *(["scene", "scene"], ["arm", "growth"], ["seeds", "seeds"]),
+    *(column for f in ZOOMS for column in ([f"x{f}", f"x{f}"], [f"more{f}", f"x{f} - published"])),
+    *(["primitives", "primitives"], ["share", "of published"], ["seconds", "training s"], ["times", "of published"]),
+]
+NOTE = (
+    "PSNR on held-out views, dB, means over seeds ± half their range; differences and shares seed by seed, times are "
+    "medians. The same steps. Budget of fewer: {fewer}."
+)
+
+
+def measured(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    arms = [arm for arm in ARMS if arm in ("published", *given.arms.split(";"))]
+
+    def look(scene: str, seed: int) -> dict[Any, Any]:
+        return {arm: evaluation_of(arm, scene, backbone, seed, given) for arm in arms}
+
+    found = over_seeds(look, scenes, given)
+    return [
+        row_of(scene, arm, [one[arm] for one in found[scene]], [one["published"] for one in found[scene]])
+        for scene in scenes
+        for arm in arms
+    ]
+
+
+def main(words: Sequence[str]) -> None:
+    """Train and write the tables."""
+    given = arguments(words)
+    machine, load = describe_machine(torch.device("cpu")), told_load()
+    machine |= {"threads": 1} if given.jobs > 1 else {}
+    read_sections(given.to / "capacity_cpu.json")  # what cannot be added to is refused before training
+    note = NOTE.format(fewer=", ".join(f"{scene} {count:,}" for scene, count in FEWER.items()))
+    for backbone in given.backbones.split(","):
+        title = f"Growth of {backbone}"
+        command = shown_command(words, "benchmarks/capacity.py")
+        table = stamped(title, COLUMNS, measured(backbone, given), [note], load, command)
+        write_results(given.to, "capacity_cpu", machine, {backbone: table})
+        print(text_table(table))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
