@@ -45,6 +45,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
     parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
+    parser.add_argument("--label", default="", help="of tables over other scenes, seeds or rows: added to their names")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/capacity"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
@@ -125,7 +126,7 @@ def main(words: Sequence[str]) -> None:
         title = f"Growth of {backbone}"
         command = shown_command(words, "benchmarks/capacity.py")
         table = stamped(title, COLUMNS, measured(backbone, given), [note], load, command)
-        write_results(given.to, "capacity_cpu", machine, {backbone: table})
+        write_results(given.to, "capacity_cpu", machine, {backbone + given.label: table})
         print(text_table(table))
 
 
