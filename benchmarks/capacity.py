@@ -1,14 +1,16 @@
 """How many primitives a scene needs: published growth, budgets, and growth that pays for itself (docs/capacity.md).
 
-    python benchmarks/capacity.py [--scenes FOLDER] [--only fox,lego] [--backbones gs3d,mip_splatting] [--seeds 0,1,2]
+    python benchmarks/capacity.py [--scenes FOLDER] [--what growth,compact] [--only fox,lego] [--backbones gs3d]
 
 FOLDER holds `fox` (COLMAP), `lego` (NeRF-Synthetic), `castle` (photographs alone); without it only the built-in scene
-is measured. Every scene is trained as published, adaptively, and with a budget of as many primitives as published ends
-with, and of fewer, beside published growth held at that cap; the same steps. Finished runs below --runs are not trained
-again. A quarter of an hour of two cores for a scene, a backbone and a seed.
+is measured. `growth`: every scene is trained as published, adaptively, and with a budget of as many primitives as
+published ends with, and of fewer, beside published growth held at that cap; the same steps. `compact`: the published
+runs made smaller by `gsx compact`. Finished runs below --runs are not trained again. A quarter of an hour of two cores
+for a scene, a backbone and a seed.
 """
 
 import argparse
+import shutil
 import statistics
 import sys
 import time
@@ -18,9 +20,10 @@ from typing import Any
 
 import torch
 
+from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
-from measuring.runs import train
+from measuring.runs import gsx, train
 from zoom import numbers, over_seeds, told
 
 RESULTS = Path(__file__).parent / "results"
@@ -41,6 +44,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser.add_argument("--what", default="growth,compact", help="tables, by commas")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
@@ -62,11 +66,16 @@ def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
     }.get(arm, ["backbone.capacity=budget", f"backbone.budget.primitives={number}"])
 
 
+def folder_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> Path:
+    """Where a run is kept."""
+    return given.runs / "_".join([backbone, scene, arm.replace(",", "").replace(" ", "_"), str(seed)])
+
+
 def evaluation_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of the run of an arm, which is trained unless it is there."""
     published = {} if arm in ("published", "adaptive") else evaluation_of("published", scene, backbone, seed, given)
     where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
-    folder = given.runs / "_".join([backbone, scene, arm.replace(",", "").replace(" ", "_"), str(seed)])
+    folder = folder_of(arm, scene, backbone, seed, given)
     print(time.strftime("%H:%M"), folder.name, flush=True)
     words = [f"backbone={backbone}", *overrides_of(arm, scene, published or {"primitives": 0}), *SUBJECTS[scene]]
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
@@ -115,6 +124,73 @@ def measured(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
+# -- made smaller afterwards -------------------------------------------------------------------------------------------
+
+PROMISE = 0.1
+"""dB that may be lost."""
+COMPACT_COLUMNS = [
+    *(["scene", "scene"], ["seeds", "seeds"], ["primitives", "primitives"], ["left", "left"]),
+    *(["ply", "PLY, of its bytes"], ["smallest", "smallest file"], ["file", "of the PLY's bytes"]),
+    ["judged", "lost in views that judge, dB"],
+    *([f"lost{factor}", f"in test views at x{factor}, dB"] for factor in ZOOMS),
+]
+COMPACT_NOTE = (
+    f"`gsx compact RUN --max-drop-db {PROMISE}` of published runs, means over seeds ± half their range. Losses are those "
+    "of the model and its PLY. The smallest file is quantised, and in views that judge it keeps the promise, too."
+)
+
+
+def compacted(scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+    """compact.json of a published run made smaller, its evaluations before (`was`) and after (`is`), bytes before."""
+    evaluation = evaluation_of("published", scene, backbone, seed, given)
+    folder = folder_of("published", scene, backbone, seed, given)
+    to = folder.with_name(f"{folder.name}_compact")
+    if not (to / "compact.json").is_file():
+        print(time.strftime("%H:%M"), to.name, flush=True)
+        shutil.rmtree(to, ignore_errors=True)
+        words = ["compact", str(folder), "--max-drop-db", str(PROMISE), "--to", str(to)]
+        gsx(words, {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}, to.with_name(f"{to.name}.log"))
+    after = {"was": evaluation, "is": read_json(to / "evaluation.json")}
+    return read_json(to / "compact.json") | after | {"bytes": (folder / "point_cloud.ply").stat().st_size}
+
+
+def smallest_file(found: dict[str, Any]) -> str:
+    """Suffix of the smallest file that was kept."""
+    kept = {suffix: facts["bytes"] for suffix, facts in found["formats"].items() if facts["kept"]}
+    return min(kept, key=lambda suffix: kept[suffix])
+
+
+def share_of_bytes(found: Sequence[dict[str, Any]], suffixes: Sequence[str]) -> float:
+    """Mean size of files, over that of the PLY before."""
+    return statistics.mean(one["formats"][s]["bytes"] / one["bytes"] for one, s in zip(found, suffixes, strict=True))
+
+
+def compact_row(scene: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Means over seeds."""
+    files = [smallest_file(one) for one in found]
+    row = {
+        "scene": scene,
+        "seeds": len(found),
+        "primitives": round(statistics.mean(one["was"]["primitives"] for one in found)),
+        "left": f"{statistics.mean(one['is']['primitives'] / one['was']['primitives'] for one in found):.2f}",
+        "ply": f"{share_of_bytes(found, ['.ply'] * len(found)):.2f}",
+        "smallest": ", ".join(sorted(set(files))),
+        "file": f"{share_of_bytes(found, files):.3f}",
+        "judged": told([one["chosen"]["drop"] for one in found], ".2f"),
+    }
+    for factor in ZOOMS:
+        lost = [one["was"]["zoom"][factor]["psnr"] - one["is"]["zoom"][factor]["psnr"] for one in found]
+        row[f"lost{factor}"] = told(lost, ".2f")
+    return row
+
+
+def made_smaller(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    found = over_seeds(lambda scene, seed: compacted(scene, backbone, seed, given), scenes, given)
+    return [compact_row(scene, found[scene]) for scene in scenes]
+
+
 def main(words: Sequence[str]) -> None:
     """Train and write the tables."""
     given = arguments(words)
@@ -122,12 +198,17 @@ def main(words: Sequence[str]) -> None:
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "capacity_cpu.json")  # what cannot be added to is refused before training
     note = NOTE.format(fewer=", ".join(f"{scene} {count:,}" for scene, count in FEWER.items()))
+    command = shown_command(words, "benchmarks/capacity.py")
     for backbone in given.backbones.split(","):
-        title = f"Growth of {backbone}"
-        command = shown_command(words, "benchmarks/capacity.py")
-        table = stamped(title, COLUMNS, measured(backbone, given), [note], load, command)
-        write_results(given.to, "capacity_cpu", machine, {backbone + given.label: table})
-        print(text_table(table))
+        tables = {}
+        if "growth" in given.what:
+            rows = measured(backbone, given)
+            tables[backbone] = stamped(f"Growth of {backbone}", COLUMNS, rows, [note], load, command)
+        if "compact" in given.what:
+            title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
+            tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)
+        write_results(given.to, "capacity_cpu", machine, {name + given.label: table for name, table in tables.items()})
+        print(*map(text_table, tables.values()), sep="\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How many primitives there are: curves by hand, budgets met, what is withheld, what ends growth, resume."""
+"""How many primitives there are: curves by hand, budgets met, validation windows, what ends growth, resume."""
 
 import math
 from dataclasses import replace
@@ -66,6 +66,7 @@ def test_a_budget_is_met(points: int, primitives: int, tmp_path: Path) -> None:
         (("backbone.capacity=most",), "backbone.capacity is 'most'; choose published, budget or adaptive"),
         (("backbone.capacity=budget",), "capacity=budget and a number above 0"),
         (("backbone.budget.primitives=9",), "capacity=budget and a number above 0"),
+        (("backbone.capacity=budget", "backbone.budget.primitives=6000000"), "above backbone.max_primitives"),
         (("backbone.adaptive.window=0",), r"backbone.adaptive.window is 0.0; give a number from 0.05 to 1"),
         (("backbone.adaptive.price=-1",), "backbone.adaptive.price is -1.0; give a number from 1e-06 to 100"),
     ],
@@ -81,7 +82,7 @@ def test_every_backbone_takes_every_capacity(backbone: str, tmp_path: Path) -> N
         tiny_settings(tmp_path, f"backbone={backbone}", *words)
 
 
-# -- what is withheld --------------------------------------------------------------------------------------------------
+# -- validation windows ------------------------------------------------------------------------------------------------
 
 
 def adaptive(scene: Scene, growing: Growing = PUBLISHED, **more: float) -> Adaptive:
@@ -93,7 +94,7 @@ def test_windows_move_with_every_event_and_stay_between() -> None:
     judge, model = adaptive(scene, views=3), small_gs3d(scene, options=options_of("adaptive"))
 
     def all_at(step: int) -> dict[str, Window]:
-        found = {view.name: judge.withheld(model.table, view, step) for view in scene.train}
+        found = {view.name: judge.validation_window(model.table, view, step) for view in scene.train}
         return {name: window for name, window in found.items() if window is not None}
 
     assert len(all_at(601)) == 3
@@ -111,15 +112,15 @@ def test_a_window_lies_where_it_is_told() -> None:
     assert part_of(view, 1.0, 0.7, 0.2) == Window(0, 0, 24, 16)
 
 
-def test_training_does_not_see_what_is_withheld(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Photographs white where they are withheld train to the same bits, until the windows move."""
+def test_training_does_not_see_validation_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs white in their windows train to the same bits, until the windows move."""
     words = ("iterations=30", "backbone.capacity=adaptive", "backbone.density.stop=29000", "rasterizer=eager")
     plain = tiny_run(tmp_path / "plain", words, stop_after=5)
     model, image = plain.backbone, View.image
 
     def disturbed(self: View) -> Tensor:
         out = image(self).clone()
-        window = model.withheld(self, 2)  # type: ignore[attr-defined]
+        window = model.validation_window(self, 2)  # type: ignore[attr-defined]
         if window is not None and out.shape[1:] == (self.camera.height, self.camera.width):
             out[:, *window.pixels] = 1
         return out

@@ -1,11 +1,11 @@
-"""As many primitives as pay for themselves: growth goes on while windows that are withheld from the loss say so.
+"""As many primitives as pay for themselves: growth goes on while validation windows say so.
 
-Between two events of density control a window of some training views counts in no loss. At the next event these windows
-are drawn twice: by the model as it is, and as it would be had the last event added nothing. What the error differs by
+Between two events of density control a window of some training views counts in no loss. At the next event they are
+drawn twice: by the model as it is, and as it would be had the last event added nothing. What the error differs by
 is the gain of what was added, told in dB per doubling of the primitives, the unit of the price. Growth is the faster
 the more it gains, and ends where that stays below the price; then, and at the last event, goes what is not worth it.
-No step sees the windows while they are withheld; they move to other views and places with every event, so that all
-pixels are learnt from in the end. Test views play no part.
+No step has seen the windows since what is judged was added; they move to other views and places with every event, so
+that all pixels are learnt from in the end. Test views play no part.
 """
 
 import logging
@@ -50,7 +50,7 @@ class AdaptiveOptions:
     slowest: Annotated[float, Range(1e-6, 10)] = 0.01
     """Growth that slows down to less has ended."""
     views: Annotated[int, Range(1, 1000)] = 6
-    """Of which a window is withheld at a time."""
+    """Training views that have a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
     """Its sides as shares of the view's."""
 
@@ -85,17 +85,17 @@ class Adaptive:
         table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
         table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
 
-    # -- what is withheld ----------------------------------------------------------------------------------------
+    # -- validation windows --------------------------------------------------------------------------------------
 
     def windows(self, interval: int) -> dict[View, Window]:
-        """The windows that are withheld during an interval between events, counted from 0."""
-        generator = torch.Generator().manual_seed(derived_seed("withheld", interval))
+        """The windows that count in no loss during an interval between events, counted from 0."""
+        generator = torch.Generator().manual_seed(derived_seed("validation", interval))
         order = torch.randperm(len(self.views), generator=generator)[: self.options.views].tolist()
         corners = torch.rand(len(order), 2, generator=generator).tolist()
         chosen = zip([self.views[index] for index in order], corners, strict=True)
         return {view: part_of(view, self.options.window, *corner) for view, corner in chosen}
 
-    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+    def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """That of the interval which the step belongs to, while there is something to judge."""
         if not self.growing.start < step < self.growing.stop or self.ended(table):
             return None
@@ -112,7 +112,7 @@ class Adaptive:
         return found | (self.removed(model, step) if last or (grew and self.ended(model.table)) else {})
 
     def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
-        """Draw the withheld windows with and without what the last event added."""
+        """Draw the validation windows with and without what the last event added."""
         table = model.table
         before = None if self.ended(table) else undone(table)
         if before is None:
@@ -152,7 +152,7 @@ class Adaptive:
     def tell(self, trial: Trial, table: ParameterTable) -> None:
         """Log what was decided, because of which number and threshold."""
         verdict = "has ended" if self.ended(table) else f"goes on by {trial.rate:.1%}"
-        gain, price = f"{trial.gain:.2f} +- {trial.error:.2f} dB per doubling in withheld windows", self.options.price
+        gain, price = f"{trial.gain:.2f} +- {trial.error:.2f} dB per doubling in validation windows", self.options.price
         told = trial.step, verdict, trial.primitives, trial.added, gain, price
         logger.info("step %d: growth %s at %d primitives: the last %d gained %s, price %.2f", *told)
 

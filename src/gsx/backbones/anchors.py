@@ -172,9 +172,9 @@ class Anchors:
         growth, steps = self.options.growth, self.schedule
         return Growing(steps.step(growth.start), steps.step(growth.stop), steps.interval(growth.every))
 
-    def withheld(self, view: View, step: int) -> Window | None:
+    def validation_window(self, view: View, step: int) -> Window | None:
         """What capacity is judged by."""
-        return self.capacity.withheld(self.table, view, step)
+        return self.capacity.validation_window(self.table, view, step)
 
     def grow_and_prune(self, step: int) -> dict[str, float]:
         """Grow, forget what was judged, prune, clamp: the order of the reference (Scaffold-GS)."""

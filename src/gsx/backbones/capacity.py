@@ -73,7 +73,7 @@ class Capacity(Protocol):
         """How many of the primitives `wanted` may be added now."""
         ...
 
-    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+    def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """The window of a view that counts in no loss at a step; None: all of it counts."""
         ...
 
@@ -101,7 +101,7 @@ class Cap:
         """Up to the cap."""
         return room_under(self.most, len(table))
 
-    def withheld(self, table: ParameterTable, view: View, step: int) -> Window | None:
+    def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """Nothing."""
         return None
 

@@ -32,6 +32,11 @@ class CapacityOptions:
                 f"backbone.capacity is {self.capacity} and backbone.budget.primitives {self.budget.primitives}: "
                 "a budget of so many primitives takes both, capacity=budget and a number above 0"
             )
+        if 0 < self.max_primitives < self.budget.primitives:
+            raise ValueError(
+                f"backbone.budget.primitives is {self.budget.primitives}, above backbone.max_primitives, which is "
+                f"{self.max_primitives}: raise that, or set it to 0"
+            )
 
 
 def capacity_of(options: CapacityOptions, context: BackboneContext, growing: Growing) -> Capacity:

@@ -156,9 +156,9 @@ class GS3D:
         if seen:
             add_statistics(self.table, seen)
 
-    def withheld(self, view: View, step: int) -> Window | None:
+    def validation_window(self, view: View, step: int) -> Window | None:
         """What capacity is judged by."""
-        return self.capacity.withheld(self.table, view, step)
+        return self.capacity.validation_window(self.table, view, step)
 
     def densify_and_prune(self, step: int) -> dict[str, float]:
         """Clone, split, prune and reset when due."""

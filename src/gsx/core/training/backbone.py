@@ -152,10 +152,10 @@ class Planned(Protocol):
 
 
 @runtime_checkable
-class Withholding(Protocol):
+class Validating(Protocol):
     """A backbone that keeps parts of training views from being learnt for a while, to judge by them."""
 
-    def withheld(self, view: View, step: int) -> Window | None:
+    def validation_window(self, view: View, step: int) -> Window | None:
         """The window of the view that is to count in no loss at this step; None: all of it counts."""
         ...
 

@@ -17,7 +17,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Drawn, Observation, Withholding, remove_nonfinite
+from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
@@ -142,7 +142,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
 def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | None:
     """Pixels that count: all but those masked, and those of a window that the backbone keeps to judge by."""
     counted = view.counted()
-    window = run.backbone.withheld(view, number) if isinstance(run.backbone, Withholding) else None
+    window = run.backbone.validation_window(view, number) if isinstance(run.backbone, Validating) else None
     if window is None:
         return counted
     left = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
