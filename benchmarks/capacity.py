@@ -135,7 +135,7 @@ COMPACT_COLUMNS = [
     *([f"lost{factor}", f"in test views at x{factor}, dB"] for factor in ZOOMS),
 ]
 COMPACT_NOTE = (
-    f"`gsx compact RUN --max-drop-db {PROMISE}` of published runs, means over seeds ± half their range. Losses are those "
+    f"`gsx compact RUN --max-drop-db {PROMISE}` of published runs, means over seeds ± half their range. Losses: those "
     "of the model and its PLY. The smallest file is quantised, and in views that judge it keeps the promise, too."
 )
 

@@ -1,5 +1,6 @@
 """How many primitives there are: curves by hand, budgets met, validation windows, what ends growth, resume."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
+from gsx.experiments.reports.report import growth_chart
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -204,6 +206,14 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
     assert bool((model.table["opacity_logits"] > -15).all())
 
 
+def test_reports_show_what_growth_gained() -> None:
+    lines = [{"step": s, "judged": n, "gain": g, "price": 0.8} for s, n, g in ((6, 100, 2.0), (12, 150, 0.5))]
+    chart = growth_chart([{"step": 1}, *lines])
+    assert chart.count("<polyline") + chart.count("<path") >= 2
+    assert growth_chart([{"step": 1}, {"step": 2, "judged": 3}]) == ""
+    assert growth_chart([]) == ""
+
+
 DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
 """Events at steps 6, 12 and, of backbones published with 30,000 steps, 18 of 24."""
 
@@ -224,6 +234,9 @@ def test_adaptive_runs_resume_bit_for_bit(words: tuple[str, ...], part: str, tmp
     tiny_run(tmp_path / "whole", words)
     expected = final_tensors(tmp_path / "whole")
     assert len(expected["record.trials"]) > 0
+    lines = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    judged = [(line["step"], line["judged"], line["gain"]) for line in lines if "judged" in line]
+    assert judged == [tuple(trial[[0, 1, 3]].tolist()) for trial in expected["record.trials"]]
     for stop in (9, 13):
         tiny_run(tmp_path / f"parts{stop}", words, stop_after=stop)
         again, settings = open_run(tmp_path / f"parts{stop}", plugins(), ())
