@@ -2,12 +2,14 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from small_scene import published_options, small_context, small_gs3d, small_scene, spread
+from test_anchors import small_anchors
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
@@ -18,7 +20,10 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
+from gsx.core.training.distributed import Ranks
+from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 from gsx.experiments.reports.report import growth_chart
+from gsx.experiments.runs.build import refuse_own_judgement
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -150,6 +155,47 @@ def test_gain_in_decibels_by_hand() -> None:
     gain, error = decibels(torch.tensor([9.0, 1.0]).double(), torch.tensor([8.0, 2.0]).double())
     assert gain == 0
     assert error == pytest.approx(10 / math.log(10) * math.sqrt(2) * math.sqrt(2) / 10)
+
+
+def test_an_event_on_anchors_adds_what_there_is_room_for_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though cells of several sizes are tried in turn."""
+    asked = []
+    backbone = small_anchors("scaffold")
+    monkeypatch.setattr(backbone.capacity, "room", lambda table, wanted, step: 7)
+
+    def grow(table: ParameterTable, representation: object, least: float, room: Callable[[int], int], step: int):
+        asked.append(room(100))
+        append_rows(table, {name: value[:5] for name, value in detached_rows(table).items()})
+        asked.append(room(100))
+        return 5, 0
+
+    monkeypatch.setattr(backbone.grid, "grow", grow)
+    backbone.grow_and_prune(1600)
+    assert asked == [7, 2]
+
+
+def test_a_cap_that_holds_growth_is_told() -> None:
+    scene = small_scene(spread(50))
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    capped = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
+    assert capped.judge(model, lambda table: None, 700) == {"withheld": 8}  # 15 asked for, room for 7
+
+
+def test_what_no_view_shows_outlives_a_budget() -> None:
+    """Of a budget of 8 and 20 points: half lie behind the cameras."""
+    points = spread(20)
+    points[10:, 1] -= 50
+    model = small_gs3d(small_scene(points), options=options_of("budget", budget=BudgetOptions(primitives=8)))
+    model.capacity.judge(model, lambda table: None, 14900)
+    assert len(model.table) == 8
+    assert bool((model.table["means"][:, 1] < -40).all())
+
+
+def test_several_processes_do_not_each_judge_for_themselves() -> None:
+    refuse_own_judgement(options_of("published"), Ranks(size=2))
+    refuse_own_judgement(options_of("adaptive"), Ranks())
+    with pytest.raises(ConfigError, match="capacity=adaptive is for one process"):
+        refuse_own_judgement(options_of("adaptive"), Ranks(size=2))
 
 
 def trials(*rates: float) -> Tensor:

@@ -89,7 +89,7 @@ class Adaptive:
 
     def windows(self, interval: int) -> dict[View, Window]:
         """The windows that count in no loss during an interval between events, counted from 0."""
-        generator = torch.Generator().manual_seed(derived_seed("validation", interval))
+        generator = torch.Generator().manual_seed(derived_seed("withheld", interval))
         order = torch.randperm(len(self.views), generator=generator)[: self.options.views].tolist()
         corners = torch.rand(len(order), 2, generator=generator).tolist()
         chosen = zip([self.views[index] for index in order], corners, strict=True)
@@ -109,7 +109,9 @@ class Adaptive:
         grew = not self.ended(model.table)
         found = self.tried(model, undone, step)
         last = self.growing.share(step) == 1
-        return found | (self.removed(model, step) if last or (grew and self.ended(model.table)) else {})
+        found |= self.removed(model, step) if last or (grew and self.ended(model.table)) else {}
+        held = self.asked(model.table, step) - room_under(self.most, len(model.table))
+        return found | ({"withheld": held} if held > 0 else {})
 
     def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Draw the validation windows with and without what the last event added."""
@@ -118,7 +120,8 @@ class Adaptive:
         if before is None:
             return {}
         windows = self.windows((step - 1) // self.growing.every)
-        has, had = (window_errors(model, rows, windows, self.background, step).cpu() for rows in (table, before))
+        form = self.context.forming(step)
+        has, had = (window_errors(model, rows, windows, form, self.background, step).cpu() for rows in (table, before))
         floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
         gain, error = decibels(has + floor, had + floor)
         each = self.options.discount / math.log2(len(table) / len(before))
@@ -128,13 +131,15 @@ class Adaptive:
         row = torch.tensor([list(vars(trial).values())], dtype=torch.float64)
         table.record["trials"] = torch.cat([table.record["trials"], row])
         self.tell(trial, table)
-        return {"judged": len(table), "gain": trial.gain, "gain_error": trial.error, "price": self.options.price}
+        spread = {"gain_error": trial.error} if math.isfinite(trial.error) else {}  # of one window there is none
+        return {"judged": len(table), "gain": trial.gain, "price": self.options.price} | spread
 
     def removed(self, model: Backbone[Any], step: int) -> dict[str, float]:
         """Remove rows without which the error of the training views would grow by less than their share of the price.
 
-        One of N rows may cost lambda / (N ln 2) dB, lambda being the price: a share of lambda ln 10 / (10 N ln 2) of
-        the squared error, as it will be in the end.
+        A view that shows N rows may lose lambda / (N ln 2) dB with one of them, lambda being the price: lambda ln 10 /
+        (10 N ln 2) of its squared error, as that will be in the end. Rows are judged in the mean over the views that
+        show them.
         """
         found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share
@@ -166,10 +171,13 @@ class Adaptive:
         return self.rate(table) < self.options.slowest
 
     def room(self, table: ParameterTable, wanted: int, step: int) -> int:
-        """A share of the primitives while growth pays; none at the last event, which nothing would judge."""
-        if self.ended(table) or self.growing.share(step) == 1:
-            return 0
-        return min(math.ceil(self.rate(table) * len(table)), room_under(self.most, len(table)))
+        """A share of the primitives while growth pays, up to the cap."""
+        return min(self.asked(table, step), room_under(self.most, len(table)))
+
+    def asked(self, table: ParameterTable, step: int) -> int:
+        """How many an event may add if no cap holds it; none at the last one, which nothing would judge."""
+        over = self.ended(table) or self.growing.share(step) == 1
+        return 0 if over else math.ceil(self.rate(table) * len(table))
 
     def plan(self) -> dict[str, Any]:
         """The price."""

@@ -5,6 +5,7 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 """
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -182,12 +183,9 @@ class Anchors:
         visits = growth.success * self.schedule.interval(growth.every)
         found = self.capacity.judge(self, without_newborn, step)
         enough, old = eligible(self.table, visits / 2)[0], len(self.table)
+        most = old + self.capacity.room(self.table, sys.maxsize, step)
         grown, without_room = self.grid.grow(
-            self.table,
-            self.representation,
-            visits / 2,
-            lambda wanted: self.capacity.room(self.table, wanted, step),
-            step,
+            self.table, self.representation, visits / 2, lambda wanted: most - len(self.table), step
         )
         mark_newborn(self.table, old)
         reset_offsets(self.table, enough)

@@ -22,7 +22,7 @@ class BudgetOptions:
     """Growth towards a number; values in conf/backbone/parts/capacity.yaml."""
 
     primitives: Count = 0
-    """How many there are to be when growth ends."""
+    """How many there are to be when growth ends, at most: what is faint then is pruned as ever."""
     power: Share = 0.5
     """At a share t of the growth there may be first + (primitives - first) t^power (Improved-GS: a square root)."""
 
@@ -130,7 +130,8 @@ class Budget(Cap):
             return {}
         found = worth_in_training(model, self.context, step)
         kept = torch.ones_like(found.squares, dtype=torch.bool)
-        kept[found.squares.argsort(stable=True)[:excess]] = False
+        worth = torch.where(found.shown > 0, found.squares, torch.inf)  # of what no view shows nothing is known
+        kept[worth.argsort(stable=True)[:excess]] = False
         keep_rows(model.table, kept)
         return {"removed": excess}
 
@@ -150,7 +151,8 @@ class Budget(Cap):
 def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
     """What training views lose without each row."""
     views = some_of(context.scene.train, LOOKS, context.generator)
-    return worth_of_rows(model, views, context.scene.background.to(context.device), step, context.generator)
+    background, form = context.scene.background.to(context.device), context.forming(step)
+    return worth_of_rows(model, views, form, background, step, context.generator)
 
 
 def mark_newborn(table: ParameterTable, old: int) -> None:

@@ -93,7 +93,8 @@ class LongAxis:
         """As many as there is room for."""
         table = model.table
         views = some_of(control.views, self.views, control.generator)
-        score = drawn_errors(model, views, control.background, step) * mean_absolute(table)
+        drawn = drawn_errors(model, views, control.forming(step), control.background, step)
+        score = drawn * mean_absolute(table)
         wanted = score > 0
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
         count = int(chosen.sum())

@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.training.evidence import difference, error_sums, look, random_signs, removal_squares
+from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.evidence import difference, error_sums, look, random_signs, removal_changes, squared_changes
+from gsx.core.training.supersampling import FinerRaster, finer_raster
 
 RULES = RasterSettings(evaluation="float64", accumulation="float64", alpha_min=1e-9, transmittance_stop=0, cull="tight")
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64)
@@ -48,6 +51,11 @@ def cloud(count: int) -> Splats:
     )
 
 
+def plain(camera: Camera) -> FinerRaster:
+    """Rendered at the camera's own resolution."""
+    return finer_raster(camera, Reduction(filter="bicubic"), 1)
+
+
 def without(splats: Splats, row: int) -> Splats:
     kept = torch.arange(len(splats)) != row
     return Splats(**{name: value[kept] for name, value in vars(splats).items()})
@@ -56,7 +64,7 @@ def without(splats: Splats, row: int) -> Splats:
 def test_errors_are_shared_by_blending_weights() -> None:
     """Against renders in which one splat is white and all else black: these are its weights."""
     splats, view = cloud(5), view_of(12, 9)
-    seen = look(splats, view.camera, RULES, BACKGROUND)
+    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
     off = difference(seen.rendering.image, view)
     error = (rasterize(splats, view.camera, RULES, background=BACKGROUND).image - view.image()).square().sum(0)
     for row, found in enumerate(error_sums(seen, off)):
@@ -70,9 +78,9 @@ def test_errors_are_shared_by_blending_weights() -> None:
 def test_what_the_picture_loses_without_a_splat() -> None:
     """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
     splats, view = cloud(4), view_of(2, 1)
-    seen = look(splats, view.camera, RULES, BACKGROUND)
+    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
     patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
-    found = torch.stack([removal_squares(seen, signs) for signs in patterns]).mean(0)
+    found = torch.stack([removal_changes(seen, signs).square() for signs in patterns]).mean(0)
     for row in range(4):
         less = rasterize(without(splats, row), view.camera, RULES, background=BACKGROUND).image
         expected = float((less - seen.rendering.image.detach()).square().sum())
@@ -85,3 +93,37 @@ def test_signs_come_from_the_generator_alone() -> None:
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert set(one.unique().tolist()) == {-1, 1}
+
+
+def test_signs_are_none_where_a_picture_does_not_count() -> None:
+    counted = torch.zeros(2, 3, dtype=torch.bool)
+    counted[0, 1] = True
+    signs = random_signs(torch.zeros(3, 2, 3), torch.Generator().manual_seed(1), counted)
+    assert signs.abs().sum(0).tolist() == [[0, 3, 0], [0, 0, 0]]
+
+
+def test_a_finer_raster_is_judged_as_it_is_reduced() -> None:
+    """What goes with a splat, of a picture that is rendered twice as fine and reduced: against two such pictures."""
+    splats, view = cloud(4), view_of(2, 1)
+    raster = finer_raster(view.camera, Reduction(filter="area"), 2)
+    seen = look(splats, raster, RULES, BACKGROUND)
+    patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
+    found = torch.stack([removal_changes(seen, signs).square() for signs in patterns]).mean(0)
+    for row in range(4):
+        less = raster.reduced(rasterize(without(splats, row), raster.camera, RULES, background=BACKGROUND).image)
+        assert float(found[row]) == pytest.approx(float((less - seen.image.detach()).square().sum()), rel=1e-6)
+
+
+def test_a_row_of_several_splats_goes_as_a_whole() -> None:
+    """Two splats of one row, seen through each other by little: what both change together, not each by itself."""
+    splats, view = cloud(4), view_of(12, 9)
+    splats = replace(splats, log_opacities=splats.log_opacities - 4)  # so faint that what lies behind hardly matters
+    drawn = DrawnSplats(splats=splats, rows=torch.tensor([0, 0, 1, 1]))
+    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
+    squares = squared_changes(drawn, seen, None, 2, 512, torch.Generator().manual_seed(2))
+    whole = rasterize(splats, view.camera, RULES, background=BACKGROUND).image
+    for row in range(2):
+        kept = torch.tensor([0, 0, 1, 1]) != row
+        rest = Splats(**{name: value[kept] for name, value in vars(splats).items()})
+        less = rasterize(rest, view.camera, RULES, background=BACKGROUND).image
+        assert float(squares[row]) == pytest.approx(float((less - whole).square().sum()), rel=0.2)

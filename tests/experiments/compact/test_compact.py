@@ -11,6 +11,9 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
@@ -110,7 +113,8 @@ def test_views_that_judge_are_not_learnt_from(folder: Path) -> None:
 
 def test_a_window_is_the_middle_at_twice_the_focal_length(folder: Path) -> None:
     camera = opened(folder).scene.train[0].camera
-    closer = closer_window(camera)
+    closer, window = closer_window(camera)
+    assert window == Window(24, 18, 48, 36)
     assert closer.fx == 2 * camera.fx
     assert closer.size == camera.size
     middle = torch.tensor([[24.0, 18.0]]).double()
@@ -183,6 +187,56 @@ def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:
     assert len(columns["x"]) == len(small.backbone.table)
     learnt = figures(small, judges(big)[1], [1.0])["1"]
     assert learnt == pytest.approx(figures(big, judges(big)[1], [1.0])["1"], abs=1.0)
+
+
+def test_bands_that_go_are_not_in_the_files(folder: Path, tmp_path: Path) -> None:
+    """Everything may be lost, so that only the constant colours are left: 17 numbers and three normals a splat."""
+    compact(folder, tmp_path / "small", 50.0, 1, [], plugins())
+    found, run = json.loads((tmp_path / "small" / "compact.json").read_text()), opened(tmp_path / "small")
+    assert found["chosen"]["degree"] == 0
+    assert run.backbone.table["sh_rest"].shape[1] == 0
+    columns = read_ply(tmp_path / "small" / "point_cloud.ply")
+    assert len(columns) == 17
+    assert read_run(tmp_path / "small").evaluation["megabytes"] == pytest.approx(found["chosen"]["megabytes"], rel=1e-6)
+
+
+def test_anchors_are_made_smaller(tmp_path: Path) -> None:
+    words = ("backbone=scaffold", "iterations=20", "rasterizer=eager", "training.batch=2")
+    tiny_run(tmp_path / "run", words)
+    compact(tmp_path / "run", tmp_path / "small", 50.0, 1, [], plugins())
+    found = json.loads((tmp_path / "small" / "compact.json").read_text())
+    assert found["chosen"]["degree"] == -1
+    assert found["formats"] == {}
+    assert len(opened(tmp_path / "small").backbone.table) == found["chosen"]["primitives"]
+    assert found["chosen"]["primitives"] < found["before"]["primitives"]
+
+
+def test_what_cannot_be_made_smaller_is_told_and_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    tiny_run(tmp_path / "stopped", ("iterations=20", "rasterizer=eager"), stop_after=5)
+    tiny_run(tmp_path / "judged", ("iterations=0", f"init={folder / 'point_cloud.ply'}", "rasterizer=eager"))
+    with pytest.raises(InputError, match="is at step 5 of 20"):
+        compact(tmp_path / "stopped", tmp_path / "a", 0.1, 1, [], plugins())
+    with pytest.raises(InputError, match="trained nothing: give that file"):
+        compact(tmp_path / "judged", tmp_path / "b", 0.1, 1, [], plugins())
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "b").exists()
+
+
+def test_an_error_leaves_no_folder(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*given: object) -> Try:
+        raise MemoryError
+
+    monkeypatch.setattr(Shrinking, "attempt", fail)
+    with pytest.raises(MemoryError):
+        compact(folder, tmp_path / "small", 0.1, 1, [], plugins())
+    assert not (tmp_path / "small").exists()
+
+
+def test_masked_pixels_make_no_row_worth_anything(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = opened(folder)
+    assert float(worth_of(run, run.scene.train, generator()).max()) > 0
+    monkeypatch.setattr(View, "counted", lambda view: torch.zeros(36, 48, dtype=torch.bool))
+    assert float(worth_of(run, run.scene.train, generator()).max()) == 0
 
 
 def test_a_splat_file_is_made_smaller(folder: Path, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -16,6 +16,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.schedule import Schedule
+from gsx.core.training.supersampling import FinerRaster, finer_raster, times_as_fine
 
 MOST_LOST, FEW = 0.01, 10
 """Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
@@ -43,6 +44,16 @@ class BackboneContext:
         """Those that the next step renders by: of the photographs, as fine as they are rendered then."""
         times = self.supersample if step >= self.finer_after else 1
         return [view.camera.zoom(times) for view in self.scene.train]
+
+    def forming(self, step: int) -> Callable[[Camera], FinerRaster]:
+        """How pictures come about at a step."""
+        supersample = self.supersample if step > self.finer_after else 1
+
+        def form(camera: Camera) -> FinerRaster:
+            times = times_as_fine(camera, self.scene.train, supersample)
+            return finer_raster(camera, self.scene.reduction, times)
+
+        return form
 
     def points(self) -> PointCloud:
         """What the model starts from.

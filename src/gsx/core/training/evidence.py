@@ -8,7 +8,7 @@ Both come from gradients of one render I of colours c_k by blending weights w_k,
   by that, and by a part linear in the error, which training has brought to nothing in the sum over views.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,9 +21,13 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Drawn
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.supersampling import FinerRaster
+
+Forming = Callable[[Camera], FinerRaster]
+"""How a camera's picture comes about at a step (`training.supersample`)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,16 +35,26 @@ class Look:
     """A render of M splats whose colours and log-opacities are leaves."""
 
     rendering: Rendering
+    image: Float[Tensor, "3 H W"]
+    """The picture: the render, reduced where that is finer."""
     colours: Float[Tensor, "M 3"]
     log_opacities: Float[Tensor, "M"]
 
+    @property
+    def visible(self) -> Float[Tensor, "M"]:
+        """1 for splats that are on screen, 0 for others."""
+        screen, out = self.rendering.screen, torch.zeros_like(self.log_opacities).detach()
+        out[screen.ids[screen.visible]] = 1.0
+        return out
 
-def look(splats: Splats, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"]) -> Look:
-    """Render splats for a camera, at its own resolution."""
+
+def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background: Float[Tensor, "3"]) -> Look:
+    """Render splats for a camera, as it is rendered at that step."""
     values = {name: value.detach() for name, value in vars(splats).items()}
     colours, log_opacities = (values[name].requires_grad_() for name in ("colours", "log_opacities"))
-    rendering = rasterize(replace(splats, **values), camera, raster, background=background)
-    return Look(rendering=rendering, colours=colours, log_opacities=log_opacities)
+    rendering = rasterize(replace(splats, **values), raster.camera, rules, background=background)
+    image = raster.reduced(rendering.image)
+    return Look(rendering=rendering, image=image, colours=colours, log_opacities=log_opacities)
 
 
 def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
@@ -52,46 +66,53 @@ def error_sums(seen: Look, off: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
     """Sum over pixels of blending weight times squared difference, summed over channels: they add up to the squared
     error where splats cover everything (Rota Bulo et al. 2024, for maxima over views)."""
     upstream = off.square().sum(0, keepdim=True).expand(3, -1, -1) / 3
-    (gradient,) = torch.autograd.grad(seen.rendering.image, [seen.colours], upstream, retain_graph=True)
+    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], upstream, retain_graph=True)
     return gradient.sum(1)
 
 
-def random_signs(image: Float[Tensor, "3 H W"], generator: torch.Generator) -> Float[Tensor, "3 H W"]:
-    """1 or -1 for each value of a picture."""
-    return torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+def random_signs(
+    image: Float[Tensor, "3 H W"], generator: torch.Generator, counted: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, "3 H W"]:
+    """1 or -1 for each value of a picture; 0 where it does not count."""
+    return blacked(torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1, counted)
 
 
-def removal_squares(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
-    """By how much the picture changes without each of the splats: squares summed over its values, in the mean over
-    random signs. Where the model is at its best this is what the squared error grows by.
+def removal_changes(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+    """By how much the picture changes without each of the splats, summed over its values with random signs. The mean of
+    the square, of one or of a sum of several, is the sum over values of the squared change without these splats.
 
     Alphas at their upper bound count as if there were none.
     """
-    (change,) = torch.autograd.grad(seen.rendering.image, [seen.log_opacities], signs, retain_graph=True)
-    return change.square()
+    (change,) = torch.autograd.grad(seen.image, [seen.log_opacities], signs, retain_graph=True)
+    return change
 
 
 # -- by row of a model's table -----------------------------------------------------------------------------------------
 
 
-def add_by_row(sums: Float[Tensor, "N"], drawn: Drawn, values: Float[Tensor, "M"]) -> None:
-    """Add what was found of each splat to the row that it comes from."""
-    if drawn.rows is None:
-        sums += values
-    else:
-        sums.index_add_(0, drawn.rows, values)
+def by_row(drawn: Drawn, values: Float[Tensor, "M"], count: int) -> Float[Tensor, "N"]:
+    """Sums of what was found of the splats of each of so many rows."""
+    return values if drawn.rows is None else values.new_zeros(count).index_add_(0, drawn.rows, values)
+
+
+def looked_at(
+    model: Backbone[Any], camera: Camera, form: Forming, background: Float[Tensor, "3"], step: int
+) -> tuple[Drawn, Look]:
+    """(what the model draws for a camera, its render)."""
+    raster = form(camera)
+    with torch.no_grad():
+        drawn = model.draw(raster.drawn_for, step)
+    return drawn, look(drawn.splats, raster, model.raster, background)
 
 
 def drawn_errors(
-    model: Backbone[Any], views: Sequence[View], background: Float[Tensor, "3"], step: int
+    model: Backbone[Any], views: Sequence[View], form: Forming, background: Float[Tensor, "3"], step: int
 ) -> Float[Tensor, "N"]:
     """Of each row the squared error that it draws in the views, by blending weights."""
     sums = background.new_zeros(len(model.table))
     for view in views:
-        with torch.no_grad():
-            drawn = model.draw(view.camera, step)
-        seen = look(drawn.splats, view.camera, model.raster, background)
-        add_by_row(sums, drawn, error_sums(seen, difference(seen.rendering.image, view)))
+        drawn, seen = looked_at(model, view.camera, form, background, step)
+        sums += by_row(drawn, error_sums(seen, difference(seen.image, view)), len(sums))
     return sums
 
 
@@ -100,34 +121,45 @@ class Removal:
     """What N rows are worth to the pictures of some views."""
 
     squares: Float[Tensor, "N"]
-    """`removal_squares` of the row's splats, in the mean over those that some view shows; 0 where none is shown."""
+    """Squared changes of the picture without the row, in the mean over the views that show it; 0 where none does."""
     shown: Float[Tensor, "N"]
-    """How many are: views that show it, where a row is one splat."""
+    """How many views show it."""
     error_share: float
-    """Squared error of the views over all splats that they show."""
+    """Squared error of the views over the rows that they show, summed over views."""
+
+
+DRAWS = 32
+"""Of random signs, at least, over all views."""
 
 
 def worth_of_rows(
     model: Backbone[Any],
     views: Sequence[View],
+    form: Forming,
     background: Float[Tensor, "3"],
     step: int,
     generator: torch.Generator,
 ) -> Removal:
     """What the pictures of the views lose without each row."""
-    squares, shown, error = background.new_zeros(len(model.table)), background.new_zeros(len(model.table)), 0.0
+    count = len(model.table)
+    squares, shown, error = background.new_zeros(count), background.new_zeros(count), 0.0
     for view in views:
-        with torch.no_grad():
-            drawn = model.draw(view.camera, step)
-        seen = look(drawn.splats, view.camera, model.raster, background)
-        image = seen.rendering.image
-        add_by_row(squares, drawn, removal_squares(seen, random_signs(image.detach(), generator)))
-        screen = seen.rendering.screen
-        visible = torch.zeros_like(seen.log_opacities).detach()
-        visible[screen.ids[screen.visible]] = 1.0
-        add_by_row(shown, drawn, visible)
-        error += float(difference(image, view).double().square().sum())
+        drawn, seen = looked_at(model, view.camera, form, background, step)
+        squares += squared_changes(drawn, seen, view.counted(), count, max(1, DRAWS // len(views)), generator)
+        shown += by_row(drawn, seen.visible, count) > 0
+        error += float(difference(seen.image, view).double().square().sum())
     return Removal(squares=squares / shown.clamp_min(1), shown=shown, error_share=error / max(1.0, float(shown.sum())))
+
+
+def squared_changes(
+    drawn: Drawn, seen: Look, counted: Bool[Tensor, "H W"] | None, count: int, draws: int, generator: torch.Generator
+) -> Float[Tensor, "N"]:
+    """Squared change of a picture without each row, in the mean over draws of signs."""
+    total = seen.log_opacities.new_zeros(count).detach()
+    for _ in range(draws):
+        signs = random_signs(seen.image.detach(), generator, counted)
+        total += by_row(drawn, removal_changes(seen, signs), count).square() / draws
+    return total
 
 
 def some_of(views: Sequence[View], count: int, generator: torch.Generator) -> list[View]:
@@ -140,24 +172,25 @@ def window_errors(
     model: Backbone[Any],
     table: ParameterTable,
     windows: Mapping[View, Window],
+    form: Forming,
     background: Float[Tensor, "3"],
     step: int,
 ) -> Float[Tensor, "W"]:
     """Squared error in windows of views, each summed over its values, of the model as it would be with that table."""
     own, model.table = model.table, table
     try:
-        errors = [window_error(model, view, window, background, step) for view, window in windows.items()]
+        errors = [window_error(model, view, window, form, background, step) for view, window in windows.items()]
     finally:
         model.table = own
     return torch.stack(errors)
 
 
 def window_error(
-    model: Backbone[Any], view: View, window: Window, background: Float[Tensor, "3"], step: int
+    model: Backbone[Any], view: View, window: Window, form: Forming, background: Float[Tensor, "3"], step: int
 ) -> Float[Tensor, ""]:
-    """Squared error in a window of a view, at the view's own resolution."""
-    splats = model.draw(view.camera, step).splats
-    shown = rasterize(splats, window.of(view.camera), model.raster, background=background).image
-    counted = view.counted()
-    difference = shown - window.cut(view.image()).to(shown)
-    return blacked(difference, None if counted is None else counted[window.pixels]).double().square().sum()
+    """Squared error in a window of a view."""
+    splats = model.draw(form(view.camera).drawn_for, step).splats
+    raster, counted = form(window.of(view.camera)), view.counted()
+    shown = raster.reduced(rasterize(splats, raster.camera, model.raster, background=background).image)
+    off = shown - window.cut(view.image()).to(shown)
+    return blacked(off, None if counted is None else counted[window.pixels]).double().square().sum()

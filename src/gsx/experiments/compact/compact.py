@@ -2,8 +2,8 @@
 
 import logging
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,16 @@ import torch
 
 from gsx.core.errors import ConfigError, InputError, first_line
 from gsx.core.files import read_json, write_json
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
+from gsx.core.gaussians.splat_files import read_gaussians, write_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.gaussians.suffixes import STANDARD
 from gsx.core.plugins import Plugins
-from gsx.core.quality.metrics import psnr
 from gsx.core.seeds import derived_seed
 from gsx.core.training import checkpoint
-from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, told
+from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, figures, shorten_colours, told
 from gsx.experiments.reports.overview import write_overview
-from gsx.experiments.run_folder.claims import claimed
+from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import finish
@@ -52,22 +50,21 @@ def compact(
     """Write a smaller run of a run folder or splat file to a new folder; returns its report.
 
     Raises:
-        ConfigError, InputError: the folder is in use, or the target is neither, or no scene is given for a file.
+        ConfigError, InputError: the folder is in use, the target is neither or not finished, or a file has no scene.
     """
     refuse_used(str(to))
     run, settings = opened(target, overrides, plugins)
-    warm(run.raster, run.device)
-    steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
-    generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
-    shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)
-    logger.info("judged by %d training views: %s", len(shrinking.judging), shrinking.before)
-    best = shrinking.smallest()
-    if best not in shrinking.tried:
-        logger.warning("nothing could be taken away within %.3g dB: the new folder holds the model as it was", max_drop)
-    shrinking.take(best)
-    with ExitStack() as claims:
-        begin(run, settings, target, to, claims)
-        found = {
+    with claimed_anew(to):
+        warm(run.raster, run.device)
+        steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
+        generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
+        shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)
+        logger.info("judged by %d training views: %s", len(shrinking.judging), shrinking.before)
+        best = shrinking.smallest()
+        if best not in shrinking.tried:
+            logger.warning("nothing could go within %.3g dB: the new folder holds the model as it was", max_drop)
+        shrinking.take(best)
+        found: dict[str, Any] = {
             "from": str(target.resolve()),
             "max_drop_db": max_drop,
             "judges": [view.name for view in shrinking.judging],
@@ -76,17 +73,46 @@ def compact(
             "tries": told(shrinking.tried),
             "chosen": told([best])[0],
         }
-        evaluation = finish(run, settings, plugins)
-        found["formats"] = formats(run, shrinking, evaluation, max_drop)
+        run, settings = begin(run, settings, target, to, best.degree, plugins)
+        found["formats"] = formats(run, shrinking, best.drop, max_drop)
         write_json(to / NAME, found)
+        evaluation = finish(run, settings, plugins)
     tell(target, evaluation, found)
     return overview(target, to)
 
 
+@contextmanager
+def claimed_anew(to: Path) -> Iterator[None]:
+    """A new folder, claimed; nothing is left of it where nothing was written.
+
+    Raises:
+        InputError: it is in use.
+    """
+    there = to.is_dir()
+    to.mkdir(parents=True, exist_ok=True)
+    try:
+        with claimed(to):
+            refuse_used(str(to))
+            yield
+    finally:
+        if not there and not any(path.name != LOCK for path in to.iterdir()):
+            shutil.rmtree(to, ignore_errors=True)
+
+
 def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Run, Settings]:
-    """The run to make smaller: of a folder, or one that a splat file stands at the end of."""
+    """The run to make smaller: of a folder, or one that a splat file stands at the end of.
+
+    Raises:
+        InputError: the run is not finished, or was never trained.
+    """
     if target.is_dir():
         run, settings = open_run(target, plugins, overrides)
+        if not run.complete:
+            raise InputError(
+                f"{target} is at step {run.step} of {run.iterations}: `gsx resume {target}` finishes it first"
+            )
+        if not run.iterations:
+            raise InputError(f"{target} judged a splat file and trained nothing: give that file, and its scene=...")
         run.raster = as_trained(run)
         return run, settings
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
@@ -96,37 +122,44 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
     return run, settings
 
 
-def begin(run: Run, settings: Settings, target: Path, to: Path, claims: ExitStack) -> None:
-    """The new folder, with the smaller model as its checkpoint."""
-    to.mkdir(parents=True, exist_ok=True)
-    claims.enter_context(claimed(to))
-    refuse_used(str(to))
+def begin(run: Run, settings: Settings, target: Path, to: Path, degree: int, plugins: Plugins) -> tuple[Run, Settings]:
+    """The new folder, with the smaller model as its checkpoint; the run as it opens from there."""
+    config = settings.resolved | {"folder": str(to)}
+    if degree >= 0:
+        config |= {"backbone": config["backbone"] | {"sh_degree": degree}}
+        shorten_colours(run, degree)
     run.folder = to
-    write_config(to / "config.yaml", settings.resolved | {"folder": str(to)})
+    write_config(to / "config.yaml", config)
     for name in ("environment.json", "metrics.jsonl"):
         if (target / name).is_file():
             shutil.copyfile(target / name, to / name)
     checkpoint.save(run)
+    again, settings = open_run(to, plugins)
+    again.raster = run.raster
+    return again, settings
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def formats(run: Run, shrinking: Shrinking, evaluation: dict[str, Any], max_drop: float) -> dict[str, dict[str, Any]]:
-    """Bytes and what is lost of every file of the model, by suffix; of the quantised ones only the smallest within the
-    budget is left. None for models without a standard form."""
+def formats(run: Run, shrinking: Shrinking, lost: float, max_drop: float) -> dict[str, dict[str, Any]]:
+    """Bytes and drop of every file of the model, by suffix: what the model has `lost` in views that judged it, and what
+    the file loses of it now. Of the quantised ones only the smallest within the budget is left. None for models without
+    a standard form."""
     if own_columns(run) is not None:
         return {}
-    gaussians = run.backbone.explicit(None, run.model_step)
-    standard = run.folder / f"point_cloud{STANDARD}"
-    out = {STANDARD: {"bytes": standard.stat().st_size, "drop": drop_of(run, shrinking, gaussians)}}
-    for suffix in FORMATS:
+    gaussians, out = detached(run.backbone.explicit(None, run.model_step)), dict[str, dict[str, Any]]()
+    own = figures_of(run, shrinking, gaussians)
+    for suffix in (STANDARD, *FORMATS):
         path = run.folder / f"point_cloud{suffix}"
         try:
             comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
-            write_gaussians(path, detached(gaussians), comments, run.raster.compensate)
-            out[suffix] = {"bytes": path.stat().st_size, "drop": drop_of(run, shrinking, read_gaussians(path))}
+            write_gaussians(path, gaussians, comments, run.raster.compensate)
+            read = figures_of(run, shrinking, read_gaussians(path))
+            drop = lost + max(own[zoom] - read[zoom] for zoom in own)
+            out[suffix] = {"bytes": path.stat().st_size, "drop": drop}
         except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
+            path.unlink(missing_ok=True)
             logger.info("no %s: %s", suffix, first_line(error))
     within = [suffix for suffix, facts in out.items() if facts["drop"] <= max_drop]
     smallest = min(within or [STANDARD], key=lambda suffix: out[suffix]["bytes"])
@@ -142,15 +175,9 @@ def detached(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
 
 
-def drop_of(run: Run, shrinking: Shrinking, gaussians: Gaussians) -> float:
-    """The largest loss at any zoom, dB, of Gaussians in place of the model before."""
-    found = {}
-    for zoom, before in shrinking.before.items():
-        views = [closer for view in shrinking.judging if (closer := view.zoom(float(zoom))) is not None]
-        pictures = (render(run, v.camera, splats=splats_of(gaussians, v.camera.centre)).image for v in views)
-        values = [psnr(a, v.image().to(a), v.counted()) for a, v in zip(pictures, views, strict=True)]
-        found[zoom] = before - sum(values) / len(values)
-    return max(found.values())
+def figures_of(run: Run, shrinking: Shrinking, gaussians: Gaussians) -> dict[str, float]:
+    """PSNR by zoom of Gaussians in place of the model, in views that judge."""
+    return figures(run, shrinking.judging, [float(zoom) for zoom in shrinking.before], gaussians)
 
 
 # -- what is told ------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ learns on by the rates that training ended with, and is judged by training views
 """
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import fmean
@@ -15,13 +16,19 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.errors import TrainingError, first_line
+from gsx.core.gaussians.splat_files import splats_of
+from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.evidence import add_by_row, look, random_signs, removal_squares
-from gsx.core.training.parameter_table import keep_rows, restored_table, size_of, table_tensors
+from gsx.core.training.evidence import DRAWS, looked_at, squared_changes
+from gsx.core.training.guard import Guard
+from gsx.core.training.parameter_table import edit, keep_rows, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
+from gsx.core.training.supersampling import FinerRaster, finer_raster, times_as_fine
 from gsx.core.training.trainer import train_step
 
 logger = logging.getLogger(__name__)
@@ -77,38 +84,57 @@ def judges(run: Run) -> tuple[list[View], list[View]]:
 
 
 @torch.no_grad()
-def figures(run: Run, views: Sequence[View], zooms: Sequence[float]) -> dict[str, float]:
-    """Mean PSNR over views by zoom, dB; zooms without truth are left out."""
+def figures(
+    run: Run, views: Sequence[View], zooms: Sequence[float], gaussians: Gaussians | None = None
+) -> dict[str, float]:
+    """Mean PSNR over views by zoom, dB; zooms without truth are left out. gaussians: drawn in place of the model."""
     out = {}
     for factor in zooms:
         closer = [zoomed for view in views if (zoomed := view.zoom(factor)) is not None]
         if closer:
-            out[f"{factor:g}"] = fmean(
-                psnr(render(run, view.camera).image, view.image().to(run.device), view.counted()) for view in closer
-            )
+            out[f"{factor:g}"] = fmean(psnr(shown(run, v, gaussians), v.image(), v.counted()) for v in closer)
     return out
+
+
+def shown(run: Run, view: View, gaussians: Gaussians | None) -> Float[Tensor, "3 H W"]:
+    """A view by the model, or by other Gaussians."""
+    splats = None if gaussians is None else splats_of(gaussians, view.camera.centre)
+    return render(run, view.camera, splats=splats).image
 
 
 # -- what is worth least -----------------------------------------------------------------------------------------------
 
 
-def closer_window(camera: Camera) -> Camera:
-    """The middle of a camera's frame at twice its focal length, on a raster of about its size."""
+def closer_window(camera: Camera) -> tuple[Camera, Window]:
+    """(the middle of a camera's frame at twice its focal length, on a raster of about its size; where that lies in the
+    whole raster at twice the focal length)."""
     closer = camera.zoom(CLOSER)
     width, height = (max(1, round(side / CLOSER)) for side in closer.size)
-    return closer.crop((closer.width - width) // 2, (closer.height - height) // 2, width, height)
+    window = Window((closer.width - width) // 2, (closer.height - height) // 2, width, height)
+    return window.of(closer), window
+
+
+def pictures_of(view: View) -> list[tuple[Camera, Bool[Tensor, "H W"] | None]]:
+    """(camera, which pixels count) of the two pictures of a view that rows are worth something in."""
+    counted, (closer, window) = view.counted(), closer_window(view.camera)
+    if counted is None:
+        return [(view.camera, None), (closer, None)]
+    finer = counted.repeat_interleave(int(CLOSER), 0).repeat_interleave(int(CLOSER), 1)
+    return [(view.camera, counted), (closer, finer[window.pixels])]
 
 
 def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Float[Tensor, "N"]:
     """What pictures lose without each row: squared changes of values, summed over views and windows."""
     worth = torch.zeros(len(run.backbone.table), device=run.device)
+    supersample = run.supersample_at(run.model_step)
+
+    def form(camera: Camera) -> FinerRaster:
+        return finer_raster(camera, run.scene.reduction, times_as_fine(camera, run.scene.train, supersample))
+
     for view in views:
-        for camera in (view.camera, closer_window(view.camera)):
-            with torch.no_grad():
-                drawn = run.backbone.draw(camera, run.model_step)
-            picture = look(drawn.splats, camera, run.raster, run.background)
-            signs = random_signs(picture.rendering.image.detach(), generator)
-            add_by_row(worth, drawn, removal_squares(picture, signs))
+        for camera, counted in pictures_of(view):
+            drawn, seen = looked_at(run.backbone, camera, form, run.background, run.model_step)
+            worth += squared_changes(drawn, seen, counted, len(worth), max(1, DRAWS // len(views)), generator)
     return worth
 
 
@@ -134,12 +160,17 @@ class Shrinking:
         self.tried: list[Try] = []
 
     def attempt(self, share: float, degree: int) -> Try:
-        """Take the share and the bands above a degree away, learn on, judge."""
+        """Take the share and the bands above a degree away, learn on, judge. What cannot be learnt on drops without
+        end."""
         run = self.run
         run.backbone.table = restored_table(run.backbone.table, copied(self.whole))
         keep_rows(run.backbone.table, without_least(self.worth, share))
-        learn_on(run, self.learnt, degree, self.options.steps, self.plugins)
-        found = figures(run, self.judging, self.options.zooms)
+        try:
+            learn_on(run, self.learnt, degree, self.options.steps, self.plugins)
+            found = figures(run, self.judging, self.options.zooms)
+        except TrainingError as error:
+            logger.warning("with %.0f %% less it could not learn on (%s)", 100 * share, first_line(error))
+            found = dict.fromkeys(self.before, -math.inf)
         rows, size = size_of(run.backbone.table)
         drop = max(self.before[zoom] - found[zoom] for zoom in found)
         made = Try(
@@ -211,9 +242,10 @@ def learn_on(run: Run, views: Sequence[View], degree: int, steps: int, plugins: 
     run.scene, run.sampler = replace(scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
     try:
         cut_bands(run, degree)
-        for _ in range(steps):
-            train_step(run, plugins)
-            cut_bands(run, degree)
+        with plugins.listening([Guard()]):
+            for _ in range(steps):
+                train_step(run, plugins)
+                cut_bands(run, degree)
     finally:
         run.step, run.seconds, run.scene, run.sampler = step, seconds, scene, sampler
 
@@ -225,6 +257,12 @@ def cut_bands(run: Run, degree: int) -> None:
         run.backbone.table.parameters["sh_rest"][:, BANDS[degree] :] = 0
 
 
+def shorten_colours(run: Run, degree: int) -> None:
+    """Drop the bands above a degree, with their moments, from the table; what draws it has to be built for that."""
+    if "sh_rest" in run.backbone.table.parameters:
+        edit(run.backbone.table, "sh_rest", *[lambda rows: rows[:, : BANDS[degree]].contiguous()] * 2)
+
+
 def told(tries: Sequence[Try]) -> list[dict[str, object]]:
-    """Tries as JSON has them."""
-    return [asdict(made) for made in tries]
+    """Tries as JSON has them; without figures where a try could not learn on."""
+    return [asdict(made) if math.isfinite(made.drop) else asdict(made) | {"psnr": {}, "drop": None} for made in tries]

@@ -63,6 +63,13 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
+def refuse_own_judgement(options: Any, ranks: Ranks) -> None:
+    """Raise ConfigError where processes would each decide by renders of their own how many primitives there are."""
+    capacity = getattr(options, "capacity", "published")
+    if ranks.size > 1 and capacity != "published":
+        raise ConfigError(f"backbone.capacity={capacity} is for one process: call gsx without torchrun, or published")
+
+
 def build(
     settings: Settings, scene: Scene, folder: Path, training: bool = False, start: Gaussians | None = None
 ) -> Run:
@@ -77,6 +84,7 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
+        refuse_own_judgement(settings.backbone.options, ranks)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
     torch.manual_seed(general.seed)
