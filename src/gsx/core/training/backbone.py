@@ -16,7 +16,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.schedule import Schedule
-from gsx.core.training.supersampling import FinerRaster, finer_raster, times_as_fine
+from gsx.core.training.supersampling import FinerRaster, raster_at
 
 MOST_LOST, FEW = 0.01, 10
 """Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
@@ -48,12 +48,7 @@ class BackboneContext:
     def forming(self, step: int) -> Callable[[Camera], FinerRaster]:
         """How pictures come about at a step."""
         supersample = self.supersample if step > self.finer_after else 1
-
-        def form(camera: Camera) -> FinerRaster:
-            times = times_as_fine(camera, self.scene.train, supersample)
-            return finer_raster(camera, self.scene.reduction, times)
-
-        return form
+        return lambda camera: raster_at(camera, self.scene, supersample)
 
     def points(self) -> PointCloud:
         """What the model starts from.

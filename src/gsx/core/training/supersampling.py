@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
-from gsx.core.data.scene import View
+from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
 
@@ -65,3 +65,8 @@ def finer_raster(camera: Camera, reduction: Reduction, times: int) -> FinerRaste
     wide, window = with_rim(camera, reduction, times)
     finer = wide if times == 1 else wide.zoom(times)
     return FinerRaster(drawn_for=wide, camera=finer, window=window, reduction=reduction, times=times)
+
+
+def raster_at(camera: Camera, scene: Scene, supersample: int) -> FinerRaster:
+    """Of a camera at a step at which photographs of the scene are rendered `supersample` times as fine."""
+    return finer_raster(camera, scene.reduction, times_as_fine(camera, scene.train, supersample))

@@ -22,7 +22,7 @@ from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
-from gsx.core.training.supersampling import finer_raster, times_as_fine
+from gsx.core.training.supersampling import raster_at
 
 logger = logging.getLogger(__name__)
 
@@ -153,8 +153,7 @@ def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | 
 def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
     """(what the backbone draws at this step, its render), to be learnt from; screen statistics are of the raster that
     was drawn, the picture is reduced from it (`training.supersample`)."""
-    times, absolute = times_as_fine(camera, run.scene.train, run.supersample_at(number)), run.backbone.absolute_gradient
-    raster = finer_raster(camera, run.scene.reduction, times)
+    raster, absolute = raster_at(camera, run.scene, run.supersample_at(number)), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, number)
     rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
     image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))

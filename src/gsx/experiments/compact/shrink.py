@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from statistics import fmean
 
 import torch
@@ -28,7 +29,7 @@ from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import edit, keep_rows, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
-from gsx.core.training.supersampling import FinerRaster, finer_raster, times_as_fine
+from gsx.core.training.supersampling import raster_at
 from gsx.core.training.trainer import train_step
 
 logger = logging.getLogger(__name__)
@@ -127,10 +128,7 @@ def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Flo
     """What pictures lose without each row: squared changes of values, summed over views and windows."""
     worth = torch.zeros(len(run.backbone.table), device=run.device)
     supersample = run.supersample_at(run.model_step)
-
-    def form(camera: Camera) -> FinerRaster:
-        return finer_raster(camera, run.scene.reduction, times_as_fine(camera, run.scene.train, supersample))
-
+    form = partial(raster_at, scene=run.scene, supersample=supersample)
     for view in views:
         for camera, counted in pictures_of(view):
             drawn, seen = looked_at(run.backbone, camera, form, run.background, run.model_step)
