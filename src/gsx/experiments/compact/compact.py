@@ -59,7 +59,7 @@ def compact(
         steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
         generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
         shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)
-        logger.info("judged by %d training views: %s", len(shrinking.judging), shrinking.before)
+        logger.info("judged by %d training views: %s", len(shrinking.judging), shrinking.reference)
         best = shrinking.smallest()
         if best not in shrinking.tried:
             logger.warning("nothing could go within %.3g dB: the new folder holds the model as it was", max_drop)
@@ -69,7 +69,7 @@ def compact(
             "max_drop_db": max_drop,
             "judges": [view.name for view in shrinking.judging],
             "learnt_on_steps": steps,
-            "before": {"primitives": len(shrinking.worth), "psnr": shrinking.before},
+            "before": {"primitives": len(shrinking.worth), "psnr": shrinking.before, "learnt_on": shrinking.reference},
             "tries": told(shrinking.tried),
             "chosen": told([best])[0],
         }

@@ -2,7 +2,8 @@
 
 What a row is worth is what the pictures of all training views lose without it, at their own size and in windows at
 twice their focal length, where small Gaussians count. How many go is found by bisection: a try removes the least worth,
-learns on by the rates that training ended with, and is judged by training views that it did not learn from.
+learns on by the rates that training ended with, and is judged by training views that it does not learn from, beside the
+whole model after the same.
 """
 
 import logging
@@ -71,7 +72,7 @@ class Try:
     psnr: dict[str, float]
     """By zoom."""
     drop: float
-    """The largest loss at any zoom, dB."""
+    """The largest loss at any zoom against the whole model that has learnt on as well, dB."""
 
 
 def judges(run: Run) -> tuple[list[View], list[View]]:
@@ -155,6 +156,9 @@ class Shrinking:
         self.before = figures(run, self.judging, options.zooms)
         self.worth = worth_of(run, run.scene.train, generator)
         self.whole = copied(table_tensors(run.backbone.table))
+        learn_on(run, self.learnt, degree_of_run(run), options.steps, plugins)
+        self.reference = figures(run, self.judging, options.zooms)
+        """Of the whole model, which has learnt on like every try: views that judge are no longer learnt from."""
         self.tried: list[Try] = []
 
     def attempt(self, share: float, degree: int) -> Try:
@@ -170,7 +174,7 @@ class Shrinking:
             logger.warning("with %.0f %% less it could not learn on (%s)", 100 * share, first_line(error))
             found = dict.fromkeys(self.before, -math.inf)
         rows, size = size_of(run.backbone.table)
-        drop = max(self.before[zoom] - found[zoom] for zoom in found)
+        drop = max(self.reference[zoom] - found[zoom] for zoom in found)
         made = Try(
             removed=share,
             degree=degree,
