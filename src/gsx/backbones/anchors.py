@@ -16,7 +16,7 @@ from torch.nn import Parameter
 
 from gsx.backbones.anchor_grids import grid_of
 from gsx.backbones.anchor_options import ExplicitOptions, HeadRates, NeuralOptions
-from gsx.backbones.capacity import Growing, mark_newborn, without_newborn
+from gsx.backbones.capacity import Growing, growing_of, mark_newborn, without_newborn
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
@@ -170,8 +170,7 @@ class Anchors:
 
     def growing(self) -> Growing:
         """When anchors grow and go."""
-        growth, steps = self.options.growth, self.schedule
-        return Growing(steps.step(growth.start), steps.step(growth.stop), steps.interval(growth.every))
+        return growing_of(self.options.growth, self.schedule)
 
     def validation_window(self, view: View, step: int) -> Window | None:
         """What capacity is judged by."""

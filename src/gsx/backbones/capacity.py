@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.data.scene import View
@@ -15,6 +16,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import Removal, some_of, worth_of_rows
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
+from gsx.core.training.schedule import Schedule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,23 @@ class Growing:
     def share(self, step: int) -> float:
         """How much of the events is over after the one at a step, from 0 to 1."""
         return min(1.0, max(0.0, (step // self.every - self.start // self.every) / self.events()))
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """Options of something that acts now and then, in steps of the published run."""
+
+    @property
+    def start(self) -> int: ...
+    @property
+    def stop(self) -> int: ...
+    @property
+    def every(self) -> int: ...
+
+
+def growing_of(options: Timed, schedule: Schedule) -> Growing:
+    """When density control acts in this run."""
+    return Growing(schedule.step(options.start), schedule.step(options.stop), schedule.interval(options.every))
 
 
 LOOKS = 48
@@ -166,7 +185,11 @@ def without_newborn(table: ParameterTable) -> ParameterTable | None:
     old = table.statistics["born"] == 0
     if bool(old.all()) or not bool(old.any()):
         return None
-    rows = {name: value[old] for name, value in detached_rows(table).items()}
+    return to_look_at(table, {name: value[old] for name, value in detached_rows(table).items()})
+
+
+def to_look_at(table: ParameterTable, rows: dict[str, Tensor]) -> ParameterTable:
+    """A table of these parameters and columns in the place of another's, by which nothing is learnt."""
     return ParameterTable(
         {name: Parameter(rows[name], requires_grad=False) for name in table.parameters},
         {name: rows[name] for name in table.columns},

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch.nn.functional import logsigmoid
 
-from gsx.backbones.capacity import Capacity, Growing
+from gsx.backbones.capacity import Capacity, growing_of
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
 from gsx.backbones.mip import Filter
@@ -15,11 +15,6 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import zero_statistics
 from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column
 from gsx.core.training.schedule import Schedule
-
-
-def growing_of(options: Density, schedule: Schedule) -> Growing:
-    """When density control acts."""
-    return Growing(schedule.step(options.start), schedule.step(options.stop), schedule.interval(options.every))
 
 
 class DensityControl:

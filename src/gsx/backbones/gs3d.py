@@ -8,8 +8,9 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import normalize
 
+from gsx.backbones.capacity import growing_of
 from gsx.backbones.capacity_options import capacity_of
-from gsx.backbones.density_control import DensityControl, growing_of
+from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
 from gsx.backbones.long_axis import LongAxis

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 from torch.nn.functional import normalize
 
+from gsx.backbones.capacity import to_look_at
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
@@ -116,10 +116,7 @@ class LongAxis:
             0, torch.cat([first, second]), False
         )
         values = {name: torch.cat([value[others], whole[name]]) for name, value in rows.items()}
-        return ParameterTable(
-            {name: Parameter(values[name], requires_grad=False) for name in table.parameters},
-            {name: values[name] for name in table.columns},
-        )
+        return to_look_at(table, values)
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """None."""

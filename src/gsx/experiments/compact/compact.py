@@ -11,8 +11,7 @@ import torch
 
 from gsx.core.errors import ConfigError, InputError, first_line
 from gsx.core.files import read_json, write_json
-from gsx.core.gaussians.splat_files import read_gaussians, write_gaussians
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.suffixes import STANDARD
 from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
@@ -24,7 +23,7 @@ from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import finish
-from gsx.experiments.runs.export import notes, own_columns, render_mode
+from gsx.experiments.runs.export import export, own_columns
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
@@ -148,14 +147,13 @@ def formats(run: Run, shrinking: Shrinking, lost: float, max_drop: float) -> dic
     a standard form."""
     if own_columns(run) is not None:
         return {}
-    gaussians, out = detached(run.backbone.explicit(None, run.model_step)), dict[str, dict[str, Any]]()
-    own = figures_of(run, shrinking, gaussians)
+    zooms, out = [float(zoom) for zoom in shrinking.before], dict[str, dict[str, Any]]()
+    own = figures(run, shrinking.judging, zooms)
     for suffix in (STANDARD, *FORMATS):
         path = run.folder / f"point_cloud{suffix}"
         try:
-            comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
-            write_gaussians(path, gaussians, comments, run.raster.compensate)
-            read = figures_of(run, shrinking, read_gaussians(path))
+            export(run, path)
+            read = figures(run, shrinking.judging, zooms, read_gaussians(path))
             drop = lost + max(own[zoom] - read[zoom] for zoom in own)
             out[suffix] = {"bytes": path.stat().st_size, "drop": drop}
         except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
@@ -168,16 +166,6 @@ def formats(run: Run, shrinking: Shrinking, lost: float, max_drop: float) -> dic
         if not out[suffix]["kept"]:
             (run.folder / f"point_cloud{suffix}").unlink()
     return out
-
-
-def detached(gaussians: Gaussians) -> Gaussians:
-    """On the CPU, without gradients."""
-    return Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
-
-
-def figures_of(run: Run, shrinking: Shrinking, gaussians: Gaussians) -> dict[str, float]:
-    """PSNR by zoom of Gaussians in place of the model, in views that judge."""
-    return figures(run, shrinking.judging, [float(zoom) for zoom in shrinking.before], gaussians)
 
 
 # -- what is told ------------------------------------------------------------------------------------------------------

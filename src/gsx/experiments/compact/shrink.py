@@ -20,6 +20,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import TrainingError, first_line
+from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.splat_files import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
@@ -151,7 +152,7 @@ class Shrinking:
     """The tries on one run. What the run holds afterwards is the last one."""
 
     def __init__(self, run: Run, options: ShrinkOptions, plugins: Plugins, generator: torch.Generator) -> None:
-        self.run, self.options, self.plugins, self.generator = run, options, plugins, generator
+        self.run, self.options, self.plugins = run, options, plugins
         self.learnt, self.judging = judges(run)
         self.before = figures(run, self.judging, options.zooms)
         self.worth = worth_of(run, run.scene.train, generator)
@@ -165,8 +166,7 @@ class Shrinking:
         """Take the share and the bands above a degree away, learn on, judge. What cannot be learnt on drops without
         end."""
         run = self.run
-        run.backbone.table = restored_table(run.backbone.table, copied(self.whole))
-        keep_rows(run.backbone.table, without_least(self.worth, share))
+        self.cut(share)
         try:
             learn_on(run, self.learnt, degree, self.options.steps, self.plugins)
             found = figures(run, self.judging, self.options.zooms)
@@ -191,6 +191,12 @@ class Shrinking:
         )
         return made
 
+    def cut(self, share: float) -> None:
+        """Give the run the whole model without the share of its rows that is worth least."""
+        backbone = self.run.backbone
+        backbone.table = restored_table(backbone.table, copied(self.whole))
+        keep_rows(backbone.table, without_least(self.worth, share))
+
     def allowed(self, made: Try) -> bool:
         """Whether it is within the budget."""
         return made.drop <= self.options.max_drop
@@ -214,8 +220,7 @@ class Shrinking:
     def take(self, best: Try) -> None:
         """Make the run what a try was, learnt from all training views."""
         run = self.run
-        run.backbone.table = restored_table(run.backbone.table, copied(self.whole))
-        keep_rows(run.backbone.table, without_least(self.worth, best.removed))
+        self.cut(best.removed)
         if best.removed or best.degree < degree_of_run(run):
             learn_on(run, run.scene.train, best.degree, self.options.steps, self.plugins)
 
@@ -228,7 +233,7 @@ def copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def degree_of_run(run: Run) -> int:
     """Of the colours of a table with bands; -1 where networks make them."""
     rest = run.backbone.table.parameters.get("sh_rest")
-    return -1 if rest is None else BANDS.index(rest.shape[1])
+    return -1 if rest is None else degree_of(rest.shape[1])
 
 
 def size_with(run: Run, degree: int, size: int) -> int:
