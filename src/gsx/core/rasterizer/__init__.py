@@ -1,5 +1,7 @@
 """The one rasterizer every backbone renders through: project, pair with tiles, sort, composite. Needs only torch."""
 
+import torch
+
 from gsx.core.rasterizer.batch import rasterize_batch
 from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
@@ -21,3 +23,7 @@ __all__ = [
     "touches",
     "undilated_radii",
 ]
+
+torch.exp(torch.zeros(1))
+"""MKL sets its vector functions up in the first call. Where two threads make that call at once, the second now and then
+computes its half with seven bits fewer (exp, log, sin; torch 2.13): so the first call is made here, by one thread."""
