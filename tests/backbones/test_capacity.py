@@ -196,6 +196,8 @@ def test_several_processes_do_not_each_judge_for_themselves() -> None:
     refuse_own_judgement(options_of("adaptive"), Ranks())
     with pytest.raises(ConfigError, match="capacity=adaptive is for one process"):
         refuse_own_judgement(options_of("adaptive"), Ranks(size=2))
+    with pytest.raises(ConfigError, match="sh_judged=0.8 is for one process"):
+        refuse_own_judgement(options_of("published", sh_judged=0.8), Ranks(size=2))
 
 
 def trials(*rates: float) -> Tensor:
@@ -267,7 +269,7 @@ DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("backbone=gs3d",), "density"),
+        (("backbone=gs3d", "backbone.sh_judged=0.5"), "density"),
         (("backbone=octree_gs3d", "backbone.densification=clone_split"), "clone_split.density"),
         (("backbone=scaffold", "backbone.growth.observe_from=0", "backbone.growth.success=0.1"), "growth"),
     ],

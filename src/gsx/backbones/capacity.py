@@ -14,7 +14,7 @@ from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
-from gsx.core.training.evidence import Removal, some_of, worth_of_rows
+from gsx.core.training.evidence import Changes, Removal, removal_changes, some_of, worth_of_rows
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
 from gsx.core.training.schedule import Schedule
 
@@ -167,11 +167,13 @@ class Budget(Cap):
         return {"budget": {"primitives": self.most}}
 
 
-def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
-    """What training views lose without each row."""
+def worth_in_training(
+    model: Backbone[Any], context: BackboneContext, step: int, changes: Changes = removal_changes
+) -> Removal:
+    """What training views lose without each row, or by other changes of it."""
     views = some_of(context.scene.train, LOOKS, context.generator)
     background, form = context.scene.background.to(context.device), context.forming(step)
-    return worth_of_rows(model, views, form, background, step, context.generator)
+    return worth_of_rows(model, views, form, background, step, context.generator, changes)
 
 
 def mark_newborn(table: ParameterTable, old: int) -> None:

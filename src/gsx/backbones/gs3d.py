@@ -8,13 +8,14 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import normalize
 
-from gsx.backbones.capacity import growing_of
+from gsx.backbones.capacity import growing_of, worth_in_training
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
+from gsx.backbones.sh_degrees import hold_bands, judge_degrees
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -30,6 +31,7 @@ from gsx.core.rasterizer import Rendering
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
+from gsx.core.training.evidence import Look, recolouring_changes
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
 
@@ -75,7 +77,7 @@ class GS3D:
         self, options: GS3DOptions, context: BackboneContext, visibility: Visibility, densification: Densification
     ) -> None:
         density, scene = options.density, context.scene
-        self.options, self.visibility, self.extent = options, visibility, scene.extent
+        self.options, self.visibility, self.extent, self.context = options, visibility, scene.extent, context
         self.schedule = context.schedule(options.published_iterations)
         self.capacity = capacity_of(options, context, growing_of(density, self.schedule))
         self.control = DensityControl(density, self.capacity, context, self.schedule, densification)
@@ -94,6 +96,8 @@ class GS3D:
 
     def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
         """A table of raw parameters and columns that nothing is known of yet."""
+        if self.options.sh_judged > 0:
+            columns = columns | {"sh_degree": torch.full((len(raw["means"]),), self.options.sh_degree)}
         table = ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
@@ -142,6 +146,14 @@ class GS3D:
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 
+    @torch.no_grad()
+    def colours_by_degree(self, camera: Camera, step: int) -> Float[Tensor, "D M 3"]:
+        """Colours of what the camera draws, of each degree up to that of the step."""
+        values = self.visibility.shown(self.table, camera, step).values
+        offsets = offsets_from(values["means"], camera.centre)
+        degrees = range(self.active_degree(step) + 1)
+        return torch.stack([colours_of(values["sh_dc"], values["sh_rest"], offsets, degree) for degree in degrees])
+
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """That of density control; 3D-GS has none."""
         return self.control.densification.regulariser(drawn)
@@ -172,7 +184,22 @@ class GS3D:
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)
             done["opacity_resets"] = 1
+        if step == self.sh_judged():
+            done |= self.judge_degrees(step)
         return done
+
+    def sh_judged(self) -> int:
+        """Step at which SH degrees are judged; 0: at none."""
+        return round(self.options.sh_judged * self.schedule.iterations)
+
+    def judge_degrees(self, step: int) -> dict[str, float]:
+        """Keep the bands of colour that training views tell are worth their numbers."""
+
+        def changes(seen: Look, signs: Tensor) -> Tensor:
+            return recolouring_changes(seen, self.colours_by_degree(seen.camera, step), signs)
+
+        found = worth_in_training(self, self.context, step, changes)
+        return judge_degrees(self.table, found, self.options.sh_price, step)
 
     def means_rate_steps(self) -> int:
         """Step at which the learning rate of the means has come down."""
@@ -192,6 +219,8 @@ class GS3D:
         rest = self.table["sh_rest"]
         if rest.grad is None and self.table["sh_dc"].grad is not None:
             rest.grad = torch.zeros_like(rest)
+        if "sh_degree" in self.table.columns and step >= self.sh_judged():
+            hold_bands(self.table)
         self.set_rates(step)
         take_adam_step(self.table)
         make_identity_where_zero(self.table["quats"])

@@ -60,6 +60,10 @@ class GS3DOptions(CapacityOptions):
     published_iterations: Interval
     sh_degree: Annotated[int, Range(0, 3)]
     sh_every: Interval
+    sh_judged: Share = 0.0
+    """Share of the run after which every Gaussian keeps the SH bands that are worth their numbers; 0: it keeps all."""
+    sh_price: Annotated[float, Range(1e-6, 100)] = 0.8
+    """dB that a doubling of all numbers of the model has to bring."""
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     rates: Rates
     density: Density

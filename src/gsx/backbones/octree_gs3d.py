@@ -64,7 +64,7 @@ def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions,
             f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
         )
     both = vars(options) | {"rates": own.rates, "density": own.density}
-    gaussians = GS3DOptions(**{field.name: both[field.name] for field in fields(GS3DOptions)})
+    gaussians = GS3DOptions(**{field.name: both[field.name] for field in fields(GS3DOptions) if field.name in both})
     levels = faithful(options.levels, options.fidelity)
     assert levels is not None
     return gaussians, levels, own.level_density

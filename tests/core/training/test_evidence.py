@@ -13,7 +13,15 @@ from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.backbone import DrawnSplats
-from gsx.core.training.evidence import difference, error_sums, look, random_signs, removal_changes, squared_changes
+from gsx.core.training.evidence import (
+    difference,
+    error_sums,
+    look,
+    random_signs,
+    recolouring_changes,
+    removal_changes,
+    squared_changes,
+)
 from gsx.core.training.supersampling import FinerRaster, finer_raster
 
 RULES = RasterSettings(evaluation="float64", accumulation="float64", alpha_min=1e-9, transmittance_stop=0, cull="tight")
@@ -85,6 +93,21 @@ def test_what_the_picture_loses_without_a_splat() -> None:
         less = rasterize(without(splats, row), view.camera, RULES, background=BACKGROUND).image
         expected = float((less - seen.rendering.image.detach()).square().sum())
         assert float(found[row]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_the_picture_changes_by_with_other_colours() -> None:
+    """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
+    splats, view = cloud(4), view_of(2, 1)
+    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
+    others = torch.stack([1 - splats.colours, splats.colours.roll(1, 1)])
+    patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
+    found = torch.stack([recolouring_changes(seen, others, signs).square() for signs in patterns]).mean(0)
+    for other, row in itertools.product(range(2), range(4)):
+        colours = splats.colours.clone()
+        colours[row] = others[other, row]
+        painted = rasterize(replace(splats, colours=colours), view.camera, RULES, background=BACKGROUND).image
+        expected = float((painted - seen.image.detach()).square().sum())
+        assert float(found[other, row]) == pytest.approx(expected, rel=1e-9)
 
 
 def test_signs_come_from_the_generator_alone() -> None:

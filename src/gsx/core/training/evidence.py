@@ -5,7 +5,8 @@ Both come from gradients of one render I of colours c_k by blending weights w_k,
 - dI/dc_k = w_k, so that sum_p M w_k is the gradient of sum_p M I with respect to c_k (M = squared error: who draws it);
 - dI/d ln o_k = w_k (c_k - b_k), b_k the colour behind k: just what a pixel loses when k is removed. Its square, summed
   over pixels, is the mean of the square of a gradient with M = random signs (Hutchinson 1989). The squared error grows
-  by that, and by a part linear in the error, which training has brought to nothing in the sum over views.
+  by that, and by a part linear in the error, which training has brought to nothing in the sum over views. So it does
+  where k has another colour c': by w_k (c' - c_k), squared.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,8 @@ class Look:
     """The picture: the render, reduced where that is finer."""
     colours: Float[Tensor, "M 3"]
     log_opacities: Float[Tensor, "M"]
+    camera: Camera
+    """That the splats are drawn for."""
 
     @property
     def visible(self) -> Float[Tensor, "M"]:
@@ -54,7 +57,8 @@ def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background:
     colours, log_opacities = (values[name].requires_grad_() for name in ("colours", "log_opacities"))
     rendering = rasterize(replace(splats, **values), raster.camera, rules, background=background)
     image = raster.reduced(rendering.image)
-    return Look(rendering=rendering, image=image, colours=colours, log_opacities=log_opacities)
+    leaves = {"colours": colours, "log_opacities": log_opacities}
+    return Look(rendering=rendering, image=image, camera=raster.drawn_for, **leaves)
 
 
 def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
@@ -87,12 +91,21 @@ def removal_changes(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, 
     return change
 
 
+def recolouring_changes(
+    seen: Look, others: Float[Tensor, "K M 3"], signs: Float[Tensor, "3 H W"]
+) -> Float[Tensor, "K M"]:
+    """By how much the picture changes with other colours of each of the splats, summed over its values with signs."""
+    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], signs, retain_graph=True)
+    return ((others - seen.colours.detach()) * gradient).sum(2)
+
+
 # -- by row of a model's table -----------------------------------------------------------------------------------------
 
 
-def by_row(drawn: Drawn, values: Float[Tensor, "M"], count: int) -> Float[Tensor, "N"]:
+def by_row(drawn: Drawn, values: Float[Tensor, "*K M"], count: int) -> Float[Tensor, "*K N"]:
     """Sums of what was found of the splats of each of so many rows."""
-    return values if drawn.rows is None else values.new_zeros(count).index_add_(0, drawn.rows, values)
+    sums = values.new_zeros(*values.shape[:-1], count)
+    return values if drawn.rows is None else sums.index_add_(-1, drawn.rows, values)
 
 
 def looked_at(
@@ -118,10 +131,10 @@ def drawn_errors(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Removal:
-    """What N rows are worth to the pictures of some views."""
+    """What N rows, or K parts of each, are worth to the pictures of some views."""
 
-    squares: Float[Tensor, "N"]
-    """Squared changes of the picture without the row, in the mean over the views that show it; 0 where none does."""
+    squares: Float[Tensor, "*K N"]
+    """Squared changes of the picture without them, in the mean over the views that show the row; 0 where none does."""
     shown: Float[Tensor, "N"]
     """How many views show it."""
     error_share: float
@@ -130,6 +143,8 @@ class Removal:
 
 DRAWS = 32
 """Of random signs, at least, over all views."""
+Changes = Callable[[Look, Tensor], Tensor]
+"""(render, signs) -> [*K, M]: by how much the picture changes, as `removal_changes` tells it."""
 
 
 def worth_of_rows(
@@ -139,26 +154,33 @@ def worth_of_rows(
     background: Float[Tensor, "3"],
     step: int,
     generator: torch.Generator,
+    changes: Changes = removal_changes,
 ) -> Removal:
-    """What the pictures of the views lose without each row."""
-    count = len(model.table)
+    """What the pictures of the views lose without each row, or by other changes of it."""
+    count, draws = len(model.table), max(1, DRAWS // len(views))
     squares, shown, error = background.new_zeros(count), background.new_zeros(count), 0.0
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)
-        squares += squared_changes(drawn, seen, view.counted(), count, max(1, DRAWS // len(views)), generator)
+        squares = squares + squared_changes(drawn, seen, view.counted(), count, draws, generator, changes)
         shown += by_row(drawn, seen.visible, count) > 0
         error += float(difference(seen.image, view).double().square().sum())
     return Removal(squares=squares / shown.clamp_min(1), shown=shown, error_share=error / max(1.0, float(shown.sum())))
 
 
 def squared_changes(
-    drawn: Drawn, seen: Look, counted: Bool[Tensor, "H W"] | None, count: int, draws: int, generator: torch.Generator
-) -> Float[Tensor, "N"]:
-    """Squared change of a picture without each row, in the mean over draws of signs."""
+    drawn: Drawn,
+    seen: Look,
+    counted: Bool[Tensor, "H W"] | None,
+    count: int,
+    draws: int,
+    generator: torch.Generator,
+    changes: Changes = removal_changes,
+) -> Float[Tensor, "*K N"]:
+    """Squared change of a picture without each row, or by other changes of it, in the mean over draws of signs."""
     total = seen.log_opacities.new_zeros(count).detach()
     for _ in range(draws):
         signs = random_signs(seen.image.detach(), generator, counted)
-        total += by_row(drawn, removal_changes(seen, signs), count).square() / draws
+        total = total + by_row(drawn, changes(seen, signs), count).square() / draws
     return total
 
 

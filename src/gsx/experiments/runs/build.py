@@ -64,10 +64,12 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 
 
 def refuse_own_judgement(options: Any, ranks: Ranks) -> None:
-    """Raise ConfigError where processes would each decide by renders of their own how many primitives there are."""
+    """Raise ConfigError where processes would each decide by renders of their own what the model needs."""
     capacity = getattr(options, "capacity", "published")
     if ranks.size > 1 and capacity != "published":
         raise ConfigError(f"backbone.capacity={capacity} is for one process: call gsx without torchrun, or published")
+    if ranks.size > 1 and getattr(options, "sh_judged", 0) > 0:
+        raise ConfigError(f"backbone.sh_judged={options.sh_judged} is for one process: call gsx without torchrun, or 0")
 
 
 def build(
