@@ -5,21 +5,27 @@
 FOLDER holds `fox` (COLMAP), `lego` (NeRF-Synthetic), `castle` (photographs alone); without it only the built-in scene
 is measured. `growth`: every scene is trained as published, adaptively, and with a budget of as many primitives as
 published ends with, and of fewer, beside published growth held at that cap; the same steps. `compact`: the published
-runs made smaller by `gsx compact`. Finished runs below --runs are not trained again. A quarter of an hour of two cores
-for a scene, a backbone and a seed.
+runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
+numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. Finished runs
+below --runs are not trained again. A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
+import json
 import shutil
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gsx.api import train as train_here
+from gsx.backbones import adaptive, capacity, long_axis
+from gsx.backbones.sh_degrees import numbers_of
 from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
@@ -44,7 +50,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
-    parser.add_argument("--what", default="growth,compact", help="tables, by commas")
+    parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence")
     parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
@@ -122,6 +128,137 @@ def measured(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
         for scene in scenes
         for arm in arms
     ]
+
+
+# -- bands of colour ---------------------------------------------------------------------------------------------------
+
+BANDS_FROM, PRICES = 0.8, (0.05, 0.2, 0.8)
+"""Share of the run after which they are judged; dB per doubling of all numbers."""
+BANDS_COLUMNS = [
+    *(["scene", "scene"], ["price", "dB a doubling"], ["seeds", "seeds"]),
+    *(column for f in ZOOMS for column in ([f"x{f}", f"x{f}"], [f"more{f}", f"x{f} - all bands"])),
+    *(["primitives", "primitives"], ["degrees", "of degree 0 / 1 / 2 / 3"]),
+    *(["numbers", "of all numbers"], ["spz", ".spz, of its bytes"]),
+]
+BANDS_NOTE = (
+    "`backbone.capacity=adaptive`; at four fifths of the steps each Gaussian keeps the SH bands that are worth their "
+    "numbers. PSNR on held-out views, dB, means over seeds ± half their range; differences seed by seed. Numbers: of "
+    "what the Gaussians are with all bands."
+)
+
+
+def spz_bytes(folder: Path) -> int:
+    """Of the model of a run."""
+    path = folder.with_name(f"{folder.name}.spz")
+    if not path.is_file():
+        gsx(["export", str(folder), str(path)], log=folder.with_name(f"{folder.name}.spz.log"))
+    return path.stat().st_size
+
+
+def judged_evaluation(scene: str, price: float, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+    """Of a run at that price, with how many Gaussians have each degree."""
+    folder = given.runs / f"{backbone}_{scene}_bands_{price}_{seed}"
+    print(time.strftime("%H:%M"), folder.name, flush=True)
+    threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
+    wish = [f"backbone.sh_judged={BANDS_FROM}", f"backbone.sh_price={price}"]
+    words = [f"backbone={backbone}", *overrides_of("adaptive", scene, {"primitives": 0}), *SUBJECTS[scene], *wish]
+    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
+    more = [*where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    found = train(folder, [*words, *more], threads, folder.with_name(f"{folder.name}.log"))
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    told_of = next(line for line in lines if "degree_0" in line)
+    return found | {"degrees": [told_of[f"degree_{degree}"] for degree in range(4)], "spz": spz_bytes(folder)}
+
+
+def bands_row(scene: str, price: float, own: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]]) -> dict:
+    """Means over seeds, and what is different from runs with all bands, seed by seed."""
+    row = row_of(scene, "adaptive", own, first) | {"price": price}
+    counts = [statistics.mean(column) for column in zip(*(run["degrees"] for run in own), strict=True)]
+    sizes = numbers_of(3, other=11).tolist()
+    kept = sum(count * size for count, size in zip(counts, sizes, strict=True)) / (sizes[-1] * sum(counts))
+    shares = " / ".join(f"{count / sum(counts):.2f}" for count in counts)
+    bytes_left = statistics.mean(a["spz"] / b["spz"] for a, b in zip(own, first, strict=True))
+    row |= {"degrees": shares, "numbers": f"{kept:.2f}", "spz": f"{bytes_left:.2f}"}
+    return {name: row[name] for name, _ in BANDS_COLUMNS}
+
+
+def bands_judged(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+
+    def look(scene: str, seed: int) -> dict[float, Any]:
+        whole = evaluation_of("adaptive", scene, backbone, seed, given)
+        all_bands = {0.0: whole | {"spz": spz_bytes(folder_of("adaptive", scene, backbone, seed, given))}}
+        return all_bands | {price: judged_evaluation(scene, price, backbone, seed, given) for price in PRICES}
+
+    found = over_seeds(look, scenes, given)
+    return [
+        bands_row(scene, price, [one[price] for one in found[scene]], [one[0.0] for one in found[scene]])
+        for scene in scenes
+        for price in PRICES
+    ]
+
+
+# -- what the evidence costs -------------------------------------------------------------------------------------------
+
+EVIDENCE = {
+    "windows": (adaptive, "window_errors"),
+    "removals": (capacity, "worth_of_rows"),
+    "errors": (long_axis, "drawn_errors"),
+}
+"""What adaptive growth finds out, and where it asks for it."""
+EVIDENCE_COLUMNS = [
+    *(["scene", "scene"], ["seeds", "seeds"], ["seconds", "training s"], ["windows", "validation windows"]),
+    *(["removals", "what is not worth its price"], ["errors", "who draws the error"], ["share", "together"]),
+]
+EVIDENCE_NOTE = "Adaptive runs, in this process; shares of the training's seconds, medians over seeds."
+
+
+@contextmanager
+def clocked() -> Iterator[dict[str, float]]:
+    """Seconds spent on each kind of evidence inside the block."""
+    spent, own = dict.fromkeys(EVIDENCE, 0.0), {name: getattr(*place) for name, place in EVIDENCE.items()}
+
+    def timed(name: str) -> Callable[..., Any]:
+        def call(*given: Any) -> Any:
+            begun = time.perf_counter()
+            found = own[name](*given)
+            spent[name] += time.perf_counter() - begun
+            return found
+
+        return call
+
+    for name, place in EVIDENCE.items():
+        setattr(*place, timed(name))
+    try:
+        yield spent
+    finally:
+        for name, place in EVIDENCE.items():
+            setattr(*place, own[name])
+
+
+def evidence_shares(scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, float]:
+    """Of the training time of a run."""
+    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
+    words = [f"backbone={backbone}", *overrides_of("adaptive", scene, {"primitives": 0}), *SUBJECTS[scene], *where]
+    folder = given.runs / f"{backbone}_{scene}_clocked_{seed}"
+    shutil.rmtree(folder, ignore_errors=True)
+    with clocked() as spent:
+        train_here(*words, f"seed={seed}", f"folder={folder}")
+    seconds = read_json(folder / "evaluation.json")["train_seconds"]
+    return {"seconds": seconds, **{name: value / seconds for name, value in spent.items()}}
+
+
+def evidence_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    rows = []
+    for scene in [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]:
+        found = [evidence_shares(scene, backbone, seed, given) for seed in given.seeds]
+        middle = {name: statistics.median(one[name] for one in found) for name in found[0]}
+        share = statistics.median(sum(one[name] for name in EVIDENCE) for one in found)
+        shares = {name: f"{100 * middle[name]:.1f} %" for name in EVIDENCE} | {"share": f"{100 * share:.1f} %"}
+        rows.append({"scene": scene, "seeds": len(found), "seconds": round(middle["seconds"]), **shares})
+    return rows
 
 
 # -- made smaller afterwards -------------------------------------------------------------------------------------------
@@ -204,6 +341,13 @@ def main(words: Sequence[str]) -> None:
         if "growth" in given.what:
             rows = measured(backbone, given)
             tables[backbone] = stamped(f"Growth of {backbone}", COLUMNS, rows, [note], load, command)
+        if "bands" in given.what:
+            rows = bands_judged(backbone, given)
+            title = f"{backbone} with the bands of colour that are worth their numbers"
+            tables[f"{backbone}_bands"] = stamped(title, BANDS_COLUMNS, rows, [BANDS_NOTE], load, command)
+        if "evidence" in given.what:
+            title, rows = f"What adaptive growth of {backbone} asks costs", evidence_rows(backbone, given)
+            tables[f"{backbone}_evidence"] = stamped(title, EVIDENCE_COLUMNS, rows, [EVIDENCE_NOTE], load, command)
         if "compact" in given.what:
             title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
             tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)
