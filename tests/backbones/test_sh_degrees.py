@@ -85,6 +85,16 @@ def test_bands_stay_where_they_are_cheap_and_go_where_they_are_dear() -> None:
         assert model.table["sh_degree"].tolist() == degrees
 
 
+def test_bands_that_have_not_begun_to_learn_are_not_judged() -> None:
+    """At step 1000 of the published run colours are of degree 1."""
+    scene = small_scene(spread(3))
+    model = small_gs3d(scene, options=replace(published_options(), sh_judged=1000 / 30000, sh_price=1e-6))
+    with torch.no_grad():
+        model.table["sh_rest"][:, :3] = torch.tensor([0.5, 0.0, 0.5])[:, None, None]
+    model.densify_and_prune(1000)
+    assert model.table["sh_degree"].tolist() == [3, 0, 3]
+
+
 def test_degrees_are_saved_with_the_model() -> None:
     model = shiny()
     model.densify_and_prune(JUDGED)
@@ -94,5 +104,5 @@ def test_degrees_are_saved_with_the_model() -> None:
 
 def test_nothing_is_judged_unless_asked_for() -> None:
     model = small_gs3d(small_scene(spread(3)))
-    assert model.sh_judged() == 0
+    assert model.sh_step() == 0
     assert "sh_degree" not in model.table.columns

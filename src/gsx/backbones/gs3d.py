@@ -97,7 +97,8 @@ class GS3D:
     def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
         """A table of raw parameters and columns that nothing is known of yet."""
         if self.options.sh_judged > 0:
-            columns = columns | {"sh_degree": torch.full((len(raw["means"]),), self.options.sh_degree)}
+            degrees = torch.full((len(raw["means"]),), self.options.sh_degree, dtype=torch.int8)
+            columns = columns | {"sh_degree": degrees}
         table = ParameterTable(
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
@@ -184,11 +185,11 @@ class GS3D:
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)
             done["opacity_resets"] = 1
-        if step == self.sh_judged():
+        if step == self.sh_step():
             done |= self.judge_degrees(step)
         return done
 
-    def sh_judged(self) -> int:
+    def sh_step(self) -> int:
         """Step at which SH degrees are judged; 0: at none."""
         return round(self.options.sh_judged * self.schedule.iterations)
 
@@ -219,7 +220,7 @@ class GS3D:
         rest = self.table["sh_rest"]
         if rest.grad is None and self.table["sh_dc"].grad is not None:
             rest.grad = torch.zeros_like(rest)
-        if "sh_degree" in self.table.columns and step >= self.sh_judged():
+        if "sh_degree" in self.table.columns and step >= self.sh_step():
             hold_bands(self.table)
         self.set_rates(step)
         take_adam_step(self.table)

@@ -49,10 +49,10 @@ def kept_bands(degrees: Int[Tensor, "N"], count: int) -> Bool[Tensor, "N B"]:
 
 def judge_degrees(table: ParameterTable, found: Removal, price: float, step: int) -> dict[str, float]:
     """Lower the degrees of rows by what was found of them; the bands above are zeroed with their moments."""
-    highest = len(found.squares) - 1
+    highest, own = len(found.squares) - 1, table["sh_degree"]
     other = sum(value[0].numel() for name, value in table.parameters.items() if name not in ("sh_dc", "sh_rest"))
-    degrees = least_degrees(found.squares, found.shown, found.error_share, price, numbers_of(highest, other))
-    table.columns["sh_degree"] = torch.minimum(table["sh_degree"], degrees.to(table["sh_degree"]))
+    degrees = least_degrees(found.squares, found.shown, found.error_share, price, numbers_of(highest, other)).to(own)
+    table.columns["sh_degree"] = torch.where(degrees < highest, degrees, own)  # higher ones may not have begun to learn
     clear_bands(table)
     counts = torch.bincount(table["sh_degree"].long(), minlength=highest + 1).tolist()
     told = ", ".join(f"{count} of degree {degree}" for degree, count in enumerate(counts))
