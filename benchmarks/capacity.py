@@ -43,6 +43,7 @@ SUBJECTS = {
 FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000}
 """Primitives of the smaller budget."""
 ARMS = ("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer")
+ADAPTIVE = "backbone.capacity=adaptive"
 ZOOMS = ("1", "2", "4")
 
 
@@ -67,7 +68,7 @@ def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
     number = published["primitives"] if arm == "budget as published" else FEWER[scene]
     return {
         "published": [],
-        "adaptive": ["backbone.capacity=adaptive"],
+        "adaptive": [ADAPTIVE],
         "published, held at fewer": [f"backbone.max_primitives={number}"],
     }.get(arm, ["backbone.capacity=budget", f"backbone.budget.primitives={number}"])
 
@@ -80,13 +81,27 @@ def folder_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Na
 def evaluation_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of the run of an arm, which is trained unless it is there."""
     published = {} if arm in ("published", "adaptive") else evaluation_of("published", scene, backbone, seed, given)
+    wish = overrides_of(arm, scene, published or {"primitives": 0})
+    return trained(folder_of(arm, scene, backbone, seed, given), words_of(wish, scene, backbone, seed, given), given)
+
+
+def words_of(wish: Sequence[str], scene: str, backbone: str, seed: int, given: argparse.Namespace) -> list[str]:
+    """The whole composition of a run that differs from the published one by a wish."""
     where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
-    folder = folder_of(arm, scene, backbone, seed, given)
+    zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
+    return [f"backbone={backbone}", *wish, *SUBJECTS[scene], *where, f"seed={seed}", zooms]
+
+
+def trained(folder: Path, words: Sequence[str], given: argparse.Namespace) -> dict[str, Any]:
+    """Evaluation of the run in a folder, which is trained unless it is there."""
     print(time.strftime("%H:%M"), folder.name, flush=True)
-    words = [f"backbone={backbone}", *overrides_of(arm, scene, published or {"primitives": 0}), *SUBJECTS[scene]]
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    more = [*where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    return train(folder, [*words, *more], threads, folder.with_name(f"{folder.name}.log"))
+    return train(folder, words, threads, folder.with_name(f"{folder.name}.log"))
+
+
+def scenes_of(given: argparse.Namespace) -> list[str]:
+    """Those asked for that are there."""
+    return [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
 
 
 def row_of(scene: str, arm: str, own: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -116,7 +131,7 @@ NOTE = (
 
 def measured(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of a backbone."""
-    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    scenes = scenes_of(given)
     arms = [arm for arm in ARMS if arm in ("published", *given.arms.split(";"))]
 
     def look(scene: str, seed: int) -> dict[Any, Any]:
@@ -158,13 +173,8 @@ def spz_bytes(folder: Path) -> int:
 def judged_evaluation(scene: str, price: float, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of a run at that price, with how many Gaussians have each degree."""
     folder = given.runs / f"{backbone}_{scene}_bands_{price}_{seed}"
-    print(time.strftime("%H:%M"), folder.name, flush=True)
-    threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    wish = [f"backbone.sh_judged={BANDS_FROM}", f"backbone.sh_price={price}"]
-    words = [f"backbone={backbone}", *overrides_of("adaptive", scene, {"primitives": 0}), *SUBJECTS[scene], *wish]
-    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
-    more = [*where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    found = train(folder, [*words, *more], threads, folder.with_name(f"{folder.name}.log"))
+    wish = [ADAPTIVE, f"backbone.sh_judged={BANDS_FROM}", f"backbone.sh_price={price}"]
+    found = trained(folder, words_of(wish, scene, backbone, seed, given), given)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     told_of = next(line for line in lines if "degree_0" in line)
     return found | {"degrees": [told_of[f"degree_{degree}"] for degree in range(4)], "spz": spz_bytes(folder)}
@@ -184,7 +194,7 @@ def bands_row(scene: str, price: float, own: Sequence[dict[str, Any]], first: Se
 
 def bands_judged(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of a backbone."""
-    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    scenes = scenes_of(given)
 
     def look(scene: str, seed: int) -> dict[float, Any]:
         whole = evaluation_of("adaptive", scene, backbone, seed, given)
@@ -239,12 +249,10 @@ def clocked() -> Iterator[dict[str, float]]:
 
 def evidence_shares(scene: str, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, float]:
     """Of the training time of a run."""
-    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
-    words = [f"backbone={backbone}", *overrides_of("adaptive", scene, {"primitives": 0}), *SUBJECTS[scene], *where]
     folder = given.runs / f"{backbone}_{scene}_clocked_{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     with clocked() as spent:
-        train_here(*words, f"seed={seed}", f"folder={folder}")
+        train_here(*words_of([ADAPTIVE], scene, backbone, seed, given), f"folder={folder}")
     seconds = read_json(folder / "evaluation.json")["train_seconds"]
     return {"seconds": seconds, **{name: value / seconds for name, value in spent.items()}}
 
@@ -252,7 +260,7 @@ def evidence_shares(scene: str, backbone: str, seed: int, given: argparse.Namesp
 def evidence_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of a backbone."""
     rows = []
-    for scene in [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]:
+    for scene in scenes_of(given):
         found = [evidence_shares(scene, backbone, seed, given) for seed in given.seeds]
         middle = {name: statistics.median(one[name] for one in found) for name in found[0]}
         share = statistics.median(sum(one[name] for name in EVIDENCE) for one in found)
@@ -323,7 +331,7 @@ def compact_row(scene: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def made_smaller(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of a backbone."""
-    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    scenes = scenes_of(given)
     found = over_seeds(lambda scene, seed: compacted(scene, backbone, seed, given), scenes, given)
     return [compact_row(scene, found[scene]) for scene in scenes]
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.backbones.capacity import Growing, Undone, worth_in_training
+from gsx.backbones.capacity import Growing, Undone, error_exponent, worth_in_training
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
@@ -143,7 +143,7 @@ class Adaptive:
         """
         found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share
-        least = self.options.price * math.log(10) / (10 * math.log(2)) * lasting
+        least = error_exponent(self.options.price) * lasting
         doomed = (found.shown > 0) & (found.squares < least)
         if bool(doomed.all()):
             return {}

@@ -167,6 +167,11 @@ class Budget(Cap):
         return {"budget": {"primitives": self.most}}
 
 
+def error_exponent(price: float) -> float:
+    """The squared error falls as N^-this where a doubling of N brings so many dB."""
+    return price * math.log(10) / (10 * math.log(2))
+
+
 def worth_in_training(
     model: Backbone[Any], context: BackboneContext, step: int, changes: Changes = removal_changes
 ) -> Removal:

@@ -1,6 +1,7 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -62,6 +63,11 @@ def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
         raise InputError(f"init: the file has colours of degree {degree}, backbone.sh_degree is {sh_degree}: raise it")
     missing = rest.new_zeros(len(rest), bands - rest.shape[1], 3)
     return vars(gaussians) | {"sh_dc": gaussians.sh_dc[:, None], "sh_rest": torch.cat([rest, missing], 1)}
+
+
+def colours_from(camera: Camera, values: Mapping[str, Tensor], degree: int) -> Float[Tensor, "M 3"]:
+    """Colours of Gaussians as seen from a camera, up to a degree."""
+    return colours_of(values["sh_dc"], values["sh_rest"], offsets_from(values["means"], camera.centre), degree)
 
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
@@ -136,14 +142,13 @@ class GS3D:
         """The Gaussians that the camera draws, with their colours as seen from there."""
         shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
-        offsets = offsets_from(values["means"], camera.centre)
         scales, log_opacities = extents(self.table, shown, self.filter)
         splats = Splats(
             means=values["means"],
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(values["sh_dc"], values["sh_rest"], offsets, self.active_degree(step)),
+            colours=colours_from(camera, values, self.active_degree(step)),
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 
@@ -151,9 +156,7 @@ class GS3D:
     def colours_by_degree(self, camera: Camera, step: int) -> Float[Tensor, "D M 3"]:
         """Colours of what the camera draws, of each degree up to that of the step."""
         values = self.visibility.shown(self.table, camera, step).values
-        offsets = offsets_from(values["means"], camera.centre)
-        degrees = range(self.active_degree(step) + 1)
-        return torch.stack([colours_of(values["sh_dc"], values["sh_rest"], offsets, degree) for degree in degrees])
+        return torch.stack([colours_from(camera, values, degree) for degree in range(self.active_degree(step) + 1)])
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """That of density control; 3D-GS has none."""

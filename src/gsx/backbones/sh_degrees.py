@@ -7,11 +7,11 @@ their numbers cost, by the price of a doubling of all numbers. The degree at whi
 """
 
 import logging
-import math
 
 import torch
 from torch import Tensor
 
+from gsx.backbones.capacity import error_exponent
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.evidence import Removal
 from gsx.core.training.parameter_table import ParameterTable, edit
@@ -37,7 +37,7 @@ def least_degrees(
     error_share: the squared error of a view over what it shows; price: dB that a doubling of all numbers has to bring.
     """
     share = (numbers / numbers[-1]).to(squares)
-    cost = squares + price * math.log(10) / (10 * math.log(2)) * error_share * share[:, None]
+    cost = squares + error_exponent(price) * error_share * share[:, None]
     return torch.where(shown > 0, cost.argmin(0), len(numbers) - 1)
 
 

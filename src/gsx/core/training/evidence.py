@@ -104,8 +104,9 @@ def recolouring_changes(
 
 def by_row(drawn: Drawn, values: Float[Tensor, "*K M"], count: int) -> Float[Tensor, "*K N"]:
     """Sums of what was found of the splats of each of so many rows."""
-    sums = values.new_zeros(*values.shape[:-1], count)
-    return values if drawn.rows is None else sums.index_add_(-1, drawn.rows, values)
+    if drawn.rows is None:
+        return values
+    return values.new_zeros(*values.shape[:-1], count).index_add_(-1, drawn.rows, values)
 
 
 def looked_at(
@@ -147,6 +148,11 @@ Changes = Callable[[Look, Tensor], Tensor]
 """(render, signs) -> [*K, M]: by how much the picture changes, as `removal_changes` tells it."""
 
 
+def draws_of_each(views: Sequence[View]) -> int:
+    """How often signs are drawn for each of the views."""
+    return max(1, DRAWS // len(views))
+
+
 def worth_of_rows(
     model: Backbone[Any],
     views: Sequence[View],
@@ -157,7 +163,7 @@ def worth_of_rows(
     changes: Changes = removal_changes,
 ) -> Removal:
     """What the pictures of the views lose without each row, or by other changes of it."""
-    count, draws = len(model.table), max(1, DRAWS // len(views))
+    count, draws = len(model.table), draws_of_each(views)
     squares, shown, error = background.new_zeros(count), background.new_zeros(count), 0.0
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)

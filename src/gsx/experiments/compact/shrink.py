@@ -26,7 +26,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.evidence import DRAWS, looked_at, squared_changes
+from gsx.core.training.evidence import draws_of_each, looked_at, squared_changes
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import edit, keep_rows, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
@@ -134,7 +134,7 @@ def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Flo
     for view in views:
         for camera, counted in pictures_of(view):
             drawn, seen = looked_at(run.backbone, camera, form, run.background, run.model_step)
-            worth += squared_changes(drawn, seen, counted, len(worth), max(1, DRAWS // len(views)), generator)
+            worth += squared_changes(drawn, seen, counted, len(worth), draws_of_each(views), generator)
     return worth
 
 
@@ -267,7 +267,7 @@ def cut_bands(run: Run, degree: int) -> None:
 def shorten_colours(run: Run, degree: int) -> None:
     """Drop the bands above a degree, with their moments, from the table; what draws it has to be built for that."""
     if "sh_rest" in run.backbone.table.parameters:
-        edit(run.backbone.table, "sh_rest", *[lambda rows: rows[:, : BANDS[degree]].contiguous()] * 2)
+        edit(run.backbone.table, "sh_rest", *[lambda rows: rows[:, : BANDS[degree]]] * 2)
 
 
 def told(tries: Sequence[Try]) -> list[dict[str, object]]:

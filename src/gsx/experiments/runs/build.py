@@ -65,11 +65,10 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 
 def refuse_own_judgement(options: Any, ranks: Ranks) -> None:
     """Raise ConfigError where processes would each decide by renders of their own what the model needs."""
-    capacity = getattr(options, "capacity", "published")
-    if ranks.size > 1 and capacity != "published":
-        raise ConfigError(f"backbone.capacity={capacity} is for one process: call gsx without torchrun, or published")
-    if ranks.size > 1 and getattr(options, "sh_judged", 0) > 0:
-        raise ConfigError(f"backbone.sh_judged={options.sh_judged} is for one process: call gsx without torchrun, or 0")
+    for name, shared in {"capacity": "published", "sh_judged": 0}.items():
+        value = getattr(options, name, shared)
+        if ranks.size > 1 and value != shared:
+            raise ConfigError(f"backbone.{name}={value} is for one process: call gsx without torchrun, or {shared}")
 
 
 def build(
