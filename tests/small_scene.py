@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import BackboneContext
+from gsx.core.training.resolution import Resolution
 from gsx.experiments.runs.settings import typed
 
 
@@ -52,21 +53,21 @@ def published_options(**density: float) -> GS3DOptions:
 
 
 def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **more: int) -> BackboneContext:
-    """What a backbone on the CPU is built from."""
+    """What a backbone on the CPU is built from; `more`: of its resolution."""
     return BackboneContext(
         scene=scene,
         iterations=iterations,
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
-        **more,
+        resolution=Resolution(scene=scene, **more),
     )
 
 
 def small_gs3d(
     scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None, **more: int
 ) -> GS3D:
-    """The backbone at step 0; `more`: of its context."""
+    """The backbone at step 0; `more`: of its resolution."""
     return gs3d(options or published_options(), small_context(scene, iterations=iterations, seed=seed, **more))
 
 

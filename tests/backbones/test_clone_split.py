@@ -35,6 +35,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.density import within_room
 from gsx.core.training.parameter_table import size_of
+from gsx.core.training.resolution import Resolution
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
@@ -69,6 +70,7 @@ def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
+        resolution=Resolution(scene=scene or deep_scene()),
     )
     backbone = free_gaussians(options, context)
     visibility = visibility_of(backbone)

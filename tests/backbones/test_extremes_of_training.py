@@ -16,6 +16,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
+from gsx.core.training.resolution import Resolution
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import in_units, measured, warned_of_units
 from gsx.experiments.runs.settings import Settings
@@ -46,6 +47,7 @@ def built(name: str, scene: Scene) -> Backbone:
         device=torch.device("cpu"),
         raster=settings.raster,
         generator=torch.Generator().manual_seed(0),
+        resolution=Resolution(scene=scene),
     )
     return settings.backbone.component.factory(settings.backbone.options, context)
 

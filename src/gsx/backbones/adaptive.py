@@ -78,7 +78,7 @@ class Adaptive:
     def __init__(self, options: AdaptiveOptions, context: BackboneContext, growing: Growing, most: int) -> None:
         self.options, self.growing, self.most = options, growing, most
         self.context = context
-        self.views, self.background = context.scene.train, context.scene.background.to(context.device)
+        self.background = context.scene.background.to(context.device)
 
     def begin(self, table: ParameterTable) -> None:
         """Nothing has been added or found yet."""
@@ -87,19 +87,21 @@ class Adaptive:
 
     # -- validation windows --------------------------------------------------------------------------------------
 
-    def windows(self, interval: int) -> dict[View, Window]:
-        """The windows that count in no loss during an interval between events, counted from 0."""
+    def windows(self, step: int) -> dict[View, Window]:
+        """The windows that count in no loss at a step: those of the interval between events that it belongs to."""
+        views, interval = self.context.resolution.views(step), (step - 1) // self.growing.every
         generator = torch.Generator().manual_seed(derived_seed("withheld", interval))
-        order = torch.randperm(len(self.views), generator=generator)[: self.options.views].tolist()
+        order = torch.randperm(len(views), generator=generator)[: self.options.views].tolist()
         corners = torch.rand(len(order), 2, generator=generator).tolist()
-        chosen = zip([self.views[index] for index in order], corners, strict=True)
+        chosen = zip([views[index] for index in order], corners, strict=True)
         return {view: part_of(view, self.options.window, *corner) for view, corner in chosen}
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """That of the interval which the step belongs to, while there is something to judge."""
         if not self.growing.start < step < self.growing.stop or self.ended(table):
             return None
-        return self.windows((step - 1) // self.growing.every).get(view)
+        named = {other.name: window for other, window in self.windows(step).items()}
+        return named.get(view.name)
 
     # -- what is found -------------------------------------------------------------------------------------------
 
@@ -119,8 +121,8 @@ class Adaptive:
         before = None if self.ended(table) else undone(table)
         if before is None:
             return {}
-        windows = self.windows((step - 1) // self.growing.every)
-        form = self.context.forming(step)
+        windows = self.windows(step)
+        form = self.context.resolution.forming(step)
         has, had = (window_errors(model, rows, windows, form, self.background, step).cpu() for rows in (table, before))
         floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
         gain, error = decibels(has + floor, had + floor)

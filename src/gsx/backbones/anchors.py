@@ -87,7 +87,7 @@ class Anchors:
     ) -> None:
         scene, points = context.scene, context.points()
         self.options, self.representation, self.sh = options, representation, sh
-        self.network_rates, self.extent, self.finer_after = network_rates, scene.extent, context.finer_after
+        self.network_rates, self.extent, self.resolution = network_rates, scene.extent, context.resolution
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
         self.views = {camera: number for number, camera in enumerate(self.cameras)}
@@ -162,7 +162,7 @@ class Anchors:
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Grow and prune when due (Scaffold-GS, train.py)."""
         due = self.growing().due(step)
-        if not due and step != self.finer_after:
+        if not due and not self.resolution.changes_after(step):
             return {}
         done = self.grow_and_prune(step) if due else {}
         self.filter.refresh(self.table, self.table["anchors"], step)

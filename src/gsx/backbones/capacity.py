@@ -176,8 +176,8 @@ def worth_in_training(
     model: Backbone[Any], context: BackboneContext, step: int, changes: Changes = removal_changes
 ) -> Removal:
     """What training views lose without each row, or by other changes of it."""
-    views = some_of(context.scene.train, LOOKS, context.generator)
-    background, form = context.scene.background.to(context.device), context.forming(step)
+    views = some_of(context.resolution.views(step), LOOKS, context.generator)
+    background, form = context.scene.background.to(context.device), context.resolution.forming(step)
     return worth_of_rows(model, views, form, background, step, context.generator, changes)
 
 

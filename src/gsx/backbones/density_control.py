@@ -25,8 +25,7 @@ class DensityControl:
     ) -> None:
         self.options, self.capacity, self.schedule, self.densification = options, capacity, schedule, how
         self.extent, self.generator = context.scene.extent, context.generator
-        self.forming = context.forming
-        self.views, self.background = context.scene.train, context.scene.background.to(context.device)
+        self.resolution, self.background = context.resolution, context.scene.background.to(context.device)
         self.growing = growing_of(options, schedule)
         self.white = bool((context.scene.background == 1).all())
 

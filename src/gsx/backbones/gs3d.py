@@ -89,7 +89,7 @@ class GS3D:
         self.control = DensityControl(density, self.capacity, context, self.schedule, densification)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, density.stop)
         self.raster = self.filter.rules(context.raster)
-        self.absolute_gradient, self.finer_after = density.absolute or self.capacity.ranked, context.finer_after
+        self.absolute_gradient = density.absolute or self.capacity.ranked
         self.first_degree = 0
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
@@ -183,7 +183,7 @@ class GS3D:
         if done or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)
-            if step == self.finer_after and before is not None:  # the picture goes on as it was
+            if before is not None and self.context.resolution.changes_after(step):  # the picture goes on as it was
                 absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)

@@ -92,8 +92,8 @@ class LongAxis:
     def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
         """As many as there is room for."""
         table = model.table
-        views = some_of(control.views, self.views, control.generator)
-        drawn = drawn_errors(model, views, control.forming(step), control.background, step)
+        views = some_of(control.resolution.views(step), self.views, control.generator)
+        drawn = drawn_errors(model, views, control.resolution.forming(step), control.background, step)
         score = drawn * mean_absolute(table)
         wanted = score > 0
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))

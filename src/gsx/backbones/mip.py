@@ -149,13 +149,15 @@ class MipFilter:
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
-        table.columns["filter"] = filter_sizes(means.detach(), self.context.rendered_cameras(step), self.options)
+        table.columns["filter"] = filter_sizes(
+            means.detach(), self.context.resolution.rendered_cameras(step + 1), self.options
+        )
 
     def due(self, step: int) -> bool:
         """Every interval between the end of density control and the freezing of the filter (Mip-Splatting), and where
         renders become finer."""
         options, schedule = self.options, self.schedule
-        if step == self.context.finer_after:
+        if self.context.resolution.changes_after(step):
             return True
         inside = schedule.step(self.settled) < step < schedule.step(options.stop)
         return inside and step % schedule.interval(options.every) == 0

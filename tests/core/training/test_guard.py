@@ -18,6 +18,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, Step, TrainingOptions
 from gsx.core.training.trainer import train, train_step
 
@@ -59,6 +60,7 @@ def run_with(poison: dict[int, str], folder: Path, iterations: int = 8, points: 
         iterations=iterations,
         device=torch.device("cpu"),
         generator=generator,
+        resolution=Resolution(scene=scene),
         sampler=Sampler(4, 0),
     )
 

@@ -18,6 +18,7 @@ from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
@@ -85,6 +86,7 @@ def run_of(folder: Path) -> Run:
         iterations=7,
         device=torch.device("cpu"),
         generator=torch.Generator(),
+        resolution=Resolution(scene=scene),
         sampler=Sampler(3, 0),
         step=7,
         seconds=3.0,

@@ -19,6 +19,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.execute import execute
@@ -59,6 +60,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
                 device=torch.device("cpu"),
                 raster=RasterSettings(),
                 generator=generator,
+                resolution=Resolution(scene=scene),
             ),
         )
 
@@ -73,6 +75,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
         iterations=40,
         device=torch.device("cpu"),
         generator=generator,
+        resolution=Resolution(scene=scene),
         sampler=Sampler(views, 0),
     )
     run.held_out = partial(held_out_renders, run, anew)

@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -15,8 +15,8 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.schedule import Schedule
-from gsx.core.training.supersampling import FinerRaster, raster_at
 
 MOST_LOST, FEW = 0.01, 10
 """Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
@@ -35,20 +35,8 @@ class BackboneContext:
     """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
-    supersample: int = 1
-    """How many times as fine as photographs they are rendered (`training.supersample`)."""
-    finer_after: int = 0
-    """Step after which they are."""
-
-    def rendered_cameras(self, step: int) -> list[Camera]:
-        """Those that the next step renders by: of the photographs, as fine as they are rendered then."""
-        times = self.supersample if step >= self.finer_after else 1
-        return [view.camera.zoom(times) for view in self.scene.train]
-
-    def forming(self, step: int) -> Callable[[Camera], FinerRaster]:
-        """How pictures come about at a step."""
-        supersample = self.supersample if step > self.finer_after else 1
-        return lambda camera: raster_at(camera, self.scene, supersample)
+    resolution: Resolution
+    """How finely training views are seen and rendered at each step."""
 
     def points(self) -> PointCloud:
         """What the model starts from.

@@ -38,7 +38,7 @@ def render(
     Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
     `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
     """
-    times = supersample or times_as_fine(camera, run.scene.train, run.supersample_at(run.model_step))
+    times = supersample or times_as_fine(camera, run.scene.train, run.resolution.supersample_at(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
     tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, pixels=pixels)

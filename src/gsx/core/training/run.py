@@ -20,6 +20,7 @@ from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.pseudo_views import Term
+from gsx.core.training.resolution import Resolution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +41,27 @@ class TrainingOptions:
     supersample_from: Share = 0.0
     """Share of the steps that are rendered at the photographs' resolution before that."""
 
+    coarse: Annotated[int, Range(1, 64)] = 1
+    """Photographs are seen so many times as coarse at first: a power of two (`training.resolution`); published: 1."""
+    coarse_until: Share = 0.0
+    """Share of the steps after which they are seen as they are."""
+
     def __post_init__(self) -> None:
         if self.supersample_from == 1:
             raise ValueError("training.supersample_from is 1.0; give a share of the steps below 1")
+        if self.coarse & (self.coarse - 1):
+            near = 1 << self.coarse.bit_length() - 1
+            raise ValueError(f"training.coarse is {self.coarse}; give a power of two, for example {near}")
 
-    def finer_after(self, iterations: int) -> int:
-        """Steps that a run of so many takes at the photographs' own resolution before it renders more finely; or 0."""
-        return round(self.supersample_from * iterations) if self.supersample > 1 else 0
+    def resolution(self, scene: Scene, iterations: int) -> Resolution:
+        """Of the training views in a run of so many steps."""
+        return Resolution(
+            scene=scene,
+            coarse=self.coarse,
+            coarse_until=round(self.coarse_until * iterations) if self.coarse > 1 else 0,
+            supersample=self.supersample,
+            finer_after=round(self.supersample_from * iterations) if self.supersample > 1 else 0,
+        )
 
 
 @dataclass(eq=False)
@@ -121,6 +136,7 @@ class Run:
     backbone: Backbone[Any]
     raster: RasterSettings
     training: TrainingOptions
+    resolution: Resolution
     iterations: int
     device: torch.device
     generator: torch.Generator
@@ -166,10 +182,6 @@ class Run:
     def model_step(self) -> int:
         """The step by whose rules the model is drawn between steps: the last one done; before the first that one."""
         return max(1, self.step)
-
-    def supersample_at(self, step: int) -> int:
-        """How many times as fine as photographs they are rendered at a step."""
-        return self.training.supersample if step > self.training.finer_after(self.iterations) else 1
 
     @property
     def background(self) -> Float[Tensor, "3"]:

@@ -22,7 +22,6 @@ from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Step
-from gsx.core.training.supersampling import raster_at
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +69,8 @@ def veto(run: Run, step: Step, plugins: Plugins) -> str:
 
 def remove_lost(run: Run, step: Step) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
-    cameras = [run.scene.train[number].camera for number in run.sampler.taken]
+    views = run.resolution.views(step.number)
+    cameras = [views[number].camera for number in run.sampler.taken]
     removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed:
         run.changing = True
@@ -87,11 +87,11 @@ def backward(run: Run) -> Step:
     picked = run.ranks.share(batch)
     asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
-    steps = []
+    views, steps = run.resolution.views(number), []
     for view, terms, colour in zip(picked, asked, colours, strict=True):
         with gradients_added(run.backbone.table):
             given = [term for term in terms if term is not None]
-            steps.append(view_loss(run, number, run.scene.train[view], given, colour))
+            steps.append(view_loss(run, number, views[view], given, colour))
     told = {tally.name: tally.account_at(number) for tally in run.tallies}
     steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
     return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
@@ -153,7 +153,7 @@ def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | 
 def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
     """(what the backbone draws at this step, its render), to be learnt from; screen statistics are of the raster that
     was drawn, the picture is reduced from it (`training.supersample`)."""
-    raster, absolute = raster_at(camera, run.scene, run.supersample_at(number)), run.backbone.absolute_gradient
+    raster, absolute = run.resolution.forming(number)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, number)
     rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
     image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))

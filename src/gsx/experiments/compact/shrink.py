@@ -129,7 +129,7 @@ def pictures_of(view: View) -> list[tuple[Camera, Bool[Tensor, "H W"] | None]]:
 def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Float[Tensor, "N"]:
     """What pictures lose without each row: squared changes of values, summed over views and windows."""
     worth = torch.zeros(len(run.backbone.table), device=run.device)
-    supersample = run.supersample_at(run.model_step)
+    supersample = run.resolution.supersample_at(run.model_step)
     form = partial(raster_at, scene=run.scene, supersample=supersample)
     for view in views:
         for camera, counted in pictures_of(view):

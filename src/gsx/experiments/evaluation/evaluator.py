@@ -167,8 +167,8 @@ class Evaluator:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
         renders is drawn as finely as it was trained."""
         times = self.options.supersample
-        if factor < 1 and not times and self.run.supersample_at(self.run.model_step) > 1:
-            times = math.ceil(self.run.supersample_at(self.run.model_step) / factor)
+        if factor < 1 and not times and self.run.resolution.supersample_at(self.run.model_step) > 1:
+            times = math.ceil(self.run.resolution.supersample_at(self.run.model_step) / factor)
         return render(self.run, view.camera, self.options.tile_pixels, times)
 
     def view(self, view: View) -> dict[str, Any]:

@@ -100,8 +100,7 @@ def build(
             device=device,
             raster=raster,
             generator=generator,
-            supersample=settings.training.supersample,
-            finer_after=settings.training.finer_after(iterations),
+            resolution=settings.training.resolution(scene, iterations),
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
 
@@ -119,6 +118,7 @@ def build(
         backbone=backbone,
         raster=backbone.raster,
         training=settings.training,
+        resolution=settings.training.resolution(scene, general.iterations),
         iterations=general.iterations,
         device=device,
         generator=generator,

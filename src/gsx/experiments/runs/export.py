@@ -121,7 +121,7 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
 
 def supersampling_note(run: Run) -> list[str]:
     """How training saw the model, where that was through finer pixels."""
-    times = run.supersample_at(run.model_step)
+    times = run.resolution.supersample_at(run.model_step)
     filter_ = run.scene.reduction.filter
     return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
 

@@ -82,6 +82,7 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         backbone=backbone,
         raster=backbone.raster,
         training=run.training,
+        resolution=run.training.resolution(scene, steps),
         iterations=steps,
         device=run.device,
         generator=generator,

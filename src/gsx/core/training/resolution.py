@@ -1,0 +1,114 @@
+"""How finely training views are seen and rendered at each step: coarsely at first, then as they are, at last more so.
+
+What a view shows at a fraction of its size is learnt in a fraction of the time (DashGaussian, Chen et al. 2025).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import Scene, View
+from gsx.core.shapes import Bool, UInt8
+from gsx.core.training.supersampling import FinerRaster, raster_at
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CoarseSource:
+    """The picture of a view, reduced by the scene's own filter (implements `gsx.core.data.scene.ImageSource`)."""
+
+    view: View
+    reduction: Reduction
+    times: int
+    kept: list[UInt8[Tensor, "3 h w"]] = field(default_factory=list)
+    """The picture, once it was asked for."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 h w"]:
+        """The whole picture: that is all that training asks for."""
+        if not self.kept:
+            width, height = (side * self.times for side in camera.size)
+            fine = self.view.image()[:, :height, :width]
+            self.kept.append((self.reduction.reduce(fine, self.times) * 255).round().byte())
+        return self.kept[0]
+
+    def max_zoom(self, camera: Camera) -> float:
+        """There is this picture alone."""
+        return 1.0
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
+        """Pixels that are made of nothing but pixels that count."""
+        fine = self.view.counted()
+        if fine is None:
+            return None
+        width, height = camera.size
+        blocks = fine[: height * self.times, : width * self.times].reshape(height, self.times, width, self.times)
+        return blocks.all(3).all(1)
+
+
+LEAST = 32
+"""Pixels that the shorter side of a picture keeps: smaller ones say little, and SSIM looks at windows of 11."""
+
+
+def coarser(view: View, reduction: Reduction, times: int) -> View:
+    """A view, so many times as coarse; what is left over at its right and lower borders does not show. It stays as it
+    is where too few pixels would be left."""
+    if times == 1 or min(view.camera.size) < LEAST * times:
+        return view
+    across, down = (side // times for side in view.camera.size)
+    camera = replace(view.camera, width=across * times, height=down * times).resize(across, down)
+    return replace(view, camera=camera, source=CoarseSource(view=view, reduction=reduction, times=times))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Resolution:
+    """Of the training views of a scene, step by step."""
+
+    scene: Scene
+    coarse: int = 1
+    """The first pictures are so many times as coarse: a power of two, halved in equal times."""
+    coarse_until: int = 0
+    """Last step that sees pictures which are coarser than the photographs."""
+    supersample: int = 1
+    """Renders are so many times as fine as photographs, and reduced as these were (`core.training.supersampling`)."""
+    finer_after: int = 0
+    """Last step before that."""
+    coarse_views: dict[int, Sequence[View]] = field(default_factory=dict)
+    """Those that were asked for, by how many times as coarse they are."""
+
+    def coarse_at(self, step: int) -> int:
+        """How many times as coarse as the photographs the pictures of a step are."""
+        if step > self.coarse_until or self.coarse == 1:
+            return 1
+        halvings = math.log2(self.coarse) * (max(1, step) - 1) / self.coarse_until
+        return self.coarse >> math.floor(halvings)
+
+    def supersample_at(self, step: int) -> int:
+        """How many times as fine as photographs they are rendered at a step."""
+        return self.supersample if step > self.finer_after else 1
+
+    def views(self, step: int) -> Sequence[View]:
+        """The training views, as a step sees them."""
+        times = self.coarse_at(step)
+        if times == 1:
+            return self.scene.train
+        if times not in self.coarse_views:
+            self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
+        return self.coarse_views[times]
+
+    def rendered_cameras(self, step: int) -> list[Camera]:
+        """Those that a step renders training views by."""
+        times = self.supersample_at(step)
+        return [view.camera.zoom(times) for view in self.views(step)]
+
+    def forming(self, step: int) -> Callable[[Camera], FinerRaster]:
+        """How pictures come about at a step."""
+        supersample = self.supersample_at(step)
+        return lambda camera: raster_at(camera, self.scene, supersample)
+
+    def changes_after(self, step: int) -> bool:
+        """Whether the next step renders at another resolution."""
+        finer = self.supersample_at(step) != self.supersample_at(step + 1)
+        return step > 0 and (finer or self.coarse_at(step) != self.coarse_at(step + 1))
