@@ -138,11 +138,11 @@ def test_trade_of_a_run_a_file_and_the_built_in_scene(
 
 
 def test_trade_help_lists_its_options(capsys: pytest.CaptureFixture[str]) -> None:
-    for asked in (["trade", "--help"], ["trade", "rasterizer", "-h"]):
+    for asked, option in {"": "gsx trade training", "rasterizer": "--max-error", "training": "--budget-mb"}.items():
         with pytest.raises(SystemExit) as end:
-            main(asked)
+            main(["trade", *filter(None, [asked]), "--help"])
         assert end.value.code == 0
-        assert "--max-error" in capsys.readouterr().out
+        assert option in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -360,6 +360,10 @@ BAD = {
     "trade no such knob": lambda t: ["trade", "rasterizer", "--knobs", "tilesize"],
     "trade no such option": lambda t: ["trade", "rasterizer", "--max-eror", "1"],
     "trade option cut off": lambda t: ["trade", "rasterizer", "--to"],
+    "trade no such trade": lambda t: ["trade", "training", "--trades", "primitive", "--to", str(t / "t")],
+    "trade less than nothing": lambda t: ["trade", "training", "--max-drop-db", "-0.1"],
+    "trade no seed": lambda t: ["trade", "training", "--seeds", "0"],
+    "trade no composition": lambda t: ["trade", "training", "iteration=5", "--to", str(t / "t")],
     "trade typo in key": lambda t: ["trade", "rasterizer", "rasterizer.tilesize=16"],
     "bad device": lambda t: words(t / "run", "device=tpu"),
 }

@@ -46,6 +46,17 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
     return read
 
 
+def not_negative(word: str) -> float:
+    """A finite number of 0 or more."""
+    try:
+        number = float(word)
+    except ValueError:
+        number = -1.0
+    if not 0 <= number < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{word}' is no number of 0 or more: give one, for example 0.1")
+    return number
+
+
 def whole(word: str) -> int:
     """A whole number of 0 or more."""
     if not word.isdecimal():

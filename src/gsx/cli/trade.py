@@ -1,15 +1,18 @@
-"""gsx trade rasterizer."""
+"""gsx trade rasterizer, gsx trade training."""
 
 import argparse
 import logging
 import sys
 from pathlib import Path
+from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, new_folder, positive, whole
+from gsx.cli.arguments import Parser, new_folder, not_negative, positive, whole
 from gsx.core.errors import ConfigError, InputError, nearest
 
 logger = logging.getLogger("gsx.cli")
+
+USAGE = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] or gsx trade training [KEY=VALUE ...]"
 
 
 def trade_arguments(arguments: list[str]) -> argparse.Namespace:
@@ -45,23 +48,87 @@ def trade_arguments(arguments: list[str]) -> argparse.Namespace:
     return given
 
 
+def training_arguments(arguments: list[str]) -> argparse.Namespace:
+    """The options of gsx trade training; `overrides` is the composition as given.
+
+    Raises:
+        ConfigError: a word means nothing here.
+    """
+    parser = Parser(
+        prog="gsx trade training",
+        usage="%(prog)s [KEY=VALUE ...] [options]",
+        description="Train a composition, and with it what could be had instead: fewer primitives or steps, other "
+        "resolutions, filters, colours, levels, pseudo details (conf/trade). Compare, and answer a wish.",
+    )
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="the composition to start from")
+    add = parser.add_argument
+    add("--budget-mb", type=positive(float), metavar="MB", help="wish: a splat file of at most so many 10^6 bytes")
+    add("--max-drop-db", type=not_negative, metavar="DB", help="wish: at most so much lost at any zoom")
+    add("--target-seconds", type=positive(float), metavar="S", help="wish: training takes at most so long")
+    add("--trades", metavar="A,B,...", help="only these, for example primitives,steps (all)")
+    add("--seeds", type=positive(int), default=1, metavar="N", help="runs of each setting (1)")
+    add("--combinations", type=whole, default=2, metavar="N", help="most combinations of good settings to try (2)")
+    add("--to", type=Path, default=Path("trade"), metavar="FOLDER", help="for trade.html, trade.json, runs (./trade)")
+    return parser.parse_intermixed_args(arguments)
+
+
 def verb_trade(arguments: list[str]) -> int:
-    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
+    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..., gsx trade training [KEY=VALUE ...] ..."""
+    verbs = {"rasterizer": trade_rasterizer, "training": trade_training}
     if arguments[:1] in (["--help"], ["-h"]):
-        arguments = ["rasterizer", "--help"]
+        both = "rasterizer: how fast against how exact. training: what it costs against what it brings."
+        Parser(prog="gsx trade", usage=USAGE, description=f"{both} Each has a --help of its own.").parse_args(["-h"])
     if not arguments:
-        raise InputError("gsx trade needs to know what to trade: gsx trade rasterizer [RUN or FILE.ply]")
-    if arguments[0] != "rasterizer":
-        remedy = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...]"
+        raise InputError(f"gsx trade needs to know what to trade: {USAGE}")
+    if arguments[0] not in verbs:
         raise ConfigError(
-            f"'{arguments[0]}' is nothing gsx can trade.{nearest(arguments[0], ['rasterizer'])} Type {remedy}"
+            f"'{arguments[0]}' is nothing gsx can trade.{nearest(arguments[0], list(verbs))} Type {USAGE}"
         )
-    given = trade_arguments(arguments[1:])
-    from gsx.experiments.trade.advice import advice_lines, table
-    from gsx.experiments.trade.knobs import check_knobs
-    from gsx.experiments.trade.measure import sweep, usable_paths
-    from gsx.experiments.trade.page import write_trade
-    from gsx.experiments.trade.subject import open_subject
+    return verbs[arguments[0]](arguments[1:])
+
+
+def trade_training(arguments: list[str]) -> int:
+    """gsx trade training [KEY=VALUE ...] ..."""
+    given = training_arguments(arguments)
+    from gsx.experiments.runs.build import choose_device
+    from gsx.experiments.runs.compose import Compositions
+    from gsx.experiments.runs.job import train
+    from gsx.experiments.trade.machine import machine
+    from gsx.experiments.trade.training.measure import Trial, measured
+    from gsx.experiments.trade.training.page import write_trade
+    from gsx.experiments.trade.training.settings import settings_of
+    from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, known, table
+
+    loaded, wanted = plugins(), given.trades.split(",") if given.trades else []
+    with Compositions(loaded) as compositions:
+        settings = settings_of(compositions.node(["+trade=settings"], "trade"), wanted)
+        device = choose_device(compositions.settings(given.overrides).general.device)
+
+    def job(composed: Any) -> Path:
+        folders = list[Path]()
+        if train(composed, loaded, folders):
+            raise KeyboardInterrupt("the same command goes on from here")
+        return folders[0]
+
+    folder = new_folder(given.to)
+    trial = Trial(given=given.overrides, seeds=range(given.seeds), folder=folder, job=job, plugins=loaded)
+    rows = measured(trial, settings, given.combinations)
+    wish = Wish(budget_mb=given.budget_mb, max_drop_db=given.max_drop_db, target_seconds=given.target_seconds)
+    first = known(rows)[0]
+    told = advice_lines(advice(rows, wish, first.zooms()[-1]), first, given.overrides)
+    page = write_trade(rows, wish, given.overrides, machine(device), folder)
+    sys.stdout.write("\n".join(["", *table(rows), "", *told]) + f"\n{page}\n")
+    return 0
+
+
+def trade_rasterizer(arguments: list[str]) -> int:
+    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
+    given = trade_arguments(arguments)
+    from gsx.experiments.trade.rasterizer.advice import advice_lines, table
+    from gsx.experiments.trade.rasterizer.knobs import check_knobs
+    from gsx.experiments.trade.rasterizer.measure import sweep, usable_paths
+    from gsx.experiments.trade.rasterizer.page import write_trade
+    from gsx.experiments.trade.rasterizer.subject import open_subject
 
     knobs, loaded = check_knobs(given.knobs), plugins()
     views, combinations = (2, 4) if given.target else (1, 1)

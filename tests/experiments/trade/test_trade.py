@@ -18,9 +18,9 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
 from gsx.experiments.reports.charts import Axis, Dot, scatter
-from gsx.experiments.trade.advice import advice_lines, front_of, most_exact, recommended, rounded_up, table
-from gsx.experiments.trade.bench import EXACT, Bench, Times, check_truth, fell_back
-from gsx.experiments.trade.knobs import (
+from gsx.experiments.trade.rasterizer.advice import advice_lines, front_of, most_exact, recommended, rounded_up, table
+from gsx.experiments.trade.rasterizer.bench import EXACT, Bench, Times, check_truth, fell_back
+from gsx.experiments.trade.rasterizer.knobs import (
     KNOBS,
     Row,
     Trial,
@@ -34,9 +34,9 @@ from gsx.experiments.trade.knobs import (
     pooled_psnr,
     single_changes,
 )
-from gsx.experiments.trade.measure import at_pace, resolved, sweep, timed, unsteady
-from gsx.experiments.trade.page import write_trade
-from gsx.experiments.trade.subject import Shot, Subject, framing_cameras, open_subject
+from gsx.experiments.trade.rasterizer.measure import at_pace, resolved, sweep, timed, unsteady
+from gsx.experiments.trade.rasterizer.page import write_trade
+from gsx.experiments.trade.rasterizer.subject import Shot, Subject, framing_cameras, open_subject
 
 
 def row(ratio: float, error: float, knob: str = "chunk", most: float | None = None, **changes: Any) -> Row:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gsx.experiments.reports.charts import pareto_front
-from gsx.experiments.trade.knobs import NOISE, OUTLIERS, SPREADS, Row, overrides
+from gsx.experiments.trade.rasterizer.knobs import NOISE, OUTLIERS, SPREADS, Row, overrides
 
 
 def shown(error: float) -> float:

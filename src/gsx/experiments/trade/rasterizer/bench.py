@@ -16,8 +16,8 @@ from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
-from gsx.experiments.trade.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
-from gsx.experiments.trade.subject import Shot, Subject
+from gsx.experiments.trade.rasterizer.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
+from gsx.experiments.trade.rasterizer.subject import Shot, Subject
 
 EXACT: dict[str, Any] = {"path": "eager", "exponent": "direct", "evaluation": "float64", "accumulation": "float64"}
 """How the truth is computed; what it is, the rules of the base settings say."""

@@ -12,9 +12,9 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.available import available, complaint
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.trade.bench import EXACT, Bench, Check, Times, check_truth, reason
-from gsx.experiments.trade.knobs import Row, Trial, combinations, ordered, single_changes
-from gsx.experiments.trade.subject import Subject
+from gsx.experiments.trade.rasterizer.bench import EXACT, Bench, Check, Times, check_truth, reason
+from gsx.experiments.trade.rasterizer.knobs import Row, Trial, combinations, ordered, single_changes
+from gsx.experiments.trade.rasterizer.subject import Subject
 
 logger = logging.getLogger(__name__)
 

@@ -1,23 +1,20 @@
 """trade.json and trade.html: every figure of a sweep, and a page of it that refers to nothing outside itself."""
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from gsx import __version__
 from gsx.core.files import replace_text, write_json
 from gsx.experiments.reports.charts import Dot, scatter
 from gsx.experiments.reports.page import NONE, fixed, template
 from gsx.experiments.run_folder.files import is_number
-from gsx.experiments.trade.advice import advice, advice_lines, front_of, shown
-from gsx.experiments.trade.bench import EXACT, UNBOUNDED
-from gsx.experiments.trade.knobs import COSTS, KNOBS, OUTLIERS, Row, overrides
-from gsx.experiments.trade.measure import Trade
+from gsx.experiments.trade.machine import machine
+from gsx.experiments.trade.rasterizer.advice import advice, advice_lines, front_of, shown
+from gsx.experiments.trade.rasterizer.bench import EXACT, UNBOUNDED
+from gsx.experiments.trade.rasterizer.knobs import COSTS, KNOBS, OUTLIERS, Row, overrides
+from gsx.experiments.trade.rasterizer.measure import Trade
 
 ERRORS = {"max_error": "max error", "most_error": f"error of all but {OUTLIERS:.2%} of the pixels"}
 """Errors that are drawn against time."""
@@ -31,7 +28,7 @@ def write_trade(trade: Trade, folder: Path, budget: float) -> Path:
     """Write trade.json and trade.html into an existing folder; returns the page."""
     write_json(folder / "trade.json", content(trade, budget))
     page = folder / "trade.html"
-    replace_text(page, template("trade/trade.html").render(context(trade, budget)))
+    replace_text(page, template("trade/rasterizer/trade.html").render(context(trade, budget)))
     return page
 
 
@@ -40,7 +37,7 @@ def content(trade: Trade, budget: float) -> dict[str, Any]:
     subject = trade.subject
     return {
         "gsx": __version__,
-        "machine": machine(trade),
+        "machine": machine(trade.subject.device),
         "model": subject.name,
         "notes": [*subject.notes, *trade.notes],
         "views": [{"name": s.name, "size": list(s.camera.size), "splats": len(s.splats)} for s in subject.shots],
@@ -60,24 +57,11 @@ def content(trade: Trade, budget: float) -> dict[str, Any]:
     }
 
 
-def machine(trade: Trade) -> dict[str, Any]:
-    """Where it was measured: times hold for nothing else."""
-    device = trade.subject.device
-    cuda = device.type == "cuda"
-    return {
-        "platform": platform.platform(),
-        "device": torch.cuda.get_device_name(device) if cuda else platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-    }
-
-
 def context(trade: Trade, budget: float) -> dict[str, Any]:
     """What the page's template needs."""
     subject, rows = trade.subject, trade.rows
     width, height = subject.shots[0].camera.size
-    told = machine(trade)
+    told = machine(trade.subject.device)
     return {
         "title": "Rasterizer: time against accuracy",
         "version": __version__,

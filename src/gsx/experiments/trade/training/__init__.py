@@ -1,0 +1,1 @@
+"""What settings of a training cost, on a scene: trained, measured, compared."""
