@@ -437,3 +437,37 @@ def test_a_multirun_over_processes_is_compared_within_its_rounds() -> None:
     assert (alone["seconds"], together["seconds"]) == ("20.0", "10.0")
     assert "ratio" not in alone
     assert together["ratio"] == "2.00 (1.25 to 3.00)"  # 10/5, 30/10, 20/16
+
+
+def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import trades
+    from gsx.cli.dispatch import main
+
+    monkeypatch.setattr(trades, "gsx", lambda words, *rest: main(words))  # here, which spares the start of a process
+    monkeypatch.setitem(trades.SUBJECTS, "demo", ("scene=demo", *TINY))
+    page = tmp_path / "page.md"
+    page.write_text("# Above\n\n<!-- demo: written by benchmarks/trades.py -->\n| old |\n\n## Below\n")
+    words = ["--only", "demo,fox", "--trades", "colour", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path)]
+    trades.main([*words, "--page", str(page)])
+    found = json.loads((tmp_path / "runs" / "demo" / "trade.json").read_text())
+    rows = read_sections(tmp_path / "trades_cpu.json")["demo"]["rows"]
+    assert [row["setting"] for row in rows[:3]] == ["as given", "SH degree 1", "SH bands judged"]
+    one, two = (run["psnr"]["1"] for run in found["rows"][1]["outcomes"])
+    assert rows[1]["x1"] == f"{(one + two) / 2:.2f} ± {abs(one - two) / 2:.2f}"
+    text = page.read_text()
+    assert text.startswith("# Above\n\n<!-- demo")
+    assert text.endswith("\n\n## Below\n")
+    assert f"| SH degree 1 | {rows[1]['x1']} |" in text
+    assert "old" not in text
+    page.write_text(text.replace("SH degree 1", "something"))
+    trades.main(["--page-only", "--to", str(tmp_path), "--page", str(page)])
+    assert page.read_text() == text
+
+
+def test_the_page_of_trades_is_that_of_the_committed_figures() -> None:
+    import trades
+
+    text = trades.PAGE.read_text()
+    assert trades.page(text, read_sections(trades.RESULTS / "trades_cpu.json")) == text

@@ -362,7 +362,7 @@ BAD = {
     "trade option cut off": lambda t: ["trade", "rasterizer", "--to"],
     "trade no such trade": lambda t: ["trade", "training", "--trades", "primitive", "--to", str(t / "t")],
     "trade less than nothing": lambda t: ["trade", "training", "--max-drop-db", "-0.1"],
-    "trade no seed": lambda t: ["trade", "training", "--seeds", "0"],
+    "trade no seed": lambda t: ["trade", "training", "--seeds", "0,0"],
     "trade no composition": lambda t: ["trade", "training", "iteration=5", "--to", str(t / "t")],
     "trade typo in key": lambda t: ["trade", "rasterizer", "rasterizer.tilesize=16"],
     "bad device": lambda t: words(t / "run", "device=tpu"),

@@ -64,6 +64,14 @@ def whole(word: str) -> int:
     return int(word)
 
 
+def different_numbers(word: str) -> list[int]:
+    """Whole numbers by commas, all different."""
+    parts = word.split(",")
+    if not all(part.isdecimal() for part in parts) or len(set(parts)) < len(parts):
+        raise argparse.ArgumentTypeError(f"'{word}' is no list of different whole numbers: give one, for example 0,1,2")
+    return [int(part) for part in parts]
+
+
 def new_folder(folder: Path) -> Path:
     """The folder, made where it is missing.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, new_folder, not_negative, positive, whole
+from gsx.cli.arguments import Parser, different_numbers, new_folder, not_negative, positive, whole
 from gsx.core.errors import ConfigError, InputError, nearest
 
 logger = logging.getLogger("gsx.cli")
@@ -66,7 +66,7 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
     add("--max-drop-db", type=not_negative, metavar="DB", help="wish: at most so much lost at any zoom")
     add("--target-seconds", type=positive(float), metavar="S", help="wish: training takes at most so long")
     add("--trades", metavar="A,B,...", help="only these, for example primitives,steps (all)")
-    add("--seeds", type=positive(int), default=1, metavar="N", help="runs of each setting (1)")
+    add("--seeds", type=different_numbers, default=[0], metavar="A,B,...", help="of the runs of each setting (0)")
     add("--combinations", type=whole, default=2, metavar="N", help="most combinations of good settings to try (2)")
     add("--to", type=Path, default=Path("trade"), metavar="FOLDER", help="for trade.html, trade.json, runs (./trade)")
     return parser.parse_intermixed_args(arguments)
@@ -111,7 +111,7 @@ def trade_training(arguments: list[str]) -> int:
         return folders[0]
 
     folder = new_folder(given.to)
-    trial = Trial(given=given.overrides, seeds=range(given.seeds), folder=folder, job=job, plugins=loaded)
+    trial = Trial(given=given.overrides, seeds=given.seeds, folder=folder, job=job, plugins=loaded)
     rows = measured(trial, settings, given.combinations)
     wish = Wish(budget_mb=given.budget_mb, max_drop_db=given.max_drop_db, target_seconds=given.target_seconds)
     first = known(rows)[0]
