@@ -15,9 +15,10 @@ def gsx_register(registry: Registry) -> None:
 
 def add_scenes(registry: Registry) -> None:
     """Loaders, a format each; of two that can read a folder the later is the more telling."""
-    from gsx.scenes import blender, bungee, colmap, demo, photos, transforms
+    from gsx.scenes import blender, bungee, colmap, demo, photos, room, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
+    registry.add("scene", "room", room.load, demo.DemoOptions)
     registry.add("scene", "photos", photos.load, photos.PhotosOptions, photos.FORMAT)
     registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions, transforms.FORMAT)
     registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions, colmap.FORMAT)

@@ -33,6 +33,8 @@ class SceneOptions:
     unit: Annotated[float, Range(1e-9, 1e9)] = 1.0
     """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
     0.2, least distances, limits of scales) expect scenes of a few units."""
+    fill: Annotated[int, Range(0, 10**8)] = 0
+    """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)

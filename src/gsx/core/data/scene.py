@@ -113,6 +113,16 @@ class InUnits(Protocol):
         ...
 
 
+@runtime_checkable
+class Fillable(Protocol):
+    """Options of a scene whose points may be added to."""
+
+    @property
+    def fill(self) -> int:
+        """By how many."""
+        ...
+
+
 def extent_of(cameras: Sequence[Camera]) -> float:
     """1.1 x the largest distance of a camera centre from the mean centre, in scene units (3D-GS, getNerfppNorm)."""
     centres = torch.stack([camera.centre.double() for camera in cameras])

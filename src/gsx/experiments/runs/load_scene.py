@@ -3,9 +3,13 @@
 import math
 from dataclasses import replace
 
+import torch
+
 from gsx.core.data.camera import offsets_from
-from gsx.core.data.scene import InUnits, Scene, View
+from gsx.core.data.filling import filled
+from gsx.core.data.scene import Fillable, InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import Settings
 
@@ -29,7 +33,14 @@ def load_scene(settings: Settings) -> Scene:
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
             "elsewhere, which gives no depth and no scale: use photos from different places"
         )
-    return scene
+    return with_more_points(scene, options.fill, settings.general.seed) if isinstance(options, Fillable) else scene
+
+
+def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
+    """The scene with points where training views show none."""
+    if count == 0:
+        return scene
+    return filled(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
 
 
 def in_units(scene: Scene, unit: float) -> Scene:

@@ -4,7 +4,7 @@ Light does not depend on where it is seen from (but for one mild highlight on th
 shadows, an even sky, and darkening where things stand close together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -115,9 +115,8 @@ def in_the_light(solid: Solid, others: list[Solid]) -> tuple[Solid, ...]:
     return tuple(found)
 
 
-def make_still_life() -> StillLife:
-    """The arrangement with its tables."""
-    things = furniture()
+def arranged(things: Sequence[tuple[Solid, Texture, float]], kit: Kit) -> StillLife:
+    """Solids with textures and highlights as things that darken each other."""
     solids = [solid for solid, _, _ in things]
     return StillLife(
         tuple(
@@ -127,8 +126,13 @@ def make_still_life() -> StillLife:
             )
             for solid, texture, shine in things
         ),
-        make_kit(torch.Generator().manual_seed(SEED)),
+        kit,
     )  # fmt: skip
+
+
+def make_still_life() -> StillLife:
+    """The arrangement with its tables."""
+    return arranged(furniture(), make_kit(torch.Generator().manual_seed(SEED)))
 
 
 def sunlight(points: Float[Tensor, "3 points"], shading: tuple[Solid, ...]) -> Float[Tensor, "points"]:

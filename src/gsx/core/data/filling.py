@@ -1,0 +1,87 @@
+"""Points where structure from motion has found none: plain walls, sky between leaves, what few photographs show.
+
+Depths are carried over from points that are seen nearby in the same picture.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.core.shapes import Bool, Float
+
+NEIGHBOURS = 3
+"""Points that a depth is carried over from."""
+COVERED = 8
+"""Among so many nearest ones in the picture a point is hidden that lies much farther than the nearest of them."""
+BEHIND = 1.3
+"""So many times as far."""
+TRIES = 8
+"""Pixels that are tried for each point that is asked for."""
+FEWEST = 16
+"""Points that a picture has to show to tell anything of depth."""
+
+
+def filled(scene: Scene, count: int, generator: torch.Generator) -> Scene:
+    """The scene with at most so many points more, with a note; each training view adds as many as the others."""
+    share = math.ceil(TRIES * count / len(scene.train))
+    clouds = [found for view in scene.train if (found := gaps_of(view, scene.points, share, generator)) is not None]
+    if not clouds:
+        return scene
+    positions, colours = (torch.cat(parts) for parts in zip(*clouds, strict=True))
+    chosen = torch.randperm(len(positions), generator=generator)[:count]
+    points = PointCloud(
+        torch.cat([scene.points.positions, positions[chosen]]), torch.cat([scene.points.colours, colours[chosen]])
+    )
+    note = f"{len(chosen):,} points added to {len(scene.points):,} where training views show none (scene.fill)"
+    return replace(scene, points=points, notes=[*scene.notes, note])
+
+
+def gaps_of(
+    view: View, points: PointCloud, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "P 3"], Tensor] | None:
+    """(positions, colours) of random pixels of a view that are farther from its points than these are from each other
+    on average; None: it shows too few points."""
+    camera = view.camera
+    pixels, depths = in_view(camera, points.positions)
+    if len(pixels) < FEWEST:
+        return None
+    shown = in_front(pixels, depths)
+    pixels, depths = pixels[shown], depths[shown]
+    size = torch.tensor(camera.size, dtype=torch.float32)
+    asked = torch.rand(count, 2, generator=generator) * size
+    apart, nearest = torch.cdist(asked, pixels).topk(min(NEIGHBOURS, len(pixels)), largest=False)
+    gaps = apart[:, 0] > math.sqrt(camera.width * camera.height / len(pixels))
+    counted = view.counted()
+    column, row = asked.long().unbind(1)
+    if counted is not None:
+        gaps &= counted[row, column]
+    weights = 1 / apart.clamp_min(1)
+    log_depth = (weights * depths.log()[nearest]).sum(1) / weights.sum(1)
+    colours = (view.image()[:, row, column].T * 255).round().byte()
+    return unprojected(camera, asked, log_depth.exp())[gaps], colours[gaps]
+
+
+def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M"]]:
+    """Pixel positions and depths of the points that lie in a camera's raster, beyond its near plane."""
+    pixels, depths = camera.project(positions)
+    inside = ((pixels >= 0) & (pixels < pixels.new_tensor(camera.size))).all(1) & (depths > camera.near)
+    return pixels[inside], depths[inside]
+
+
+def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[Tensor, "M"]:
+    """Points that are not much farther than what is seen beside them."""
+    _, nearest = torch.cdist(pixels, pixels).topk(min(COVERED, len(pixels)), largest=False)
+    return depths <= BEHIND * depths[nearest].amin(1)
+
+
+def unprojected(camera: Camera, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+    """World points at pixel positions and depths."""
+    x = (pixels[:, 0] - camera.cx) / camera.fx * depths
+    y = (pixels[:, 1] - camera.cy) / camera.fy * depths
+    points = torch.stack([x, y, depths], 1).double()
+    rotation, translation = camera.rotation.double(), camera.translation.double()
+    return ((points - translation) @ rotation).float()

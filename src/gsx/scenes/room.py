@@ -1,0 +1,188 @@
+"""The built-in room: plain plaster, thin legs, a few things with pattern; cameras that walk around in it.
+
+What photographs of rooms are like: structure from motion finds points where there is pattern, and nothing on the walls.
+Solids, textures and light are those of the built-in garden; sunlight comes in from above, where no ceiling is.
+"""
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsx.core.cache import cache_folder, content_key
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.images import ImageCache
+from gsx.core.data.resize import training_size
+from gsx.core.data.scene import PointCloud, Scene, extent_of
+from gsx.core.shapes import Bool, Float
+from gsx.scenes.demo import textures
+from gsx.scenes.demo.noise import blend
+from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
+from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
+from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, rgb, smoothstep
+from gsx.scenes.demo.tracing import rays_through, shade, trace
+from gsx.scenes.demo.views import DemoOptions, DemoSource, check, make_views, scene_version
+
+HALF = (2.5, 2.0)  # of the floor, scene units: about metres
+HEIGHT, THICK = 2.4, 0.1  # of the walls
+FLOOR = 0.3  # above the garden's ground
+FIELD_OF_VIEW = math.radians(62.0)  # horizontal
+ROUNDS = 3  # of the walk
+CHART = (0.52, 0.35)  # half sizes of the picture on the wall
+PLASTER = (0.87, 0.85, 0.81)
+BOARD = 0.16  # width of a floor board
+CONTRAST = 0.04  # of display values between neighbouring pixels: where structure from motion finds points
+TRIES = 5  # rays for each point that is wanted
+
+
+def plaster(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
+    """One colour."""
+    return rgb(PLASTER).expand_as(p)
+
+
+def boards(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
+    """Floor boards with ends that do not meet, little contrast."""
+    row = (p[1] / BOARD).floor()
+    along = p[0] / 1.3 + 0.5 * parity(row)
+    tone = 0.5 + 0.5 * kit.noise.at(along.floor() + 9.0, row + 30.0)
+    grain = 1.0 + 0.05 * kit.noise.grain(p[0] * 4.0, p[1] * 60.0, 4)
+    joint = torch.minimum(edge_distance(p[1] / BOARD, BOARD), edge_distance(along, 1.3))
+    wood = between((0.55, 0.42, 0.29), (0.63, 0.50, 0.36), tone) * grain
+    return blend(rgb((0.30, 0.23, 0.16)), wood, smoothstep(joint / 0.004))
+
+
+def walls() -> list[tuple[Solid, Texture, float]]:
+    """Floor and four walls."""
+    (x, y), z = HALF, HEIGHT / 2
+    return [
+        (box("floor", (0.0, 0.0, 0.01), (2 * x, 2 * y, 0.02)), boards, 0.0),
+        (box("north", (0.0, y + THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster, 0.0),
+        (box("south", (0.0, -y - THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster, 0.0),
+        (box("east", (x + THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster, 0.0),
+        (box("west", (-x - THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster, 0.0),
+    ]
+
+
+def on_legs(
+    name: str, centre: tuple[float, float], size: tuple[float, float], height: float, leg: float
+) -> list[tuple[Solid, Texture, float]]:
+    """A table top or a seat on four thin legs."""
+    (x, y), (width, depth) = centre, size
+    top = box(f"{name} top", (x, y, height - 0.02), (width, depth, 0.04))
+    corners = [(x + i * (width / 2 - 0.05), y + j * (depth / 2 - 0.05)) for i in (-1, 1) for j in (-1, 1)]
+    legs = [cylinder(f"{name} leg", (*corner, (height - 0.04) / 2), leg, height - 0.04) for corner in corners]
+    return [(top, textures.post, 0.0), *((one, textures.bark, 0.0) for one in legs)]
+
+
+def furniture() -> list[tuple[Solid, Texture, float]]:
+    """Everything in the room with its texture and highlight."""
+    x, y = HALF
+    return [
+        *walls(),
+        (
+            box("picture", (0.3, y - 0.02, 1.45), (2 * CHART[0], 0.04, 2 * CHART[1])),
+            partial(textures.sign, half=CHART),
+            0.0,
+        ),
+        (box("chimney", (-x + 0.15, -0.9, 0.65), (0.30, 0.9, 1.3)), textures.bricks, 0.0),
+        *on_legs("table", (0.35, 0.15), (1.2, 0.7), 0.74, 0.02),
+        *on_legs("chair", (-0.75, 0.75), (0.42, 0.42), 0.46, 0.014),
+        (box("back", (-0.75, 0.95, 0.78), (0.42, 0.03, 0.24)), textures.post, 0.0),
+        (cylinder("tin", (0.1, 0.2, 0.74 + 0.13), 0.11, 0.26, -75.0), partial(textures.tin, radius=0.11), 0.0),
+        (sphere("marble", (0.62, 0.05, 0.74 + 0.12), 0.12), textures.marble, 0.0),
+        (box("crate", (1.9, -1.35, 0.26), (0.52, 0.52, 0.52), 12.0), partial(textures.crate, half=0.26), 0.0),
+        (sphere("ball", (-1.2, -0.5, 0.23), 0.23, 20.0), textures.beach_ball, 0.35),
+        (cylinder("pot", (2.0, 1.5, 0.2), 0.25, 0.40), partial(textures.pot, half_height=0.2), 0.0),
+        (cylinder("trunk", (2.0, 1.5, 0.6), 0.045, 0.46), textures.bark, 0.0),
+        (sphere("crown", (2.0, 1.5, 1.12), 0.40), textures.foliage, 0.0),
+        (cylinder("lamp", (-1.9, 1.5, 0.75), 0.012, 1.5), textures.bark, 0.0),
+        (sphere("shade", (-1.9, 1.5, 1.55), 0.16), textures.coping, 0.0),
+    ]
+
+
+def make_room() -> StillLife:
+    """The room with its tables, raised above the garden's ground, which darkens what is near."""
+    up = double((0.0, 0.0, FLOOR))
+    lifted = [(replace(one, centre=one.centre + up), texture, shine) for one, texture, shine in furniture()]
+    return arranged(lifted, make_kit(torch.Generator().manual_seed(SEED)))
+
+
+def walking_camera(place: float, width: int, height: int) -> Camera:
+    """The camera at `place` in [0, 1) of a walk around the table, at changing heights; it looks across the room, in the
+    second round to the walls nearby."""
+    turn = 2 * math.pi * ROUNDS * place
+    outward = 1 <= ROUNDS * place < 2
+    eye = (1.55 * math.cos(turn) - 0.1, 1.2 * math.sin(turn) - 0.1, FLOOR + 1.3 + 0.25 * math.sin(2.7 * turn))
+    ahead = turn + (0.9 if outward else math.pi + 0.5 * math.sin(1.3 * turn))
+    reach = 2.2 if outward else 1.0
+    target = (reach * math.cos(ahead), reach * math.sin(ahead), FLOOR + 0.75)
+    return look_at(eye, target, fov_x=FIELD_OF_VIEW, width=width, height=height)
+
+
+def patterned(
+    room: StillLife, camera: Camera, u: Float[Tensor, "P"], v: Float[Tensor, "P"]
+) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"], Bool[Tensor, "P"]]:
+    """(positions, colours, whether there is pattern) of what rays through raster positions meet."""
+    rays = rays_through(camera, u, v)
+    hits = trace(room, rays)
+    colours = shade(room, rays, hits)
+    beside = [rays_through(camera, u + right, v + down) for right, down in ((1.0, 0.0), (0.0, 1.0))]
+    apart = [(shade(room, other, trace(room, other)) - colours).abs().amax(0) for other in beside]
+    positions = rays.origin.float()[:, None] + rays.directions * hits.depth
+    return positions, colours, torch.maximum(*apart) > CONTRAST
+
+
+def found_points(room: StillLife, cameras: list[Camera], count: int, generator: torch.Generator) -> PointCloud:
+    """Points where pictures have pattern, at most so many: as structure from motion would leave them."""
+    positions, colours = [], []
+    share = math.ceil(TRIES * count / len(cameras))
+    for camera in cameras:
+        u, v = torch.rand(2, share, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
+        where, what, pattern = patterned(room, camera, u, v)
+        positions.append(where[:, pattern])
+        colours.append(what[:, pattern])
+    where, what = torch.cat(positions, 1).T, torch.cat(colours, 1).T
+    chosen = torch.randperm(len(where), generator=generator)[:count]
+    return PointCloud(where[chosen].contiguous(), (what[chosen] * 255.0 + 0.5).to(torch.uint8))
+
+
+def room_version() -> str:
+    """A digest of the code that makes the pictures."""
+    return content_key(scene_version(), Path(__file__).read_text(encoding="utf-8"))
+
+
+def load(options: DemoOptions) -> Scene:
+    """The room; its pictures are rendered when first asked for.
+
+    Raises:
+        ConfigError: see `gsx.scenes.demo.views.check`.
+    """
+    check(options)
+    room, size = make_room(), training_size(options.width, options.height, options.downscale, options.max_width)
+    count = options.train_views
+    train = [walking_camera(index / count, *size) for index in range(count)]
+    places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
+    test = [walking_camera(place, *size) for place in places]
+    folder = cache_folder("room", content_key(room_version(), options.samples))
+    source = partial(
+        DemoSource, life=room, samples=options.samples, cache=ImageCache(int(options.cache_gb * 1e9)), folder=folder
+    )
+    return Scene(
+        name=options.name,
+        train=make_views("train", train, source),
+        test=make_views("test", test, source),
+        points=found_points(room, train, options.points, torch.Generator().manual_seed(options.seed)),
+        background=torch.tensor(options.background),
+        extent=extent_of(train),
+        provenance={
+            "format": "room",
+            "version": room_version(),
+            "size": list(size),
+            "samples": options.samples,
+            "light": "display",
+            "split": f"{options.train_views} on a walk, {options.test_views} between them",
+        },
+    )
