@@ -13,8 +13,9 @@ from gsx.experiments.runs.settings import read_config, typed, write_config
 from gsx.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[3] / "conf"
-GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks"})
-"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py."""
+GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks", "trade"})
+"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py; what gsx trade tries in
+test_training_trade.py."""
 NEEDS = {
     ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
     ("preset", "octree"): ("backbone=octree_scaffold",),

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from tiny import OVERRIDES
 
+from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError
 from gsx.core.files import read_json
+from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.trade.training.measure import Outcome, Row, combinations, different
 from gsx.experiments.trade.training.settings import GIVEN, Setting, settings_of, together
 from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, front, table
@@ -52,6 +54,13 @@ def test_settings_are_those_of_the_trades_wanted_and_scale_steps() -> None:
         settings_of(LISTED, ["step"])
     with pytest.raises(ConfigError, match=r"steps"):
         settings_of({"steps": {"none": {"steps": 0}}})
+
+
+def test_every_setting_of_ours_goes_with_3d_gs() -> None:
+    with Compositions(plugins()) as compositions:
+        for setting in settings_of(compositions.node(["+trade=settings"], "trade")):
+            settings = compositions.settings(["backbone=gs3d", *setting.overrides(900)])
+            assert settings.general.iterations == round(900 * setting.steps), setting.name
 
 
 def test_fronts_and_drops_worked_by_hand() -> None:
