@@ -3,8 +3,9 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions, decibels, part_of
 from gsx.backbones.capacity import Budget, BudgetOptions, Growing
+from gsx.backbones.gs3d import gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.builtin import plugins
 from gsx.core.data.scene import Scene, View
@@ -23,7 +25,6 @@ from gsx.core.errors import ConfigError
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 from gsx.experiments.reports.report import growth_chart
-from gsx.experiments.runs.build import refuse_own_judgement
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -191,13 +192,41 @@ def test_what_no_view_shows_outlives_a_budget() -> None:
     assert bool((model.table["means"][:, 1] < -40).all())
 
 
-def test_several_processes_do_not_each_judge_for_themselves() -> None:
-    refuse_own_judgement(options_of("published"), Ranks(size=2))
-    refuse_own_judgement(options_of("adaptive"), Ranks())
-    with pytest.raises(ConfigError, match="capacity=adaptive is for one process"):
-        refuse_own_judgement(options_of("adaptive"), Ranks(size=2))
-    with pytest.raises(ConfigError, match="is for one process: call gsx without torchrun, or 0"):
-        refuse_own_judgement(options_of("published", sh_judged=0.8), Ranks(size=2))
+@dataclass(frozen=True, kw_only=True)
+class Told(Ranks):
+    """The first of two processes, and then the other, which is told what the first has found."""
+
+    said: list[Any]
+
+    def broadcast(self, make: Callable[[], Any]) -> Any:
+        if not self.first:
+            return self.said.pop(0)
+        self.said.append(make())
+        return self.said[-1]
+
+
+@pytest.mark.parametrize("name", ["budget", "adaptive"])
+def test_all_processes_do_what_the_first_has_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second would find otherwise: its renders tell it nothing."""
+    scene = small_scene(spread(40))
+    models, said = [], list[Any]()
+    for rank in range(2):
+        options = options_of(name, budget=BudgetOptions(primitives=20 * (name == "budget")))
+        context = replace(small_context(scene), ranks=Told(rank=rank, size=2, said=said))
+        if rank:
+            monkeypatch.setattr("gsx.backbones.capacity.worth_of_rows", None)
+            monkeypatch.setattr("gsx.backbones.adaptive.window_errors", None)
+            monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", None)
+        model = gs3d(options, context)
+        for step in (600, 700, 14900):
+            model.table.statistics |= {key: torch.ones(len(model.table)) for key in ("absolute", "count")}
+            model.densify_and_prune(step)
+        models.append((model.table["means"], context.generator.get_state()))
+    (own, state), (other, after) = models
+    assert not said
+    assert len(own) != 40
+    assert torch.equal(own, other)
+    assert torch.equal(state, after)
 
 
 def trials(*rates: float) -> Tensor:

@@ -123,9 +123,13 @@ class Adaptive:
             return {}
         windows = self.windows(step)
         form = self.context.resolution.forming(step)
-        has, had = (window_errors(model, rows, windows, form, self.background, step).cpu() for rows in (table, before))
         floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
-        gain, error = decibels(has + floor, had + floor)
+
+        def look() -> tuple[float, float]:
+            both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))
+            return decibels(*(errors.cpu() + floor for errors in both))
+
+        gain, error = self.context.found_by_first(look)
         each = self.options.discount / math.log2(len(table) / len(before))
         rate = self.rate(table) * min(FASTER, max(SLOWER, each * gain / self.options.price))
         added = len(table) - len(before)

@@ -178,7 +178,11 @@ def worth_in_training(
     """What training views lose without each row, or by other changes of it."""
     views = some_of(context.resolution.views(step), LOOKS, context.generator)
     background, form = context.scene.background.to(context.device), context.resolution.forming(step)
-    return worth_of_rows(model, views, form, background, step, context.generator, changes)
+
+    def look() -> Removal:
+        return worth_of_rows(model, views, form, background, step, context.generator, changes).to("cpu")
+
+    return context.found_by_first(look).to(context.device)
 
 
 def mark_newborn(table: ParameterTable, old: int) -> None:

@@ -92,9 +92,13 @@ class LongAxis:
     def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
         """As many as there is room for."""
         table = model.table
-        views = some_of(control.resolution.views(step), self.views, control.generator)
-        drawn = drawn_errors(model, views, control.resolution.forming(step), control.background, step)
-        score = drawn * mean_absolute(table)
+        context = control.context
+        views = some_of(context.resolution.views(step), self.views, control.generator)
+
+        def look() -> Tensor:
+            return drawn_errors(model, views, context.resolution.forming(step), control.background, step).cpu()
+
+        score = context.found_by_first(look).to(context.device) * mean_absolute(table)
         wanted = score > 0
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
         count = int(chosen.sum())

@@ -119,6 +119,19 @@ def test_two_processes_equal_one_and_resume_as_one(tmp_path: Path) -> None:
     assert files(folder) == files(tmp_path / "killed")
 
 
+def test_two_processes_judge_as_one(tmp_path: Path) -> None:
+    """Growth that has to pay for itself, coarse pictures first, bands of colour judged: what the first finds holds."""
+    judged = ("backbone.capacity=adaptive", "backbone.adaptive.price=0.01", "backbone.sh_judged=0.6")
+    coarse = ("scene.width=96", "scene.height=72", "training.coarse=2", "training.coarse_until=0.4")
+    words = (*OVERRIDES, *COMMON, "backbone.density.every=2500", *judged, *coarse)
+    two = together(*words, f"folder={tmp_path / 'two'}")
+    assert two.returncode == 0, two.stderr
+    alone(*words, f"folder={tmp_path / 'one'}")
+    told = [line for line in lines(tmp_path / "one") if "judged" in line or "degree_0" in line]
+    assert len(told) > 1, "the test needs something judged"
+    assert_same(tmp_path / "two", tmp_path / "one")
+
+
 def test_two_processes_with_networks_and_pseudo_views_equal_one(tmp_path: Path) -> None:
     """Growth across levels, and pseudo views that the first process makes for both."""
     two = together(*OVERRIDES, *OCTREE, f"folder={tmp_path / 'two'}")

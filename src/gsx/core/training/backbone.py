@@ -1,6 +1,6 @@
 """What the trainer asks of a backbone, and what a backbone is given to start from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -14,10 +14,12 @@ from gsx.core.errors import InputError, LostModel
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.distributed import Ranks
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.resolution import Resolution
 from gsx.core.training.schedule import Schedule
 
+T = TypeVar("T")
 MOST_LOST, FEW = 0.01, 10
 """Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
 Observation: TypeAlias = dict[str, Tensor]
@@ -37,6 +39,15 @@ class BackboneContext:
     """The run's only source of randomness (a CPU generator)."""
     resolution: Resolution
     """How finely training views are seen and rendered at each step."""
+    ranks: Ranks = Ranks()
+    """The processes that train it together."""
+
+    def found_by_first(self, look: Callable[[], T]) -> T:
+        """What the first process finds, on all of them; the generator goes on from there on all. It should be on the
+        CPU, where its numbers may differ in the last bit from those that others would find."""
+        found, state = self.ranks.broadcast(lambda: (look(), self.generator.get_state()))
+        self.generator.set_state(state)
+        return found
 
     def points(self) -> PointCloud:
         """What the model starts from.

@@ -141,6 +141,10 @@ class Removal:
     error_share: float
     """Squared error of the views over the rows that they show, summed over views."""
 
+    def to(self, device: torch.device | str) -> "Removal":
+        """On a device."""
+        return replace(self, squares=self.squares.to(device), shown=self.shown.to(device))
+
 
 DRAWS = 32
 """Of random signs, at least, over all views."""

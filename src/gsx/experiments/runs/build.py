@@ -63,12 +63,7 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
-def refuse_own_judgement(options: Any, ranks: Ranks) -> None:
-    """Raise ConfigError where processes would each decide by renders of their own what the model needs."""
-    for name, shared in {"capacity": "published", "sh_judged": 0}.items():
-        value = getattr(options, name, shared)
-        if ranks.size > 1 and value != shared:
-            raise ConfigError(f"backbone.{name}={value} is for one process: call gsx without torchrun, or {shared}")
+ALONE = Ranks()
 
 
 def build(
@@ -85,7 +80,6 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
-        refuse_own_judgement(settings.backbone.options, ranks)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
     torch.manual_seed(general.seed)
@@ -93,7 +87,7 @@ def build(
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
+    def anew(scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE) -> Backbone:
         context = BackboneContext(
             scene=scene,
             iterations=iterations,
@@ -101,15 +95,16 @@ def build(
             raster=raster,
             generator=generator,
             resolution=settings.training.resolution(scene, iterations),
+            ranks=together,
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
 
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
-        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator)
+        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator, ranks)
         go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
-        backbone = anew(scene, general.iterations, generator)
+        backbone = anew(scene, general.iterations, generator, ranks)
     augmenters = build_augmenters(settings, scene) if training else []
     run = Run(
         config=settings.resolved,

@@ -29,7 +29,7 @@ from gsx.experiments.run_folder.run_key import (
     trained_on,
 )
 from gsx.experiments.runs import warm_start
-from gsx.experiments.runs.build import build, choose_device, refuse_own_judgement, refuse_uneven
+from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
@@ -82,7 +82,6 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     choose_device(settings.general.device)
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
-    refuse_own_judgement(settings.backbone.options, ranks)
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
     if settings.general.viewer:
