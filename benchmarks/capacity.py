@@ -43,7 +43,7 @@ SUBJECTS = {
 FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000}
 """Primitives of the smaller budget."""
 ARMS = ("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer")
-ADAPTIVE = "backbone.capacity=adaptive"
+PUBLISHED, ADAPTIVE = "backbone.capacity=published", "backbone.capacity=adaptive"
 ZOOMS = ("1", "2", "4")
 
 
@@ -67,9 +67,9 @@ def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
     """What makes an arm; `published`: evaluation of the published arm with the same seed."""
     number = published["primitives"] if arm == "budget as published" else FEWER[scene]
     return {
-        "published": [],
+        "published": [PUBLISHED],
         "adaptive": [ADAPTIVE],
-        "published, held at fewer": [f"backbone.max_primitives={number}"],
+        "published, held at fewer": [PUBLISHED, f"backbone.max_primitives={number}"],
     }.get(arm, ["backbone.capacity=budget", f"backbone.budget.primitives={number}"])
 
 

@@ -48,7 +48,8 @@ RULES = ("none", "magnified", "resampled")
 """Values of backbone.filter that suit a model of plain 3D-GS."""
 ZOOMS = ("1", "2", "4")
 MIP = ("backbone=mip_splatting",)
-ZOOM = (*MIP, "preset=zoom")
+ZOOM = (*MIP, "preset=zoom", "backbone.capacity=published")
+"""Growth has tables of its own (benchmarks/capacity.py)."""
 EARLY = (*ZOOM, "training.supersample_from=0.5")
 COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
