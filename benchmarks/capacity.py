@@ -39,8 +39,10 @@ SUBJECTS = {
     "lego": ("scene=blender", "scene.downscale=4", "iterations=1200"),
     "castle": ("scene=photos", "scene.downscale=8", "iterations=800"),
     "demo": ("scene=demo", "iterations=900"),
+    "room": ("scene=room", "iterations=1500"),
 }
-FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000}
+BUILT_IN = ("demo", "room")
+FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000, "room": 10000}
 """Primitives of the smaller budget."""
 ARMS = ("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer")
 PUBLISHED, ADAPTIVE = "backbone.capacity=published", "backbone.capacity=adaptive"
@@ -52,7 +54,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
     parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence")
-    parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
+    parser.add_argument("--only", default="fox,fox_4,lego,castle,demo", help="scenes, by commas")
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
     parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
@@ -87,7 +89,7 @@ def evaluation_of(arm: str, scene: str, backbone: str, seed: int, given: argpars
 
 def words_of(wish: Sequence[str], scene: str, backbone: str, seed: int, given: argparse.Namespace) -> list[str]:
     """The whole composition of a run that differs from the published one by a wish."""
-    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene.split('_')[0]}"]
+    where = [] if scene in BUILT_IN else [f"scene.path={given.scenes / scene.split('_')[0]}"]
     zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
     return [f"backbone={backbone}", *wish, *SUBJECTS[scene], *where, f"seed={seed}", zooms]
 
@@ -101,7 +103,7 @@ def trained(folder: Path, words: Sequence[str], given: argparse.Namespace) -> di
 
 def scenes_of(given: argparse.Namespace) -> list[str]:
     """Those asked for that are there."""
-    return [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    return [scene for scene in given.only.split(",") if scene in BUILT_IN or given.scenes]
 
 
 def row_of(scene: str, arm: str, own: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -471,3 +471,20 @@ def test_the_page_of_trades_is_that_of_the_committed_figures() -> None:
 
     text = trades.PAGE.read_text()
     assert trades.page(text, read_sections(trades.RESULTS / "trades_cpu.json")) == text
+
+
+def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None:
+    import starts
+
+    def run(psnr: float, seen: float, primitives: int, seconds: float) -> dict[str, Any]:
+        zooms = {zoom: {"psnr": psnr - float(zoom)} for zoom in ("1", "2", "4")}
+        return {"zoom": zooms, "seen": seen, "primitives": primitives, "train_seconds": seconds}
+
+    one = {arm: run(30.0, 33.0, 100, 10.0) for arm in starts.ARMS} | {"adaptive": run(31.5, 31.0, 40, 5.0)}
+    two = {arm: run(30.4, 33.0, 100, 10.0) for arm in starts.ARMS} | {"adaptive": run(31.5, 31.0, 60, 5.0)}
+    first, _, third, _ = starts.rows_of("room", [one, two])
+    assert (first["gap"], third["gap"]) == ("+3.80 ± 0.20", "+0.50 ± 0.00")
+    assert (third["more1"], third["share"], third["times"]) == ("+1.30 ± 0.20", "0.50", "0.50")
+    lines = [{"step": step, "psnr": float(step)} for step in range(1, 101)] + [{"step": 100, "test_psnr": 1.0}]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert starts.seen_in_training(tmp_path) == sum(range(91, 101)) / 10

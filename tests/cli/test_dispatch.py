@@ -361,6 +361,7 @@ BAD = {
     "trade no such option": lambda t: ["trade", "rasterizer", "--max-eror", "1"],
     "trade option cut off": lambda t: ["trade", "rasterizer", "--to"],
     "trade no such trade": lambda t: ["trade", "training", "--trades", "primitive", "--to", str(t / "t")],
+    "trade no such settings": lambda t: ["trade", "training", "--settings", "setings", "--to", str(t / "t")],
     "trade less than nothing": lambda t: ["trade", "training", "--max-drop-db", "-0.1"],
     "trade no seed": lambda t: ["trade", "training", "--seeds", "0,0"],
     "trade no composition": lambda t: ["trade", "training", "iteration=5", "--to", str(t / "t")],

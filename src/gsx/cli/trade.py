@@ -65,7 +65,8 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
     add("--budget-mb", type=positive(float), metavar="MB", help="wish: a splat file of at most so many 10^6 bytes")
     add("--max-drop-db", type=not_negative, metavar="DB", help="wish: at most so much lost at any zoom")
     add("--target-seconds", type=positive(float), metavar="S", help="wish: training takes at most so long")
-    add("--trades", metavar="A,B,...", help="only these, for example primitives,steps (all)")
+    add("--settings", default="settings", metavar="NAME", help="what is tried: conf/trade/NAME.yaml, also a plugin's")
+    add("--trades", metavar="A,B,...", help="only these of it, for example primitives,steps (all)")
     add("--seeds", type=different_numbers, default=[0], metavar="A,B,...", help="of the runs of each setting (0)")
     add("--combinations", type=whole, default=2, metavar="N", help="most combinations of good settings to try (2)")
     add("--to", type=Path, default=Path("trade"), metavar="FOLDER", help="for trade.html, trade.json, runs (./trade)")
@@ -101,7 +102,7 @@ def trade_training(arguments: list[str]) -> int:
 
     loaded, wanted = plugins(), given.trades.split(",") if given.trades else []
     with Compositions(loaded) as compositions:
-        settings = settings_of(compositions.node(["+trade=settings"], "trade"), wanted)
+        settings = settings_of(compositions.node([f"+trade={given.settings}"], "trade"), wanted)
         device = choose_device(compositions.settings(given.overrides).general.device)
 
     def job(composed: Any) -> Path:
