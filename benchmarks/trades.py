@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from capacity import SUBJECTS, ZOOMS
+from capacity import ADAPTIVE, SUBJECTS, ZOOMS
 from gsx.core.files import read_json, replace_text
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import Section, read_sections, stamped, write_results
@@ -27,7 +27,7 @@ RESULTS = Path(__file__).parent / "results"
 PAGE = Path(__file__).parents[1] / "docs" / "trade-offs.md"
 TITLES = {"demo": "The built-in scene", "fox": "fox, an eighth", "lego": "lego, a quarter"}
 COLUMNS = [
-    *(["setting", "setting"], ["overrides", "beside `backbone=gs3d`"]),
+    *(["setting", "setting"], ["overrides", "overrides"]),
     *(column for f in ZOOMS for column in ([f"x{f}", f"x{f}"], [f"more{f}", f"x{f} - as given"])),
     *(["primitives", "primitives"], ["megabytes", "MB"], ["seconds", "training s"], ["times", "of as given"]),
     ["front", "best for its"],
@@ -47,6 +47,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--only", default=",".join(TITLES), help="scenes, by commas")
     parser.add_argument("--seeds", type=numbers, default=[0, 1], help="by commas (0,1)")
     parser.add_argument("--trades", default="", help="of conf/trade, by commas (all)")
+    parser.add_argument("--combinations", type=int, default=1, help="of good settings, at most (1)")
     parser.add_argument("--jobs", type=int, default=1, help="commands at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/trades"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
@@ -61,7 +62,7 @@ def words_of(scene: str, seeds: Sequence[int], combinations: int, given: argpars
     trades = ["--trades", given.trades] if given.trades else []
     asked = ["--seeds", ",".join(map(str, seeds)), "--combinations", str(combinations), *trades]
     zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
-    return ["trade", "training", "backbone=gs3d", *SUBJECTS[scene], *where, zooms, *asked]
+    return ["trade", "training", "backbone=gs3d", ADAPTIVE, *SUBJECTS[scene], *where, zooms, *asked]
 
 
 def tried(scene: str, seeds: Sequence[int], combinations: int, given: argparse.Namespace) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def measured(given: argparse.Namespace) -> dict[str, dict[str, Any]]:
     with ThreadPoolExecutor(given.jobs) as pool:
         for done in [pool.submit(tried, scene, [seed], 0, given) for seed in given.seeds for scene in scenes]:
             done.result()
-        whole = {scene: pool.submit(tried, scene, given.seeds, 2, given) for scene in scenes}
+        whole = {scene: pool.submit(tried, scene, given.seeds, given.combinations, given) for scene in scenes}
         return {scene: found.result() for scene, found in whole.items()}
 
 
