@@ -449,7 +449,7 @@ def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(
     monkeypatch.setitem(trades.SUBJECTS, "demo", ("scene=demo", *TINY))
     page = tmp_path / "page.md"
     page.write_text("# Above\n\n<!-- demo: written by benchmarks/trades.py -->\n| old |\n\n## Below\n")
-    words = ["--only", "demo,fox", "--trades", "colour", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path)]
+    words = ["--only", "demo,fox", "--trades", "colour,bands", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path)]
     trades.main([*words, "--page", str(page)])
     found = json.loads((tmp_path / "runs" / "demo" / "trade.json").read_text())
     rows = read_sections(tmp_path / "trades_cpu.json")["demo"]["rows"]
@@ -476,7 +476,7 @@ def test_the_page_of_trades_is_that_of_the_committed_figures() -> None:
 def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None:
     import starts
 
-    def run(psnr: float, seen: float, primitives: int, seconds: float) -> dict[str, Any]:
+    def run(psnr: float, seen: float, primitives: int, seconds: float) -> dict[str, object]:
         zooms = {zoom: {"psnr": psnr - float(zoom)} for zoom in ("1", "2", "4")}
         return {"zoom": zooms, "seen": seen, "primitives": primitives, "train_seconds": seconds}
 
