@@ -43,8 +43,8 @@ class BackboneContext:
     """The processes that train it together."""
 
     def found_by_first(self, look: Callable[[], T]) -> T:
-        """What the first process finds, on all of them; the generator goes on from there on all. It should be on the
-        CPU, where its numbers may differ in the last bit from those that others would find."""
+        """What the first process finds, on all of them, so that all decide alike: renders of others may differ in a
+        last bit. The generator goes on from there on all. Tensors are to be on the CPU."""
         found, state = self.ranks.broadcast(lambda: (look(), self.generator.get_state()))
         self.generator.set_state(state)
         return found
