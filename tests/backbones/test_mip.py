@@ -309,8 +309,12 @@ def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
 # -- density control (10.5) --------------------------------------------------------------------------------------------
 
 
+def cameras_of(backbone: GS3D) -> list[Camera]:
+    return backbone.filter.context.resolution.rendered_cameras(1)
+
+
 def drawn_opacities(backbone: GS3D) -> Tensor:
-    return backbone.draw(backbone.filter.context.rendered_cameras(0)[0], 1).splats.log_opacities.detach().exp()
+    return backbone.draw(cameras_of(backbone)[0], 1).splats.log_opacities.detach().exp()
 
 
 def test_a_reset_caps_what_is_drawn() -> None:
@@ -363,7 +367,7 @@ def test_size_and_opacity_tests_are_of_raw_values() -> None:
     backbone = row_values([0.0099, 0.0101, 0.01, 0.099, 0.11], [0.0051, 0.5, 0.0049, 0.5, 0.5], [1.0, 1.0, 0, 0, 0])
     assert float(backbone.table["filter"].min()) > 0.05
     assert float(drawn_opacities(backbone)[0]) < 0.005
-    assert float(backbone.draw(backbone.filter.context.rendered_cameras(0)[0], 1).splats.scales.detach()[3].max()) > 0.1
+    assert float(backbone.draw(cameras_of(backbone)[0], 1).splats.scales.detach()[3].max()) > 0.1
     assert backbone.densify_and_prune(3100) == {"cloned": 1, "split": 1, "pruned": 2}
     assert labels(backbone) == [0, 3, 0, 1, 1]
 
@@ -429,7 +433,7 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
         backbone.table["opacity_logits"].fill_(2.0)
         backbone.table["log_scales"].add_(1.0)
     truth = torch.zeros(12, dtype=torch.float64)
-    for number, camera in enumerate(backbone.filter.context.rendered_cameras(0)[:2]):
+    for number, camera in enumerate(cameras_of(backbone)[:2]):
         small = camera.resize(12, 8)
         weights = torch.randn(3, 8, 12, generator=torch.Generator().manual_seed(number))
         for pixel in range(96):

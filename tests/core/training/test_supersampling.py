@@ -53,6 +53,7 @@ def fresh(folder: Path, *more: str) -> Run:
     """A run at step 0 on photographs that are said to have been reduced by the bicubic filter."""
     run = start(tiny_settings(folder, "iterations=40", "rasterizer=eager", *more), plugins())
     run.scene = replace(run.scene, reduction=BICUBIC)
+    run.resolution = replace(run.resolution, scene=run.scene)
     return run
 
 
