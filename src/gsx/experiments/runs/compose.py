@@ -16,11 +16,6 @@ from gsx.core.plugins import Plugins
 from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
 OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
-OmegaConf.register_new_resolver(
-    "if_shorter",
-    lambda steps, published, then, otherwise: then if isinstance(steps, int) and steps < published else otherwise,
-    replace=True,
-)
 OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
 MODULE = "gsx.conf"
