@@ -16,15 +16,14 @@ from typing import Any
 
 import torch
 
-from capacity import ADAPTIVE, SUBJECTS, ZOOMS
+from capacity import ADAPTIVE, RESULTS, SUBJECTS, ZOOMS, scenes_of
 from gsx.core.files import read_json, replace_text
 from gsx.experiments.reports.charts import pareto_front
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, read_sections, stamped, write_results
+from measuring.results import Section, cell, read_sections, stamped, write_results
 from measuring.runs import gsx
 from zoom import numbers, told
 
-RESULTS = Path(__file__).parent / "results"
 PAGE = Path(__file__).parents[1] / "docs" / "trade-offs.md"
 TITLES = {"demo": "The built-in scene", "fox": "fox, an eighth", "lego": "lego, a quarter"}
 COLUMNS = [
@@ -78,7 +77,7 @@ def tried(scene: str, seeds: Sequence[int], combinations: int, given: argparse.N
 
 def measured(given: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """trade.json by scene: first the settings with every seed, each on its own, then all together with combinations."""
-    scenes = [scene for scene in given.only.split(",") if scene == "demo" or given.scenes]
+    scenes = scenes_of(given)
     with ThreadPoolExecutor(given.jobs) as pool:
         for done in [pool.submit(tried, scene, [seed], 0, given) for seed in given.seeds for scene in scenes]:
             done.result()
@@ -124,11 +123,6 @@ def fronts_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[int]]:
     return {unit: pareto_front(values, gains) for unit, values in costs.items()}
 
 
-def told_seeds(seeds: Sequence[int]) -> str:
-    """By commas."""
-    return ", ".join(map(str, seeds))
-
-
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
@@ -149,11 +143,6 @@ def table(section: Section) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
 
 
-def cell(value: Any) -> str:
-    """A figure as text."""
-    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
-
-
 def main(words: Sequence[str]) -> None:
     """Measure and write the tables and the page."""
     given = arguments(words)
@@ -161,7 +150,10 @@ def main(words: Sequence[str]) -> None:
     if not given.page_only:
         machine, load = describe_machine(torch.device("cpu")), told_load()
         machine |= {"threads": 1} if given.jobs > 1 else {}
-        command, notes = shown_command(words, "benchmarks/trades.py"), [f"{NOTE} Seeds: {told_seeds(given.seeds)}."]
+        command, notes = (
+            shown_command(words, "benchmarks/trades.py"),
+            [f"{NOTE} Seeds: {', '.join(map(str, given.seeds))}."],
+        )
         tables = {
             scene: stamped(TITLES[scene], COLUMNS, rows_of(found), notes, load, command)
             for scene, found in measured(given).items()

@@ -95,10 +95,10 @@ def trade_training(arguments: list[str]) -> int:
     from gsx.experiments.runs.compose import Compositions
     from gsx.experiments.runs.job import train
     from gsx.experiments.trade.machine import machine
-    from gsx.experiments.trade.training.measure import Trial, measured
+    from gsx.experiments.trade.training.measure import Trial, known, measured
     from gsx.experiments.trade.training.page import write_trade
     from gsx.experiments.trade.training.settings import settings_of
-    from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, known, table
+    from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, table
 
     loaded, wanted = plugins(), given.trades.split(",") if given.trades else []
     with Compositions(loaded) as compositions:

@@ -5,6 +5,7 @@ Solids, textures and light are those of the built-in garden; sunlight comes in f
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key
+from gsx.core.cache import content_key
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.images import ImageCache
-from gsx.core.data.resize import training_size
-from gsx.core.data.scene import PointCloud, Scene, extent_of
+from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.demo import textures
 from gsx.scenes.demo.noise import blend
@@ -24,7 +23,7 @@ from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
 from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
 from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, rgb, smoothstep
 from gsx.scenes.demo.tracing import rays_through, shade, trace
-from gsx.scenes.demo.views import DemoOptions, DemoSource, check, make_views, scene_version
+from gsx.scenes.demo.views import DemoOptions, check, photographed, scene_version
 
 HALF = (2.5, 2.0)  # of the floor, scene units: about metres
 HEIGHT, THICK = 2.4, 0.1  # of the walls
@@ -135,7 +134,7 @@ def patterned(
     return positions, colours, torch.maximum(*apart) > CONTRAST
 
 
-def found_points(room: StillLife, cameras: list[Camera], count: int, generator: torch.Generator) -> PointCloud:
+def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Points where pictures have pattern, at most so many: as structure from motion would leave them."""
     positions, colours = [], []
     share = math.ceil(TRIES * count / len(cameras))
@@ -161,28 +160,4 @@ def load(options: DemoOptions) -> Scene:
         ConfigError: see `gsx.scenes.demo.views.check`.
     """
     check(options)
-    room, size = make_room(), training_size(options.width, options.height, options.downscale, options.max_width)
-    count = options.train_views
-    train = [walking_camera(index / count, *size) for index in range(count)]
-    places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
-    test = [walking_camera(place, *size) for place in places]
-    folder = cache_folder("room", content_key(room_version(), options.samples))
-    source = partial(
-        DemoSource, life=room, samples=options.samples, cache=ImageCache(int(options.cache_gb * 1e9)), folder=folder
-    )
-    return Scene(
-        name=options.name,
-        train=make_views("train", train, source),
-        test=make_views("test", test, source),
-        points=found_points(room, train, options.points, torch.Generator().manual_seed(options.seed)),
-        background=torch.tensor(options.background),
-        extent=extent_of(train),
-        provenance={
-            "format": "room",
-            "version": room_version(),
-            "size": list(size),
-            "samples": options.samples,
-            "light": "display",
-            "split": f"{options.train_views} on a walk, {options.test_views} between them",
-        },
-    )
+    return photographed(options, make_room(), walking_camera, found_points, "room", room_version(), "a walk")

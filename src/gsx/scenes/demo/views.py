@@ -172,32 +172,49 @@ def load(options: DemoOptions) -> Scene:
         ConfigError: see `check`.
     """
     check(options)
-    life, size = make_still_life(), training_size(options.width, options.height, options.downscale, options.max_width)
-    count = options.train_views  # evenly along the spiral, and test cameras half-way between neighbours
-    train = [spiral_camera(index / count, *size) for index in range(count)]
+    life = make_still_life()
+    return photographed(options, life, spiral_camera, sample_points, "demo", scene_version(), "a spiral")
+
+
+CameraAt = Callable[[float, int, int], Camera]
+"""(place in [0, 1) of a path, width, height) -> the camera there."""
+PointsOf = Callable[[StillLife, Sequence[Camera], int, torch.Generator], PointCloud]
+"""(what there is, cameras, how many, generator) -> points to start from."""
+
+
+def photographed(
+    options: DemoOptions, life: StillLife, camera_at: CameraAt, points: PointsOf, name: str, version: str, path: str
+) -> Scene:
+    """An arrangement seen along a path: training cameras evenly on it, test cameras half-way between neighbours.
+
+    name: of the format and of its cached pictures; version: a digest of the code that makes them; path: its name.
+    """
+    size = training_size(options.width, options.height, options.downscale, options.max_width)
+    count = options.train_views
+    train = [camera_at(index / count, *size) for index in range(count)]
     places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
-    test = [spiral_camera(place, *size) for place in places]
-    folder = cache_folder("demo", content_key(scene_version(), options.samples))
+    test = [camera_at(place, *size) for place in places]
+    folder = cache_folder(name, content_key(version, options.samples))
     cache = ImageCache(int(options.cache_gb * 1e9))
     source = partial(DemoSource, life=life, samples=options.samples, cache=cache, folder=folder)
     return Scene(
         name=options.name,
         train=make_views("train", train, source),
         test=make_views("test", test, source),
-        points=sample_points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
+        points=points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
         background=torch.tensor(options.background),
         extent=extent_of(train),
-        provenance=provenance(options, size),
+        provenance=provenance(options, size, name, version, path),
     )
 
 
-def provenance(options: DemoOptions, size: tuple[int, int]) -> dict[str, Any]:
+def provenance(options: DemoOptions, size: tuple[int, int], name: str, version: str, path: str) -> dict[str, Any]:
     """What decides how the pictures look, for the evaluation protocol."""
     return {
-        "format": "demo",
-        "version": scene_version(),
+        "format": name,
+        "version": version,
         "size": list(size),
         "samples": options.samples,
         "light": "display",
-        "split": f"{options.train_views} on a spiral, {options.test_views} between them",
+        "split": f"{options.train_views} on {path}, {options.test_views} between them",
     }

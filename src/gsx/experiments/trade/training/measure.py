@@ -12,7 +12,7 @@ from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import read_json
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.page import duration
-from gsx.experiments.runs.compose import Compositions, key_of, quoted
+from gsx.experiments.runs.compose import compose, key_of, quoted
 from gsx.experiments.trade.training.settings import GIVEN, Setting, together
 
 logger = logging.getLogger(__name__)
@@ -108,8 +108,7 @@ class Trial:
 
     def composed(self, row: Sequence[str], seed: int) -> Any:
         """Its settings, checked."""
-        with Compositions(self.plugins) as compositions:
-            return compositions.settings(self.words(row, seed))
+        return compose(self.words(row, seed), self.plugins)
 
     def tried(self, setting: Setting, iterations: int) -> Row:
         """A setting, trained with each seed unless that has been done; what cannot be composed says why."""
@@ -139,6 +138,11 @@ def measured(trial: Trial, listed: Sequence[Setting], most_together: int) -> lis
     return different(rows + [trial.tried(one, iterations) for one in combinations(rows, most_together)])
 
 
+def known(rows: Sequence[Row]) -> list[Row]:
+    """Those that were trained; the composition as given comes first."""
+    return [row for row in rows if row.outcomes]
+
+
 def different(rows: Sequence[Row]) -> list[Row]:
     """Without settings that are the composition as given, or another one: they would be named twice."""
     seen, kept = set[str](), list[Row]()
@@ -157,11 +161,11 @@ CHEAP_DROP = 0.1
 def combinations(rows: Sequence[Row], most: int) -> Iterator[Setting]:
     """What is tried together, `most` at most: of several trades what brings the most at the finest zoom, two, three and
     so on; and what takes less time without losing."""
-    known = [row for row in rows if row.outcomes]
-    given, zoom = known[0], known[0].zooms()[-1]
-    better = [row for row in known[1:] if row.quality(zoom) > given.quality(zoom)]
+    given, *others = known(rows)
+    zoom = given.zooms()[-1]
+    better = [row for row in others if row.quality(zoom) > given.quality(zoom)]
     best = one_of_each(better, lambda row: -row.quality(zoom))
-    cheap = [row for row in known[1:] if row.cost("seconds") < given.cost("seconds") and row.drop(given) <= CHEAP_DROP]
+    cheap = [row for row in others if row.cost("seconds") < given.cost("seconds") and row.drop(given) <= CHEAP_DROP]
     fast = one_of_each(cheap, lambda row: row.cost("seconds"))
     counted = [best[:count] for count in range(2, min(most + 1, len(best)) + 1)] + ([fast] if len(fast) > 1 else [])
     joined = [together([row.setting for row in chosen]) for chosen in counted]

@@ -9,8 +9,8 @@ from gsx import __version__
 from gsx.core.files import replace_text, write_json
 from gsx.experiments.reports.charts import Dot, scatter
 from gsx.experiments.reports.page import template
-from gsx.experiments.trade.training.measure import COSTS, Row
-from gsx.experiments.trade.training.wishes import Wish, advice, command, figures, front, known, told
+from gsx.experiments.trade.training.measure import COSTS, Row, known
+from gsx.experiments.trade.training.wishes import Wish, advice, command, figures, front, told
 
 COLOURS = {0: 1, 1: 0}
 """Colour numbers of dots by how many changes they are; several have 2."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gsx.experiments.reports.charts import pareto_front
-from gsx.experiments.trade.training.measure import COSTS, Row
+from gsx.experiments.trade.training.measure import COSTS, Row, known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +36,6 @@ class Wish:
             f"at most {self.max_drop_db:g} dB lost at any zoom" if self.max_drop_db is not None else "",
         ]
         return ", ".join(filter(None, parts))
-
-
-def known(rows: Sequence[Row]) -> list[Row]:
-    """Those that were trained; the composition as given comes first."""
-    return [row for row in rows if row.outcomes]
 
 
 def front(rows: Sequence[Row], cost: str, zoom: str) -> list[Row]:
