@@ -28,7 +28,10 @@ def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
         terminalreporter.write_line(f"{spent:8.1f}  {file}")
 
 
-COMPILED = {f"gsx.core.rasterizer.{name}" for name in ("kernels", "geometry", "pixel_windows")}
+COMPILED = {
+    *(f"gsx.core.rasterizer.{name}" for name in ("kernels", "geometry", "pixel_windows", "selection", "boxes")),
+    *("gsx.core.gaussians.bands", "gsx.core.quality.similarity"),
+}
 """torch.compile must see these functions themselves, not the checks around them."""
 
 

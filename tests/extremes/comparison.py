@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from extremes.cases import Case
+from gsx.core.compiling import available
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.reference import alpha_maps, frame_pixels, render_reference, whole
 
 FLOAT64_TOLERANCE = 1e-12

@@ -28,7 +28,7 @@ from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import Rendering
+from gsx.core.rasterizer import Rendering, learns_compiled
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
@@ -65,9 +65,12 @@ def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
     return vars(gaussians) | {"sh_dc": gaussians.sh_dc[:, None], "sh_rest": torch.cat([rest, missing], 1)}
 
 
-def colours_from(camera: Camera, values: Mapping[str, Tensor], degree: int) -> Float[Tensor, "M 3"]:
+def colours_from(
+    camera: Camera, values: Mapping[str, Tensor], degree: int, compiled: bool = False
+) -> Float[Tensor, "M 3"]:
     """Colours of Gaussians as seen from a camera, up to a degree."""
-    return colours_of(values["sh_dc"], values["sh_rest"], offsets_from(values["means"], camera.centre), degree)
+    offsets = offsets_from(values["means"], camera.centre)
+    return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, compiled)
 
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
@@ -143,12 +146,13 @@ class GS3D:
         shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
         scales, log_opacities = extents(self.table, shown, self.filter)
+        compiled = learns_compiled(self.raster, scales.device.type)
         splats = Splats(
             means=values["means"],
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_from(camera, values, self.active_degree(step)),
+            colours=colours_from(camera, values, self.active_degree(step), compiled),
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 

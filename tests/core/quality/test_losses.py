@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from gsx.core.quality.losses import Blur, photometric, ssim_map
+from gsx.core.compiling import available
+from gsx.core.quality.losses import blur, photometric, ssim_map
 
+needs_compiler = pytest.mark.skipif(not available(), reason="no working compiler")
 OFFSET = np.arange(11) - 5
 WEIGHTS = np.exp(-(OFFSET[:, None] ** 2 + OFFSET[None] ** 2) / (2 * 1.5**2))
 WEIGHTS /= WEIGHTS.sum()
@@ -38,7 +40,7 @@ def ssim_by_windows(image: Tensor, target: Tensor) -> np.ndarray:
 def test_window_is_the_normalised_gaussian() -> None:
     point = torch.zeros(1, 23, 23, dtype=torch.float64)
     point[0, 11, 11] = 1
-    spread = Blur.apply(point)[0]
+    spread = blur(point, 5)[0]
     assert float(spread.sum()) == pytest.approx(1, abs=1e-14)
     ratios = [math.exp(-(k**2) / 4.5) for k in (6, 5, 4, 3, 2, 1, 0, 1, 2, 3, 4, 5, 6)]
     ratios[0] = ratios[-1] = 0.0  # the window ends at 5
@@ -51,7 +53,7 @@ def test_blur_of_a_point_is_the_window_cut_at_the_border() -> None:
     point[0, 1, 6] = 1.0
     expected = np.zeros((2, 9, 13))
     expected[0, :7, 1:12] = WEIGHTS[4:, :]
-    np.testing.assert_allclose(Blur.apply(point), expected, atol=1e-16)
+    np.testing.assert_allclose(blur(point, 5), expected, atol=1e-16)
 
 
 @pytest.mark.parametrize("shape", [(2, 12, 15), (3, 4, 3), (1, 1, 1)])
@@ -92,21 +94,28 @@ def test_loss_is_a_mean_not_a_sum() -> None:
     assert float(photometric(image, target, 0.0)) == pytest.approx(0.25, rel=1e-6)
 
 
-def test_gradient_of_blur() -> None:
-    maps = torch.rand(2, 7, 12, dtype=torch.float64, requires_grad=True)
-    assert gradcheck(Blur.apply, (maps,))
+def test_the_blur_is_its_own_adjoint() -> None:
+    first, second = pictures(2, 7, 12)
+    assert float((blur(first, 5) * second).sum()) == pytest.approx(float((first * blur(second, 5)).sum()), rel=1e-12)
 
 
-@pytest.mark.parametrize("padding", [5, 0])
-def test_gradient_of_ssim(padding: int) -> None:
-    image, target = pictures(2, 12, 13)
-    image.requires_grad_()
-    # uneven weights: an error that cancels in the mean would go unseen
-    weight = torch.rand(ssim_map(image, target, padding).shape, dtype=torch.float64)
-    assert gradcheck(lambda picture: (ssim_map(picture, target, padding) * weight).sum(), (image,))
-
-
-def test_gradient_of_the_loss() -> None:
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_gradient_of_the_loss(compiled: bool) -> None:
     image, target = pictures(3, 8, 6)
     image.requires_grad_()
-    assert gradcheck(lambda picture: photometric(picture, target, 0.2), (image,))
+    for weight in (0.2, 1.0):
+        assert gradcheck(lambda picture: photometric(picture, target, weight, compiled), (image,))  # noqa: B023
+
+
+@needs_compiler
+def test_the_compiled_loss_is_that_of_the_formulas_for_pictures_of_several_sizes() -> None:
+    for shape in ((3, 14, 9), (3, 30, 41), (1, 5, 70)):
+        image, target = (picture.float() for picture in pictures(*shape))
+        found = []
+        for compiled in (False, True):
+            moved = image.clone().requires_grad_()
+            loss = photometric(moved, target, 0.2, compiled)
+            loss.backward()
+            found.append((loss.detach(), moved.grad))
+        torch.testing.assert_close(found[1][0], found[0][0], rtol=1e-6, atol=0)
+        torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-4, atol=1e-6 / image.numel())

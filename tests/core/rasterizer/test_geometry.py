@@ -16,10 +16,10 @@ from raster_scenes import (
     truth_of,
 )
 
+from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.geometry import LEAST_SHARE, log_compensation
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project

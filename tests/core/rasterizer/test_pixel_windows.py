@@ -10,11 +10,11 @@ from raster_scenes import changed, front_camera, gradients, leaves, random_splat
 from tiny import tiny_run
 from torch import Tensor
 
+from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.files import read_json
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
-from gsx.core.rasterizer.available import available
 from gsx.core.rasterizer.pixel_windows import Met as MetSplat
 from gsx.core.rasterizer.pixel_windows import axes, behind_splat, splat_gradients
 

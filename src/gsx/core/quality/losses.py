@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gsx.core.quality.similarity import compiled_slopes, similarity, ssim_slopes
 from gsx.core.shapes import Float
 
 WINDOW, SIGMA = 11, 1.5
@@ -13,8 +14,8 @@ WINDOW, SIGMA = 11, 1.5
 GAUSSIAN = [math.exp(-((i - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for i in range(WINDOW)]
 WEIGHTS = [value / sum(GAUSSIAN) for value in GAUSSIAN]
 """The window along one axis, sum 1."""
-C1, C2 = 0.01**2, 0.03**2
-"""SSIM constants for values in [0, 1]."""
+PADDING = WINDOW // 2
+"""With so many zeros around it the blurred picture has its size."""
 
 
 def correlate(maps: Float[Tensor, "M H W"], axis: int) -> Float[Tensor, "M h w"]:
@@ -33,32 +34,21 @@ def blur(maps: Float[Tensor, "M H W"], padding: int) -> Float[Tensor, "M h w"]:
     return correlate(pad(rows, (0, 0, padding, padding)), 1)
 
 
-class Blur(torch.autograd.Function):
-    """Size-preserving blur. It is its own adjoint: the window is symmetric and the padding zero."""
-
-    @staticmethod
-    def forward(ctx, maps):
-        return blur(maps, WINDOW // 2)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        return blur(gradient.contiguous(), WINDOW // 2)
-
-
 def ssim_map(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = WINDOW // 2
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = PADDING
 ) -> Float[Tensor, "C h w"]:
     """Structural similarity per channel and pixel; biased variances.
 
-    `padding` is 5 for INRIA's zero-padded windows (differentiable in `image`), 0 for whole windows only.
+    `padding` is 5 for INRIA's zero-padded windows, 0 for whole windows only.
     """
-    smooth = Blur.apply if padding == WINDOW // 2 else lambda maps: blur(maps, padding)
-    mean_x, xx, xy = smooth(torch.cat([image, image * image, image * target])).chunk(3)
-    with torch.no_grad():
-        mean_y, yy = smooth(torch.cat([target, target * target])).chunk(2)
-    variances, covariance = xx - mean_x**2 + yy - mean_y**2, xy - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
-    return luminance * (2 * covariance + C2) / (variances + C2)
+    parts = blurred(image, target, padding)
+    luminance, structure = similarity(*parts)
+    return luminance * structure
+
+
+def blurred(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int) -> tuple[Tensor, ...]:
+    """Blurred image, target, image^2, target^2 and image target, each [C h w]."""
+    return tuple(blur(maps, padding) for maps in (image, target, image * image, target * target, image * target))
 
 
 def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""]:
@@ -67,7 +57,36 @@ def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""
     return weight * volumes.sum() / max(1, len(volumes))
 
 
-def photometric(image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float) -> Float[Tensor, ""]:
-    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels."""
-    absolute = (image - target).abs().mean()
-    return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim_map(image, target).mean())
+def photometric_and_gradient(
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float, compiled: bool
+) -> tuple[Float[Tensor, ""], Float[Tensor, "C H W"]]:
+    """The photometric loss and its gradient by the image. The blur is its own adjoint: the window is symmetric and the
+    padding zero."""
+    parts, slopes_of = blurred(image, target, PADDING), compiled_slopes() if compiled else ssim_slopes
+    ssim, *slopes = (found.view(image.shape) for found in slopes_of(*(part.flatten() for part in parts)))
+    by_x, by_xx, by_xy = (blur(slope, PADDING) for slope in slopes)
+    by_ssim, difference = by_x + 2 * image * by_xx + target * by_xy, image - target
+    loss = (1 - ssim_weight) * difference.abs().mean() + ssim_weight * (1 - ssim.mean())
+    return loss, ((1 - ssim_weight) * difference.sign() - ssim_weight * by_ssim) / image.numel()
+
+
+class Photometric(torch.autograd.Function):
+    """The loss, with its gradient found on the way forward."""
+
+    @staticmethod
+    def forward(ctx, image, target, ssim_weight, compiled):
+        loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled)
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    def backward(ctx, by_loss):
+        (gradient,) = ctx.saved_tensors
+        return by_loss * gradient, None, None, None
+
+
+def photometric(
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float, compiled: bool = False
+) -> Float[Tensor, ""]:
+    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image."""
+    return Photometric.apply(image, target, ssim_weight, compiled)

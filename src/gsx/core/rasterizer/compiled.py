@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.available import available, warn_once
+from gsx.core.compiling import available
 from gsx.core.rasterizer.composite import NOTHING
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
+from gsx.core.rasterizer.path import warn_once
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
 from gsx.core.rasterizer.settings import RasterSettings
@@ -91,11 +92,16 @@ def block_moments(
     before: Float[Tensor, "B P L"],
     behind: Float[Tensor, "B P L"],
     gradient: list[Float[Tensor, "B P L"]],
-) -> Float[Tensor, "B K V L"]:
-    """Moments of some blocks; `behind` is moved in front of them."""
-    basis = job.basis
-    slope, weight = job.loops.slopes(rows, basis.x, basis.y, before, behind, gradient)
-    return job.loops.moments(rows, slope, weight, basis.x, basis.y, basis.products, gradient)
+    out: Float[Tensor, "B K V L"],
+) -> None:
+    """Moments of some blocks into `out`; `behind` is moved in front of them."""
+    job.loops.moments(rows, job.basis.x, job.basis.y, job.basis.products, before, behind, gradient, out)
+
+
+def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"], like: Tensor) -> Float[Tensor, "S K V L"]:
+    """Zeros for the moments of all blocks, in the format of light."""
+    width = TABLE + job.rules.channels + 2 * job.rules.absolute
+    return like.new_zeros(*rows.shape[:2], width, rows.shape[3])
 
 
 # -- chunks --------------------------------------------------------------------------------------------------------
@@ -194,13 +200,13 @@ def chunk_moments(
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, back to front; zero for blocks that were not blended."""
     behind = torch.zeros_like(kept.inside)
-    width = TABLE + job.rules.channels + 2 * job.rules.absolute
-    moments = kept.inside.new_zeros(*rows.shape[:2], width, rows.shape[3])
+    moments = room_for_moments(job, rows, kept.inside)
     for stage in reversed(kept.stages):
         rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
-        moments[stage.blocks] = block_moments(job, take(rows, stage.blocks), kept.before(stage), rest, seen)
+        found = take(moments, stage.blocks)
+        block_moments(job, take(rows, stage.blocks), kept.before(stage), rest, seen, found)
         if not isinstance(stage.groups, slice):
-            behind[stage.groups] = rest
+            behind[stage.groups], moments[stage.blocks] = rest, found
     return moments
 
 
@@ -244,12 +250,11 @@ def segment_moments(
     shine = sum(channel * g for channel, g in zip(kept.contribution, seen, strict=True))
     own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
     behind = behind_blocks(kept.passed, own, job.lanes)
-    return torch.cat(
-        [
-            block_moments(job, rows[part], kept.before[part], behind[part], [g[part] for g in seen])
-            for part in parts(len(rows), job.batch)
-        ]
-    )
+    moments = room_for_moments(job, rows, kept.before)
+    for part in parts(len(rows), job.batch):
+        seen_here = [g[part] for g in seen]
+        block_moments(job, rows[part], kept.before[part], behind[part], seen_here, moments[part])
+    return moments
 
 
 # -- the autograd function -----------------------------------------------------------------------------------------
@@ -275,17 +280,17 @@ class CompiledComposite(torch.autograd.Function):
         inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
         accumulated, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside)
         if any(ctx.needs_input_grad):
-            ctx.kept = (job, intersections, table, rows, kept, absgrad is not None, means.dtype)
+            ctx.kept = (job, intersections, len(means), rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, intersections, table, rows, kept, absolute, dtype = ctx.kept
+        job, intersections, count, rows, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
         moments = (segment_moments if job.segments else chunk_moments)(job, rows, kept, seen)
-        values = job.loops.entry_gradients(table, job.lanes.entries, job.centre, moments)
-        total = sum_by_splat(values.view(-1, values.shape[-1]), intersections, job.lanes, len(table) - 1).to(dtype)
+        values = job.loops.entry_gradients(rows, moments).mT.flatten(0, 2)
+        total = sum_by_splat(values, intersections, job.lanes, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)

@@ -7,7 +7,6 @@ need outlive a cache. Rules are constants of the compiled code.
 
 import functools
 import math
-import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.available import first_sizes_free
+from gsx.core.compiling import WHOLE_LOOPS, sizes_free, with_last
 from gsx.core.shapes import Float, Int
 
 TABLE = 6
@@ -192,7 +191,7 @@ def slopes(
     return torch.stack(out[::-1], 1), torch.stack([weight for *_, weight in kept], 1)
 
 
-def moments(
+def sums_of(
     rows: Float[Tensor, "B K F L"],
     slope: Float[Tensor, "B K P L"],
     weight: Float[Tensor, "B K P L"],
@@ -212,6 +211,23 @@ def moments(
     if rules.absolute:
         sums += absolute_moments(rules, rows, slope, x, y)
     return torch.stack(sums, 2)
+
+
+def moments(
+    rows: Float[Tensor, "B K F L"],
+    x: Float[Tensor, "P 1"],
+    y: Float[Tensor, "P 1"],
+    products: Float[Tensor, "3 P 1"],
+    before: Float[Tensor, "B P L"],
+    behind: Float[Tensor, "B P L"],
+    gradient: list[Float[Tensor, "B P L"]],
+    out: Float[Tensor, "B K V L"],
+    rules: Rules,
+) -> None:
+    """What `sums_of` makes of what `slopes` finds, into `out`; `behind` is moved in front of the blocks. Both are loops
+    of one call: calls cost, and there are hundreds in a step."""
+    slope, weight = slopes(rows, x, y, before, behind, gradient, rules)
+    out.copy_(sums_of(rows, slope, weight, x, y, products, gradient, rules))
 
 
 def absolute_moments(
@@ -239,51 +255,50 @@ def make_rows(
     The exponent's columns, in tile-centred coordinates, with ln alpha = ln o - ...
     squares: u0, u1, k0, u2, k1 for (u0 x + u1 y + k0)^2 + (u2 y + k1)^2; direct: u0, u1, mean x, u2, mean y;
     expanded: the polynomial's coefficients of x^2, x y, x, y^2, y.
+
+    Last, behind the channels, what `shapes_of` needs beside them.
     """
     columns = [table[places, f] for f in range(table.shape[1])]
     x, y = columns[0] - centre[:, 0], columns[1] - centre[:, 1]
     u0, u1, u2, log_opacity = columns[2:TABLE]
     highest = rules.alpha_max * (places < table.shape[0] - 1).to(table.dtype)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
+    tail: list[Tensor] = []
     if rules.exponent == "squares":
-        head = [u0, u1, k0, u2, k1, log_opacity]
+        head, tail = [u0, u1, k0, u2, k1, log_opacity], [x, y]
     elif rules.exponent == "direct":
         head = [u0, u1, x, u2, y, log_opacity]
     else:
-        cross = 2 * (u1 * k0 + u2 * k1)
+        cross, tail = 2 * (u1 * k0 + u2 * k1), [x, y, u0, u1, u2]
         head = [u0 * u0, 2 * u0 * u1, 2 * u0 * k0, u1 * u1 + u2 * u2, cross, log_opacity - k0 * k0 - k1 * k1]
-    return torch.stack([*head, highest, *columns[TABLE:]], 2)
+    return torch.stack([*head, highest, *columns[TABLE:], *tail], 2)
+
+
+def shapes_of(rows: Float[Tensor, "S K F L"], rules: Rules) -> tuple[Tensor, ...]:
+    """(x, y, u0, u1, u2) of every entry, [S K L], its mean counted from the middle of the tile."""
+    columns = rows.unbind(2)
+    if rules.exponent == "squares":
+        return (*columns[-2:], columns[0], columns[1], columns[3])
+    return (columns[2], columns[4], columns[0], columns[1], columns[3]) if rules.exponent == "direct" else columns[-5:]
 
 
 def entry_gradients(
-    table: Float[Tensor, "N F"],
-    places: Int[Tensor, "S K L"],
-    centre: Float[Tensor, "S 2 1 L"],
-    moments: Float[Tensor, "S K V L"],
-    rules: Rules,
-) -> Float[Tensor, "S K L V"]:
+    rows: Float[Tensor, "S K F L"], moments: Float[Tensor, "S K V L"], rules: Rules
+) -> Float[Tensor, "S K V L"]:
     """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments."""
-    mean_x, mean_y, u0, u1, u2 = (table[places, f] for f in range(TABLE - 1))
-    x, y = mean_x - centre[:, 0], mean_y - centre[:, 1]
+    x, y, u0, u1, u2 = shapes_of(rows, rules)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
     one, mx, my, mxx, mxy, myy, *others = moments.unbind(2)
     by_k0, by_k1 = -2 * (u0 * mx + u1 * my + k0 * one), -2 * (u2 * my + k1 * one)
     by_u0 = -2 * (u0 * mxx + u1 * mxy + k0 * mx) - x * by_k0
     by_u1 = -2 * (u0 * mxy + u1 * myy + k0 * my) - y * by_k0
     by_u2 = -2 * (u2 * myy + k1 * my) - y * by_k1
-    return torch.stack([-u0 * by_k0, -u1 * by_k0 - u2 * by_k1, by_u0, by_u1, by_u2, one, *others], -1)
+    return torch.stack([-u0 * by_k0, -u1 * by_k0 - u2 * by_k1, by_u0, by_u1, by_u2, one, *others], 2)
 
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-ONE_LOOP: dict[str, str | int | bool] = {
-    "max_fusion_size": 4096,
-    "cpp.max_horizontal_fusion_size": 4096,
-    "cpp.enable_floating_point_contract_flag": "fast",
-    "cpp.dynamic_threads": True,
-}
-"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
-SHARING = {"blend": 30, "fade": 30, "slopes": 50, "moments": 50}
+SHARING = {"blend": 30, "fade": 30, "moments": 50}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
@@ -296,8 +311,7 @@ class Kernels:
 
     blend: Callable[..., None]
     fade: Callable[..., Tensor]
-    slopes: Callable[..., tuple[Tensor, Tensor]]
-    moments: Callable[..., Tensor]
+    moments: Callable[..., None]
     make_rows: Callable[..., Tensor]
     entry_gradients: Callable[..., Tensor]
 
@@ -305,15 +319,14 @@ class Kernels:
 @functools.lru_cache
 def kernels(rules: Rules) -> Kernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (blend, fade, slopes, moments, make_rows, entry_gradients)
+    loops = (blend, fade, moments, make_rows, entry_gradients)
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
-    """`loop` of these rules through torch.compile, as code of its own: torch counts compilations by code."""
-    own = types.FunctionType(loop.__code__.replace(), loop.__globals__, loop.__name__, argdefs=(rules,))
+    """`loop` of these rules through torch.compile."""
     sharing = SHARING.get(loop.__name__, 50)
-    options: dict[str, Any] = ONE_LOOP | {
+    options: dict[str, Any] = WHOLE_LOOPS | {
         "realize_opcount_threshold": sharing,
         "realize_cpu_opcount_threshold": sharing,
     }
@@ -322,10 +335,10 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
         # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one, and 32-bit
         # indices suffice (RasterSettings.compiled_values)
         options["guard_filter_fn"] = lambda guards: [guard.guard_type != "SHAPE_ENV" for guard in guards]
-    return first_sizes_free(torch.compile(own, fullgraph=True, options=options), varying)
+    return sizes_free(torch.compile(with_last(loop, rules), fullgraph=True, options=options), varying)
 
 
-def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[Tensor]:
+def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
     """Blocks vary in number, and splats; pixels and products (at most three dimensions ending in one) do not."""
     tensors = [tensor for argument in arguments for tensor in (argument if isinstance(argument, list) else [argument])]
-    return [tensor for tensor in tensors if tensor.shape[-1] > 1]
+    return [(tensor, 0) for tensor in tensors if tensor.shape[-1] > 1]

@@ -17,10 +17,11 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.available import compile_rows, compiles
+from gsx.core.compiling import compile_rows
 from gsx.core.rasterizer.composite import sum_by_splat
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections
+from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
@@ -77,7 +78,8 @@ def axes(covariances: Float[Tensor, "M 3"], conic_factors: Float[Tensor, "M 3"])
     xx, xy, yy = covariances.unbind(1)
     longer = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
     shorter = yy / longer / (2 * conic_factors[:, 0].square())
-    angle = torch.atan2(2 * xy, xx - yy) / 2
+    # in float32 torch's atan2 depends on where a number lies in memory, and crops have other lists of splats
+    angle = torch.atan2(2 * xy.double(), xx.double() - yy.double()).to(xy) / 2
     sigmas = torch.stack([longer, shorter], 1).sqrt().clamp_min(LEAST_SIGMA)
     return torch.cat([angle.cos()[:, None], angle.sin()[:, None], sigmas], 1)
 

@@ -9,18 +9,16 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from gsx.core.compiling import compile_rows
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.available import compile_rows, compiles
 from gsx.core.rasterizer.geometry import geometry
+from gsx.core.rasterizer.path import compiles, learns_compiled
+from gsx.core.rasterizer.selection import lens_of, selected, slope_bounds
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
-OPACITY_SLACK = 1e-3
-"""ln of an opacity may exceed 0 by this, for rounding."""
-SQUARABLE = 0.4
-"""Lengths in px stay below this power of their dtype's largest number: 3e15 in float32."""
 FOCAL_LIMIT = 1e12
 """No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
 Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
@@ -29,7 +27,7 @@ Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScreenSplats:
-    """M splats in front of the camera. Positions in pixels of the camera's frame, pixel centres at +0.5."""
+    """M splats that the camera may show. Positions in pixels of the camera's frame, pixel centres at +0.5."""
 
     ids: Int[Tensor, "M"]
     """Row of the splat in the input."""
@@ -59,16 +57,6 @@ def on_frame(intrinsics: Float[Tensor, "4"], frame: Frame) -> Float[Tensor, "4"]
     return intrinsics + intrinsics.new_tensor([0, 0, frame.left, frame.top])
 
 
-def slope_bounds(
-    intrinsics: Float[Tensor, "4"], frame: Frame, margin: float
-) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
-    """Smallest and largest (x/z, y/z) over the frame widened by `margin` half-extents: asymmetric off centre."""
-    focal, centre = intrinsics[:2], intrinsics[2:]
-    size = intrinsics.new_tensor([frame.width, frame.height])
-    extra = margin * size / (2 * focal)
-    return -centre / focal - extra, (size - centre) / focal + extra
-
-
 @torch.no_grad()
 def steepest_slope(intrinsics: Float[Tensor, "4"], frame: Frame, margin: float) -> Float[Tensor, ""]:
     """Largest |x/z| or |y/z| within the bounds."""
@@ -91,72 +79,45 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
 
 
 @torch.no_grad()
-def usable(splats: Splats) -> Bool[Tensor, "N"]:
-    """False for splats with a value that is not finite (an opacity of 0, ln -inf, is fine) or an opacity above 1."""
-    total = splats.means.sum(1) + splats.scales.sum(1) + splats.quats.sum(1) + splats.colours.sum(1)
-    return torch.isfinite(total) & (splats.log_opacities <= OPACITY_SLACK)
-
-
-@torch.no_grad()
-def in_range(
-    splats: Splats, points: Float[Tensor, "N 3"], intrinsics: Float[Tensor, "4"], frame: Frame, margin: float
-) -> Bool[Tensor, "N"]:
-    """Splats before the camera whose mean and axes in px can be squared in their dtype, as can 1 / depth."""
-    largest = torch.finfo(splats.means.dtype).max
-    x, y, z = points.abs().unbind(1)
-    size = splats.scales.abs().amax(1).clamp_min(1).double() * (1 + steepest_slope(intrinsics, frame, margin))
-    fits = size.maximum(x).maximum(y) * intrinsics[:2].amax() < largest**SQUARABLE * z
-    return fits & (x.maximum(y).maximum(z) <= largest)
-
-
-@torch.no_grad()
-def sound(
-    splats: Splats, points: Float[Tensor, "N 3"], intrinsics: Float[Tensor, "4"], camera: Camera, margin: float
-) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """(splats beyond the near plane, splats of which nothing is out of range). A depth that rounds to the near plane is
-    not beyond it."""
-    in_front = points[:, 2].to(splats.means) > camera.near
-    return in_front, usable(splats) & (in_range(splats, points, intrinsics, camera.frame, margin) | ~in_front)
-
-
-@torch.no_grad()
 def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
     """False for the splats that a render from this camera leaves out and counts as dropped."""
     intrinsics = on_frame(intrinsics_of(camera, None), camera.frame).to(splats.means.device)
-    return sound(splats, camera.to_camera(splats.means), intrinsics, camera, settings.jacobian_margin)[1]
+    numbers = lens_of(camera, intrinsics, settings.dilation, settings)
+    return selected(splats, camera.to_camera(splats.means), numbers, compiled=False)[0]
 
 
 def project(
     splats: Splats, camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
 ) -> ScreenSplats:
-    """The usable splats in front of the near plane as the camera sees them; differentiable in every input.
+    """The usable splats in front of the near plane that the camera may show; differentiable in every input.
 
     `intrinsics` (fx, fy, cx, cy) take the place of the camera's own, in px of its raster.
 
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
-    margin, intrinsics = settings.jacobian_margin, intrinsics_of(camera, intrinsics)
-    refuse_unusable(camera, intrinsics, margin)
+    intrinsics = intrinsics_of(camera, intrinsics)
+    refuse_unusable(camera, intrinsics, settings.jacobian_margin)
     intrinsics = on_frame(intrinsics, camera.frame).to(splats.means.device)
+    compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
+    dilation, drawn = settings.dilation, 0.0
+    if not settings.published_dilation:
+        dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
     points = camera.to_camera(splats.means)
-    in_front, good = sound(splats, points, intrinsics, camera, margin)  # selecting comes before any division
-    ids = (good & in_front).nonzero()[:, 0]
+    good, shown = selected(splats, points, lens_of(camera, intrinsics, dilation, settings), compiled)
+    ids = shown.nonzero()[:, 0]  # selecting comes before any division
     points, scales, quats, log_opacities, channels = (
         take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     )
-    low, high = slope_bounds(intrinsics, camera.frame, margin)
-    rotation = camera.rotation.to(scales)
-    drawn, rules = 0.0, tuple[Any, ...]((settings.dilation, settings.compensate))
+    rules = tuple[Any, ...]((dilation, settings.compensate))
     if not settings.published_dilation:  # numbers that differ from camera to camera are no constants of compiled code
-        dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
         rules = scales.new_tensor(dilation), False, scales.new_tensor(drawn) if drawn else None
-    worthwhile = len(ids) > 1 and torch.is_grad_enabled() and compiles(settings, ids.device.type)
-    compute = (
-        compiled_geometry(settings.published_dilation, settings.compensate, bool(drawn)) if worthwhile else geometry
-    )
+    low, high = slope_bounds(intrinsics, camera.frame, settings.jacobian_margin)
+    compute = geometry
+    if len(ids) > 1 and learns_compiled(settings, ids.device.type):
+        compute = compiled_geometry(settings.published_dilation, settings.compensate, bool(drawn))
     means, covariances, conic_factors, compensation = compute(
-        points, scales, quats, rotation, intrinsics, low.to(scales), high.to(scales), *rules
+        points, scales, quats, camera.rotation.to(scales), intrinsics, low.to(scales), high.to(scales), *rules
     )
     if drawn and compensation is not None:  # nothing becomes more opaque than alpha_max by it
         most = log_opacities.clamp_min(math.log(settings.alpha_max))

@@ -20,7 +20,7 @@ from gsx.core.shapes import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScreenStatistics:
-    """What happened to the M splats in front of the camera; gradients are there after the backward pass."""
+    """What happened to the M splats that the camera may show; gradients are there after the backward pass."""
 
     ids: Int[Tensor, "M"]
     """Row of the splat in the input."""

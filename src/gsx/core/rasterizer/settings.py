@@ -6,6 +6,8 @@ from typing import Annotated
 
 from gsx.core.ranges import Count, Range, Share, Steps
 
+CUTOFF_SLACK = 1e-3
+"""Added to ln(alpha / alpha_min) when tiles are chosen, so that rounding never drops a pixel at the cut-off."""
 WINDOW_TILE = 16
 """Tile edge of the published rasterizer: its 3-sigma windows are whole numbers of these (3D-GS, forward.cu)."""
 

@@ -5,7 +5,8 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.intersections import on_raster, published_radii, published_windows, three_sigma
+from gsx.core.rasterizer.boxes import three_sigma
+from gsx.core.rasterizer.intersections import boxes_of
 from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float
@@ -40,8 +41,7 @@ def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], q
 def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple[ScreenSplats, Bool[Tensor, "M"]]:
     """(splats beyond the near plane, those of them whose published square's tiles touch the raster)."""
     screen = project(splats, camera, settings)
-    first, last = published_windows(screen.means, published_radii(screen.covariances), camera.frame)
-    return screen, on_raster(first, last, camera)
+    return screen, boxes_of(screen, camera, settings).radii > 0
 
 
 @torch.no_grad()
@@ -59,4 +59,4 @@ def undilated_radii(
     screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
     dilation, _ = settings.dilation_at(camera.focal)
     undilated = screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])
-    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(undilated))
+    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(*undilated.unbind(1)))

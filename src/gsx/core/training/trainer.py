@@ -15,7 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
-from gsx.core.rasterizer import Rendering, rasterize
+from gsx.core.rasterizer import Rendering, learns_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
@@ -111,7 +111,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
-    loss = photometric(blacked(rendering.image, counted), target, run.training.ssim_weight)
+    compiled = learns_compiled(run.raster, run.device.type)
+    loss = photometric(blacked(rendering.image, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsx.core.allocator import keep_freed_memory
 from gsx.core.cache import cache_root
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
@@ -80,6 +81,7 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
+        keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
     torch.manual_seed(general.seed)

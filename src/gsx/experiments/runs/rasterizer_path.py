@@ -8,11 +8,12 @@ from threading import Thread
 
 import torch
 
+from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
-from gsx.core.rasterizer.available import available, compiles
+from gsx.core.rasterizer.path import compiles
 
 logger = logging.getLogger(__name__)
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from gsx.core.compiling import available, complaint
 from gsx.core.errors import InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.rasterizer.available import available, complaint
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.trade.rasterizer.bench import EXACT, Bench, Check, Times, check_truth, reason
 from gsx.experiments.trade.rasterizer.knobs import Row, Trial, combinations, ordered, single_changes

@@ -1,0 +1,68 @@
+"""Whether anything can be compiled on this machine, and compiling for sizes that vary."""
+
+import functools
+import types
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+WHOLE_LOOPS: dict[str, str | int | bool] = {
+    "max_fusion_size": 4096,
+    "cpp.max_horizontal_fusion_size": 4096,
+    "cpp.enable_floating_point_contract_flag": "fast",
+    "cpp.dynamic_threads": True,
+}
+"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
+
+
+@functools.lru_cache
+def complaint(device: str) -> str:
+    """Why nothing can be compiled for this device; empty where it can. Asked by compiling two operations."""
+    try:
+        torch.compile(lambda x: 2 * x + 1, fullgraph=True)(torch.zeros(32, device=device))
+    except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return ""
+
+
+def available(device: str = "cpu") -> bool:
+    """Whether the compiled path works on this machine."""
+    return not complaint(device)
+
+
+def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
+    """`function` with these values of its last arguments, as code of its own: torch counts compilations by code."""
+    code = function.__code__.replace()  # type: ignore[attr-defined]
+    return types.FunctionType(code, function.__globals__, function.__name__, values or function.__defaults__)  # type: ignore[attr-defined]
+
+
+def compile_rows(function: Callable[..., Any], *last: Any) -> Callable[..., Any]:
+    """`function` through torch.compile, once for any number of rows, with these values of its last arguments.
+
+    Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
+    compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
+    """
+
+    def varying(arguments: tuple[Any, ...]) -> list[tuple[Tensor, int]]:
+        rows = len(arguments[0])
+        return [(a, 0) for a in arguments if isinstance(a, Tensor) and a.dim() > 0 and len(a) == rows]
+
+    return sizes_free(torch.compile(with_last(function, *last)), varying)
+
+
+def sizes_free(
+    compiled: Callable[..., Any], varying: Callable[[tuple[Any, ...]], Iterable[tuple[Tensor, int]]]
+) -> Callable[..., Any]:
+    """Tells torch at the first call which sizes (tensor, axis) vary, so that one compilation serves all."""
+    marked: list[bool] = []
+
+    def call(*arguments: Any) -> Any:
+        if not marked:
+            marked.append(True)
+            for tensor, axis in varying(arguments):
+                torch._dynamo.maybe_mark_dynamic(tensor, axis)
+        return compiled(*arguments)
+
+    return call

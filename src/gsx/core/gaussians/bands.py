@@ -1,0 +1,43 @@
+"""Spherical harmonics of directions, compiled or not, with the signs of 3D-GS (3D-GS, sh_utils.py)."""
+
+import functools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsx.core.compiling import compile_rows
+from gsx.core.shapes import Float
+
+BAND_0 = 0.28209479177387814
+BAND_1 = 0.4886025119029199
+BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def bands(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
+    """Y_1 .. Y_B of unit directions by their components, B = (degree + 1)^2 - 1."""
+    values = [-BAND_1 * y, BAND_1 * z, -BAND_1 * x]
+    if degree >= 2:
+        a, b, c = BAND_2
+        values += [a * x * y, -a * y * z, b * (2 * z * z - x * x - y * y), -a * x * z, c * (x * x - y * y)]
+    if degree >= 3:
+        a, b, c, d, e = BAND_3
+        xx, yy, zz = x * x, y * y, z * z
+        values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
+        values += [d * z * (2 * zz - 3 * xx - 3 * yy)]
+        values += [-c * x * (4 * zz - xx - yy), e * z * (xx - yy), -a * x * (xx - 3 * yy)]
+    return values
+
+
+def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "B N"]:
+    """`harmonics` of offsets of any length, a row for each band."""
+    x, y, z = offsets.unbind(1)
+    shrink = (x * x + y * y + z * z).sqrt().clamp_min(1e-12).reciprocal()
+    return torch.stack(bands(x * shrink, y * shrink, z * shrink, degree))
+
+
+@functools.lru_cache
+def compiled_harmonics(degree: int) -> Callable[..., Tensor]:
+    """`harmonics_along` and its backward through torch.compile, for any number of offsets."""
+    return compile_rows(harmonics_along, degree)

@@ -1,0 +1,160 @@
+"""Tiles that splats may reach, splat by splat and row of tiles by row, compiled or not. Nothing here is differentiated.
+
+Numbers of one splat lie in columns (see geometry.py); a box is (first, past the last) tile along an axis.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsx.core.compiling import compile_rows, sizes_free, with_last
+from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
+from gsx.core.shapes import Float, Int
+
+FAR = 1 << 20
+"""Pixels and tiles farther out than any raster; keeps integers in range."""
+
+
+def three_sigma(xx: Float[Tensor, "M"], xy: Float[Tensor, "M"], yy: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
+    """3 sqrt(lambda_max) of covariances with the published floor of 0.1 under the inner root (3D-GS, forward.cu)."""
+    half = (xx - yy) / 2
+    return 3 * ((xx + yy) / 2 + (half * half + xy * xy).clamp_min(0.1).sqrt()).sqrt()
+
+
+def window(
+    mean: Float[Tensor, "M"], radius: Float[Tensor, "M"], tiles: Int[Tensor, ""]
+) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
+    """First and past-the-last pixel along an axis of the 16 px tiles that 3D-GS assigns to a splat; `tiles`: how many
+    the frame has (3D-GS, forward.cu)."""
+    corner = mean - 0.5  # the published mean is relative to integer pixel positions
+    edges = (corner - radius, corner + radius + (WINDOW_TILE - 1))
+    first, last = ((edge / WINDOW_TILE).nan_to_num().clamp(0, FAR).int().minimum(tiles) for edge in edges)
+    return WINDOW_TILE * first, WINDOW_TILE * last
+
+
+def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
+    """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
+    pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
+    return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
+
+
+def box(
+    mean: Float[Tensor, "M"],
+    variance: Float[Tensor, "M"],
+    limit: Float[Tensor, "M"],
+    begin: Int[Tensor, ""],
+    end: Int[Tensor, ""],
+    tile: int,
+    reach: float,
+) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
+    """First and past-the-last tile of a splat's bounding box along an axis, on the frame, cut to the raster's."""
+    half = (2 * limit.clamp_min(0) * variance).sqrt() + reach
+    first = touched(mean - half, tile).maximum(begin)
+    last = touched(mean + half, tile, past=True).minimum(end)
+    return first, torch.where(limit >= 0, last, first).maximum(first)
+
+
+def boxes(
+    means: Float[Tensor, "M 2"],
+    covariances: Float[Tensor, "M 3"],
+    log_opacities: Float[Tensor, "M"],
+    raster: Int[Tensor, "2 5"],
+    alpha_min: float,
+    tile: int,
+    reach: float,
+    windowed: bool,
+) -> tuple[
+    Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"]
+]:
+    """(first column, first row, past the last column, past the last row, published radius or 0, limit of s^2 + r^2) of
+    every splat.
+
+    `raster` holds for either axis: 16 px tiles of the frame, first and past-the-last pixel of the raster, first and
+    past-the-last tile. `windowed`: a splat reaches only the 16 px tiles of its 3-sigma square.
+    """
+    (xx, xy, yy), limit = covariances.unbind(1), log_opacities - math.log(alpha_min) + CUTOFF_SLACK
+    radius, seen, edges = three_sigma(xx, xy, yy).ceil(), None, []
+    for mean, variance, numbers in zip(means.unbind(1), (xx, yy), raster.unbind(), strict=True):
+        tiles, first_pixel, past_pixel, begin, end = numbers.unbind()
+        first, last = box(mean, variance, limit, begin, end, tile, reach)
+        left, right = window(mean, radius, tiles)
+        if windowed:
+            first = first.maximum(left // tile)
+            last = last.minimum(right // tile).maximum(first)
+        shared = right.minimum(past_pixel) > left.maximum(first_pixel)
+        seen = shared if seen is None else seen & shared
+        edges.append((first, last))
+    radii = torch.where(seen, radius, 0.0).nan_to_num().clamp_max(FAR).int()
+    (first_column, last_column), (first_row, last_row) = edges
+    return first_column, first_row, last_column, last_row, radii, limit
+
+
+def row_spans(
+    mean_x: Float[Tensor, "R"],
+    mean_y: Float[Tensor, "R"],
+    factor: tuple[Float[Tensor, "R"], Float[Tensor, "R"], Float[Tensor, "R"]],
+    limit: Float[Tensor, "R"],
+    row: Int[Tensor, "R"],
+    tile: int,
+    reach: float = 0.0,
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """First and past-the-last column (counted on the frame) at which the ellipse s^2 + r^2 <= limit meets a tile row,
+    or comes as near to its outermost pixel centres as `reach` px.
+
+    Exact: the part of an ellipse between two lines is convex, so its tiles on the row are those of its x-interval.
+    """
+    u0, u1, u2 = factor
+    top = row * tile + (0.5 - reach) - mean_y
+    height = limit.sqrt() / u2
+    low, high = top.maximum(-height), (top + (tile - 1 + 2 * reach)).minimum(height)
+    rightmost = -u1 * height * torch.rsqrt(u1 * u1 + u2 * u2)
+
+    def half_width(y: Tensor) -> Tensor:
+        return (limit - (u2 * y).square()).clamp_min(0).sqrt()
+
+    at_right, at_left = rightmost.maximum(low).minimum(high), (-rightmost).maximum(low).minimum(high)
+    right = mean_x + (half_width(at_right) - u1 * at_right) / u0
+    left = mean_x - (half_width(at_left) + u1 * at_left) / u0
+    first, last = touched(left - reach, tile), touched(right + reach, tile, past=True)
+    return first, torch.where(low <= high, last, first)
+
+
+def spans(
+    rank: Int[Tensor, "R"],
+    shapes: Float[Tensor, "6 V"],
+    sides: Int[Tensor, "3 V"],
+    starts: Int[Tensor, "V"],
+    tile: int,
+    reach: float,
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """(tile row, first column, number of columns) of every row of tiles of V splats; `rank`: its splat.
+
+    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column; `starts`: number
+    of a splat's first row in the list.
+    """
+    mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind())
+    top, left, right = (column[rank] for column in sides.unbind())
+    place = torch.arange(rank.shape[0], device=rank.device)
+    row = top + (place - starts[rank]).int()
+    begin, end = row_spans(mean_x, mean_y, (u0, u1, u2), limit, row, tile, reach)
+    begin, end = begin.maximum(left), end.minimum(right)
+    return row, begin, (end - begin).clamp_min(0).long()
+
+
+@functools.lru_cache
+def compiled_boxes(alpha_min: float, tile: int, reach: float, windowed: bool) -> Callable[..., tuple[Tensor, ...]]:
+    """`boxes` of these rules through torch.compile, for any number of splats and any raster."""
+    return compile_rows(boxes, alpha_min, tile, reach, windowed)
+
+
+@functools.lru_cache
+def compiled_spans(tile: int, reach: float) -> Callable[..., tuple[Tensor, ...]]:
+    """`spans` of these rules through torch.compile, for any number of splats and rows."""
+
+    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
+        return [(tensor, tensor.dim() - 1) for tensor in arguments]
+
+    return sizes_free(torch.compile(with_last(spans, tile, reach)), varying)
