@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 import rasterizer as benchmark
+import step
 from gsx.core.errors import InputError
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
-from measuring import naive, rival
+from measuring import naive, rival, stages
 from measuring.adapter import settings_of
 from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, backward_bytes, evaluation_limit, forward_bytes
@@ -488,3 +489,32 @@ def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None
     lines = [{"step": step, "psnr": float(step)} for step in range(1, 101)] + [{"step": 100, "test_psnr": 1.0}]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
     assert starts.seen_in_training(tmp_path) == sum(range(91, 101)) / 10
+
+
+def test_a_stage_within_another_stops_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([0.0, 1.0, 3.0, 6.0, 6.5, 10.0])
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: next(now))
+    clock = stages.StageClock()
+    inner = clock.clocked("inner", lambda: 7)
+    with clock.stage("outer"):  # begins at 0
+        assert inner() == 7  # 1 to 3
+        inner()  # 6 to 6.5
+    assert clock.seconds == {"outer": 1 + 3 + 3.5, "inner": 2 + 0.5}
+
+
+def test_a_stage_is_slower_beyond_a_tenth_and_half_a_millisecond() -> None:
+    def row(old: float | None, now: float) -> dict[str, object]:
+        return {"backbone": "gs3d", "stage": "loss", "old": old, "ms": now}
+
+    assert step.slower([row(10.0, 10.9), row(1.0, 1.4), row(10.0, 5.0), row(None, 5.0)]) == []
+    assert step.slower([row(10.0, 11.2)]) == ["gs3d, loss: 10.0 ms before, 11.2 now"]
+
+
+def test_least_times_of_stages_by_hand() -> None:
+    limits = [Limit("copy", 1e9, "B/s"), Limit("fma", 1e10, "flop/s"), Limit("exp", 1e9, "exp/s")]
+    counts = {"primitives": 1000, "numbers": 59000, "shown": 500, "pairs": 2000, "pixels": 100}
+    least = step.least_times(counts, limits)
+    assert least["Adam"] == (pytest.approx(59000 * 28 / 1e9 * 1e3), "memory")
+    evaluations = 64 * 2000
+    forward = evaluations / 1e9 + evaluations * sum(FORWARD_FLOPS.values()) / 1e10
+    assert least["blending"] == (pytest.approx(1e3 * forward), "arithmetic")

@@ -34,8 +34,8 @@ def available(device: str = "cpu") -> bool:
 
 def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
     """`function` with these values of its last arguments, as code of its own: torch counts compilations by code."""
-    code = function.__code__.replace()  # type: ignore[attr-defined]
-    return types.FunctionType(code, function.__globals__, function.__name__, values or function.__defaults__)  # type: ignore[attr-defined]
+    code = function.__code__.replace()
+    return types.FunctionType(code, function.__globals__, function.__name__, values or function.__defaults__)
 
 
 def compile_rows(function: Callable[..., Any], *last: Any) -> Callable[..., Any]:

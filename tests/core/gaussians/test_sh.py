@@ -8,6 +8,7 @@ import torch
 from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
 
+from gsx.core.compiling import available
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
 
 R3 = 1 / math.sqrt(3)
@@ -28,6 +29,9 @@ def test_table_at_given_directions(direction: tuple[float, float, float]) -> Non
         expected[number - 1] = value
     got = harmonics(torch.tensor([direction], dtype=torch.float32), 3)[0]
     torch.testing.assert_close(got, expected, atol=2e-6, rtol=0)
+
+
+needs_compiler = pytest.mark.skipif(not available(), reason="no working compiler")
 
 
 def legendre_harmonic(band: int, order: int, directions: np.ndarray) -> np.ndarray:
@@ -131,3 +135,26 @@ def test_gradient_is_that_of_finite_differences(degree: int) -> None:
         for shape in ((5, 1, 3), (5, 15, 3), (5, 3))
     )
     assert torch.autograd.gradcheck(lambda c, *a: colours_of(c + 30, *a, degree), (constant, rest, offsets))  # above 0
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_a_splat_at_the_camera_has_a_finite_gradient(compiled: bool) -> None:
+    constant, rest, offsets = coefficients()
+    offsets[4] = 0
+    offsets.requires_grad_()
+    colours_of(constant, rest, offsets, 3, compiled).sum().backward()
+    assert offsets.grad is not None
+    assert torch.isfinite(offsets.grad).all()
+
+
+@needs_compiler
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_compiled_colours_and_their_gradients_are_the_eager_ones(degree: int) -> None:
+    found = []
+    for compiled in (False, True):
+        leaves = [value.clone().requires_grad_() for value in coefficients(seed=3)]
+        colours = colours_of(*leaves, degree, compiled)
+        (colours * torch.linspace(0.5, 2, 27).view(9, 3)).sum().backward()
+        found.append([colours.detach(), *(leaf.grad for leaf in leaves)])
+    for eager, fast in zip(*found, strict=True):
+        torch.testing.assert_close(fast, eager, rtol=1e-5, atol=1e-5)

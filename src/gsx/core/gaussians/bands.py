@@ -33,7 +33,7 @@ def bands(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
 def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "B N"]:
     """`harmonics` of offsets of any length, a row for each band."""
     x, y, z = offsets.unbind(1)
-    shrink = (x * x + y * y + z * z).sqrt().clamp_min(1e-12).reciprocal()
+    shrink = (x * x + y * y + z * z).clamp_min(1e-24).rsqrt()
     return torch.stack(bands(x * shrink, y * shrink, z * shrink, degree))
 
 

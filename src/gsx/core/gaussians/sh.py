@@ -11,7 +11,8 @@ from gsx.core.shapes import Float
 
 def harmonics(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]:
     """Y_1 .. Y_B of unit directions, B = (degree + 1)^2 - 1: everything but the constant band. `degree` is 1..3."""
-    return torch.stack(bands(*directions.unbind(1), degree), 1)
+    x, y, z = directions.unbind(1)
+    return torch.stack(bands(x, y, z, degree), 1)
 
 
 class Contraction(torch.autograd.Function):

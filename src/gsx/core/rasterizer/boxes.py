@@ -76,7 +76,8 @@ def boxes(
     past-the-last tile. `windowed`: a splat reaches only the 16 px tiles of its 3-sigma square.
     """
     (xx, xy, yy), limit = covariances.unbind(1), log_opacities - math.log(alpha_min) + CUTOFF_SLACK
-    radius, seen, edges = three_sigma(xx, xy, yy).ceil(), None, []
+    radius, edges = three_sigma(xx, xy, yy).ceil(), []
+    seen = torch.ones_like(radius, dtype=torch.bool)
     for mean, variance, numbers in zip(means.unbind(1), (xx, yy), raster.unbind(), strict=True):
         tiles, first_pixel, past_pixel, begin, end = numbers.unbind()
         first, last = box(mean, variance, limit, begin, end, tile, reach)
@@ -84,8 +85,7 @@ def boxes(
         if windowed:
             first = first.maximum(left // tile)
             last = last.minimum(right // tile).maximum(first)
-        shared = right.minimum(past_pixel) > left.maximum(first_pixel)
-        seen = shared if seen is None else seen & shared
+        seen = seen & (right.minimum(past_pixel) > left.maximum(first_pixel))
         edges.append((first, last))
     radii = torch.where(seen, radius, 0.0).nan_to_num().clamp_max(FAR).int()
     (first_column, last_column), (first_row, last_row) = edges

@@ -144,5 +144,6 @@ def selected(
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
     """What `select` says of splats."""
     fields = (splats.means, splats.scales, splats.quats, splats.log_opacities, splats.colours)
-    rows = (value.detach() for value in (points, *fields))
-    return (compiled_select() if compiled else select)(*rows, numbers)
+    points, means, scales, quats, log_opacities, colours = (value.detach() for value in (points, *fields))
+    choose = compiled_select() if compiled else select
+    return choose(points, means, scales, quats, log_opacities, colours, numbers)

@@ -1,0 +1,182 @@
+"""Where a training step's time goes, stage by stage, and whether a stage has become slower (docs/architecture.md).
+
+    python benchmarks/step.py [--scenes FOLDER] [--backbones gs3d,octree_scaffold]
+    python benchmarks/step.py --against REVISION
+
+Runs of the built-in scene, or of `fox` in FOLDER at a quarter, are trained once below --runs; then steps from their
+last state are taken over and over, each stage on its own clock. `--against` measures another revision of the source in
+turn, in processes of their own, and exits with 1 where a stage takes more than 10 % longer. Nothing else should run.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+
+from measuring.limits import BACKWARD_FLOPS, FLOAT, FORWARD_FLOPS, Limit, best, measured_limits, sizes_of
+from measuring.machine import ROOT, describe_machine, shown_command, told_load
+from measuring.results import Section, stamped, text_table, write_results
+from measuring.runs import train
+from measuring.stages import told_stages
+
+RESULTS = Path(__file__).parent / "results"
+BACKBONES = ("gs3d", "mip_splatting", "octree_gs3d", "scaffold", "octree_scaffold")
+SLOWER, LEAST = 1.1, 0.5
+"""A stage has become slower when it takes this many times as long, and this many ms longer."""
+ROUNDS = 3
+"""Processes of each revision, in turn."""
+COLUMNS = [
+    *(["backbone", "backbone"], ["stage", "stage"], ["ms", "ms"], ["share", "of the step"]),
+    *(["least", "least ms"], ["bound", "bound by"], ["old", "before, ms"], ["ratio", "before / now"]),
+]
+NOTE = (
+    "Median over steps of a stage's own time, density control left out; of processes in turn where two revisions are "
+    "compared. Least: what memory traffic that cannot be avoided, or arithmetic, takes at the machine's best."
+)
+
+
+def arguments(words: Sequence[str]) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser.add_argument("--backbones", default=",".join(BACKBONES), help="by commas")
+    parser.add_argument("--steps", type=int, default=30, help="steps of each process")
+    parser.add_argument("--against", default="", help="a revision to compare with")
+    parser.add_argument("--runs", type=Path, default=Path("outputs/step"), help="where the runs are kept")
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
+    parser.add_argument("--stages-of", type=Path, default=None, help="print the stages of this run, as JSON")
+    return parser.parse_args(words)
+
+
+def subject(backbone: str, given: argparse.Namespace) -> Path:
+    """The run whose steps are measured."""
+    words = ["scene=demo", "iterations=600"]
+    if given.scenes:
+        words = ["scene=colmap", f"scene.path={given.scenes / 'fox'}", "scene.downscale=4", "iterations=1500"]
+    folder = given.runs / f"{'fox' if given.scenes else 'demo'}_{backbone}"
+    chosen = [f"backbone={backbone}", *(["backbone.capacity=published"] if "scaffold" not in backbone else [])]
+    train(folder, [*words, *chosen, "rasterizer=compiled"], log=folder.with_name(f"{folder.name}.log"))
+    return folder
+
+
+def stages_by(source: Path, run: Path, steps: int) -> dict[str, Any]:
+    """What a process with that source measures."""
+    command = [sys.executable, __file__, "--stages-of", str(run), "--steps", str(steps)]
+    environment = os.environ | {"PYTHONPATH": str(source)}
+    done = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@contextmanager
+def checked_out(revision: str) -> Iterator[Path]:
+    """The source of a revision, for a while."""
+    with TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        subprocess.run(["git", "-C", str(ROOT), "worktree", "add", "--detach", str(tree), revision], check=True)
+        try:
+            link = tree / "src" / "gsx" / "conf"
+            if not link.exists():
+                link.symlink_to(tree / "conf")
+            yield tree / "src"
+        finally:
+            subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(tree)], check=True)
+
+
+def least_times(counts: Mapping[str, float], limits: Sequence[Limit]) -> dict[str, tuple[float, str]]:
+    """(ms that a stage takes at least, what binds it) of the stages of free Gaussians of degree 3."""
+    bytes_, flops = best(list(limits), "B/s"), best(list(limits), "flop/s")
+    n, m, pairs, pixels = (counts[name] for name in ("primitives", "shown", "pairs", "pixels"))
+    evaluations = 64 * pairs
+    moved = {
+        "splats": FLOAT * n * (59 + 14),
+        "projection": FLOAT * (n * 14 + m * (14 + 14)),
+        "tiles": FLOAT * m * 7 + pairs * 4 * 8,
+        "lists": pairs * 3 * FLOAT,
+        "backward, but for blending": FLOAT * (m * (14 + 14) + n * (14 + 2 * 59)),
+        "Adam": FLOAT * 7 * counts["numbers"],
+    }
+    exp = evaluations / best(list(limits), "exp/s")
+    computed = {
+        "blending": exp + evaluations * sum(FORWARD_FLOPS.values()) / flops,
+        "blending, backward": exp + evaluations * sum(BACKWARD_FLOPS.values()) / flops,
+        "loss": 3 * pixels * 8 * 2 * 22 / flops,
+    }
+    by_memory = {name: (1e3 * size / bytes_, "memory") for name, size in moved.items()}
+    return by_memory | {name: (1e3 * seconds, "arithmetic") for name, seconds in computed.items()}
+
+
+def rows_of(
+    backbone: str, given: argparse.Namespace, limits: Sequence[Limit], old: Path | None
+) -> list[dict[str, Any]]:
+    """A row for each stage of a backbone's step, the longest first."""
+    run, sources = subject(backbone, given), [ROOT / "src", *([old] if old else [])]
+    found: list[list[dict[str, Any]]] = [[] for _ in sources]
+    for _ in range(ROUNDS):
+        for several, source in zip(found, sources, strict=True):
+            several.append(stages_by(source, run, given.steps))
+    now, *before = (medians([one["milliseconds"] for one in several]) for several in found)
+    least = least_times(found[0][0]["counts"], limits) if backbone in ("gs3d", "mip_splatting") else {}
+    rows = []
+    for stage, spent in sorted(now.items(), key=lambda item: -item[1]):
+        row = {"backbone": backbone, "stage": stage, "ms": spent, "share": f"{spent / now['step']:.2f}"}
+        row |= dict(zip(("least", "bound"), least.get(stage, (None, None)), strict=True))
+        if before:
+            row |= {"old": before[0].get(stage), "ratio": before[0].get(stage, 0.0) / spent if spent else None}
+        rows.append(row)
+    return rows
+
+
+def medians(several: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Over processes, by stage."""
+    return {name: statistics.median(each.get(name, 0.0) for each in several) for name in several[0]}
+
+
+def slower(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Stages that take longer than before."""
+    found = [row for row in rows if row.get("old") and row["ms"] > max(SLOWER * row["old"], row["old"] + LEAST)]
+    return [f"{row['backbone']}, {row['stage']}: {row['old']:.1f} ms before, {row['ms']:.1f} now" for row in found]
+
+
+def measured(given: argparse.Namespace, command: str) -> Section:
+    """The table."""
+    load, device = told_load(), torch.device("cpu")
+    limits = measured_limits(device, sizes_of(device, False), True)
+    with checked_out(given.against) if given.against else no_source() as old:
+        rows = [row for name in given.backbones.split(",") for row in rows_of(name, given, limits, old)]
+    notes = [NOTE, *([f"Before: revision {given.against}."] if given.against else [])]
+    title = f"Stages of a training step, {'fox at a quarter' if given.scenes else 'the built-in scene'}"
+    return stamped(title, COLUMNS, rows, notes, load, command)
+
+
+@contextmanager
+def no_source() -> Iterator[None]:
+    """Nothing to compare with."""
+    yield None
+
+
+def main(words: Sequence[str]) -> int:
+    """Measure, write, and say what has become slower."""
+    given = arguments(words)
+    if given.stages_of:
+        print(told_stages(given.stages_of, given.steps))
+        return 0
+    section = measured(given, shown_command(words, "benchmarks/step.py"))
+    name = "fox" if given.scenes else "demo"
+    write_results(given.to, "step_cpu", describe_machine(torch.device("cpu")), {name: section})
+    print(text_table(section))
+    found = slower(section["rows"])
+    print("\n".join(found))
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
