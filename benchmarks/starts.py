@@ -3,8 +3,8 @@
     python benchmarks/starts.py [--scenes FOLDER] [--only room,castle] [--seeds 0,1,2] [--jobs 2]
 
 The same steps of `gs3d`: published and adaptive growth, from the points of the scene, and with points where training
-views show none (`scene.fill`). FOLDER holds `fox` (COLMAP) and `castle` (photographs alone). Finished runs below --runs
-are not trained again.
+views show none (`scene.fill`); and adaptive growth for about as long as published growth takes. FOLDER holds `fox`
+(COLMAP) and `castle` (photographs alone). Finished runs below --runs are not trained again.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from capacity import ADAPTIVE, PUBLISHED, RESULTS, ZOOMS, row_of, scenes_of, trained, words_of
+from capacity import ADAPTIVE, PUBLISHED, RESULTS, SUBJECTS, ZOOMS, row_of, scenes_of, trained, words_of
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from zoom import numbers, over_seeds, told
@@ -30,8 +30,10 @@ ARMS = {
     "published, more points": (PUBLISHED, "scene.fill"),
     "adaptive": (ADAPTIVE,),
     "adaptive, more points": (ADAPTIVE, "scene.fill"),
+    "adaptive, more points and steps": (ADAPTIVE, "scene.fill", "iterations"),
 }
-"""`scene.fill` by as many as FILL says."""
+"""`scene.fill` by as many as FILL says; `iterations`: a third more of them, which take about as long as published."""
+LONGER = 4 / 3
 COLUMNS = [
     *(["scene", "scene"], ["arm", "growth and start"], ["seeds", "seeds"]),
     *(column for f in ZOOMS for column in ([f"x{f}", f"x{f}"], [f"more{f}", f"x{f} - published"])),
@@ -58,9 +60,14 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
 
 def evaluation_of(scene: str, arm: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of a run, with the PSNR of its training views."""
-    wish = [f"scene.fill={FILL[scene]}" if word == "scene.fill" else word for word in ARMS[arm]]
+    told = {"scene.fill": f"scene.fill={FILL[scene]}", "iterations": ""}
+    wish = [word for word in (told.get(word, word) for word in ARMS[arm]) if word]
+    words = [*words_of(wish, scene, BACKBONE, seed, given), "training.log_every=1"]
+    if "iterations" in ARMS[arm]:
+        steps = next(int(word.partition("=")[2]) for word in SUBJECTS[scene] if word.startswith("iterations="))
+        words.append(f"iterations={round(LONGER * steps)}")
     folder = given.runs / "_".join([scene, *arm.replace(",", "").split(), str(seed)])
-    found = trained(folder, [*words_of(wish, scene, BACKBONE, seed, given), "training.log_every=1"], given)
+    found = trained(folder, words, given)
     return found | {"seen": seen_in_training(folder)}
 
 

@@ -61,7 +61,7 @@ def subject(backbone: str, given: argparse.Namespace) -> Path:
     """The run whose steps are measured."""
     words = ["scene=demo", "iterations=600"]
     if given.scenes:
-        words = ["scene=colmap", f"scene.path={given.scenes / 'fox'}", "scene.downscale=4", "iterations=1500"]
+        words = ["scene=colmap", f"scene.path={given.scenes / 'fox'}", "scene.downscale=4", "iterations=1000"]
     folder = given.runs / f"{'fox' if given.scenes else 'demo'}_{backbone}"
     chosen = [f"backbone={backbone}", *(["backbone.capacity=published"] if "scaffold" not in backbone else [])]
     train(folder, [*words, *chosen, "rasterizer=compiled"], log=folder.with_name(f"{folder.name}.log"))

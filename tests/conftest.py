@@ -9,6 +9,7 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
+os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")  # as runs do (build.py)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

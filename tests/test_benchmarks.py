@@ -483,7 +483,7 @@ def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None
 
     one = {arm: run(30.0, 33.0, 100, 10.0) for arm in starts.ARMS} | {"adaptive": run(31.5, 31.0, 40, 5.0)}
     two = {arm: run(30.4, 33.0, 100, 10.0) for arm in starts.ARMS} | {"adaptive": run(31.5, 31.0, 60, 5.0)}
-    first, _, third, _ = starts.rows_of("room", [one, two])
+    first, _, third, *_ = starts.rows_of("room", [one, two])
     assert (first["gap"], third["gap"]) == ("+3.80 ± 0.20", "+0.50 ± 0.00")
     assert (third["more1"], third["share"], third["times"]) == ("+1.30 ± 0.20", "0.50", "0.50")
     lines = [{"step": step, "psnr": float(step)} for step in range(1, 101)] + [{"step": 100, "test_psnr": 1.0}]

@@ -19,6 +19,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.regenerator import Regenerator
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import held_out_renders
@@ -87,7 +88,15 @@ def build(
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
+    # torch would compile and load programs to see which vector registers there are: the system says so
+    os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
+    own = settings.training.resolution(scene, general.iterations)
+
+    def resolution(views: Scene, iterations: int) -> Resolution:
+        """The run's own where it sees the same views for as long: reduced pictures are kept in it."""
+        same = views.train is scene.train and iterations == general.iterations
+        return own if same else settings.training.resolution(views, iterations)
 
     def anew(scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE) -> Backbone:
         context = BackboneContext(
@@ -96,7 +105,7 @@ def build(
             device=device,
             raster=raster,
             generator=generator,
-            resolution=settings.training.resolution(scene, iterations),
+            resolution=resolution(scene, iterations),
             ranks=together,
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
@@ -115,7 +124,7 @@ def build(
         backbone=backbone,
         raster=backbone.raster,
         training=settings.training,
-        resolution=settings.training.resolution(scene, general.iterations),
+        resolution=own,
         iterations=general.iterations,
         device=device,
         generator=generator,
