@@ -5,7 +5,7 @@
 
 Runs of the built-in scene, or of `fox` in FOLDER at a quarter, are trained once below --runs; then steps from their
 last state are taken over and over, each stage on its own clock. `--against` measures another revision of the source in
-turn, in processes of their own, and exits with 1 where a stage takes more than 10 % longer. Nothing else should run.
+turn, in processes of their own, and exits with 1 where a stage takes 10 % and 0.5 ms longer. Nothing else should run.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def subject(backbone: str, given: argparse.Namespace) -> Path:
         words = ["scene=colmap", f"scene.path={given.scenes / 'fox'}", "scene.downscale=4", "iterations=1000"]
     folder = given.runs / f"{'fox' if given.scenes else 'demo'}_{backbone}"
     chosen = [f"backbone={backbone}", *(["backbone.capacity=published"] if "scaffold" not in backbone else [])]
-    train(folder, [*words, *chosen, "rasterizer=compiled"], log=folder.with_name(f"{folder.name}.log"))
+    train(folder, [*words, *chosen, "rasterizer=compiled", "device=cpu"], log=folder.with_name(f"{folder.name}.log"))
     return folder
 
 
@@ -72,7 +72,7 @@ def stages_by(source: Path, run: Path, steps: int) -> dict[str, Any]:
     """What a process with that source measures."""
     command = [sys.executable, __file__, "--stages-of", str(run), "--steps", str(steps)]
     environment = os.environ | {"PYTHONPATH": str(source)}
-    done = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -115,10 +115,10 @@ def least_times(counts: Mapping[str, float], limits: Sequence[Limit]) -> dict[st
 
 
 def rows_of(
-    backbone: str, given: argparse.Namespace, limits: Sequence[Limit], old: Path | None
+    backbone: str, given: argparse.Namespace, limits: Sequence[Limit], other: Path | None
 ) -> list[dict[str, Any]]:
     """A row for each stage of a backbone's step, the longest first."""
-    run, sources = subject(backbone, given), [ROOT / "src", *([old] if old else [])]
+    run, sources = subject(backbone, given), [ROOT / "src", *([other] if other else [])]
     found: list[list[dict[str, Any]]] = [[] for _ in sources]
     for _ in range(ROUNDS):
         for several, source in zip(found, sources, strict=True):
@@ -130,7 +130,8 @@ def rows_of(
         row = {"backbone": backbone, "stage": stage, "ms": spent, "share": f"{spent / now['step']:.2f}"}
         row |= dict(zip(("least", "bound"), least.get(stage, (None, None)), strict=True))
         if before:
-            row |= {"old": before[0].get(stage), "ratio": before[0].get(stage, 0.0) / spent if spent else None}
+            old = before[0].get(stage)
+            row |= {"old": old, "ratio": old / spent if old and spent else None}
         rows.append(row)
     return rows
 

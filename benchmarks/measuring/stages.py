@@ -60,9 +60,11 @@ class StageClock:
         """Time within belongs to a stage."""
         self.turn()
         self.open.append(name)
-        yield
-        self.turn()
-        self.open.pop()
+        try:
+            yield
+        finally:
+            self.turn()
+            self.open.pop()
 
     def clocked(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """`function` as a stage."""
@@ -83,7 +85,7 @@ def install(clock: StageClock, run: Run) -> None:
             owner = getattr(owner, part)
         if hasattr(owner, last):
             made = clock.clocked(name, getattr(owner, last))
-            setattr(owner, last, staticmethod(made) if name == "blending, backward" else made)
+            setattr(owner, last, staticmethod(made) if isinstance(vars(owner)[last], staticmethod) else made)
     for name, method in METHODS.items():
         setattr(run.backbone, method, clock.clocked(name, getattr(run.backbone, method)))
 
@@ -108,7 +110,7 @@ def measure_stages(folder: Path, steps: int) -> Measured:
 
         keep_freed_memory()
     loaded, clock = plugins(), StageClock()
-    run = open_run(folder, loaded, [])[0]
+    run = open_run(folder, loaded, ["device=cpu"])[0]
     run.raster = run.backbone.raster = replace(run.raster, path="compiled")
     install(clock, run)
     views, start = cycle(range(min(VIEWS, len(run.scene.train)))), run.step

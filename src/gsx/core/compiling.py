@@ -19,16 +19,17 @@ WHOLE_LOOPS: dict[str, str | int | bool] = {
 
 @functools.lru_cache
 def complaint(device: str) -> str:
-    """Why nothing can be compiled for this device; empty where it can. Asked by compiling two operations."""
+    """Why nothing can be compiled for this device; empty where it can. Asked by compiling a few operations,
+    those of a vector library among them."""
     try:
-        torch.compile(lambda x: 2 * x + 1, fullgraph=True)(torch.zeros(32, device=device))
+        torch.compile(lambda x: 2 * x.exp() + x.log(), fullgraph=True)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return ""
 
 
 def available(device: str = "cpu") -> bool:
-    """Whether the compiled path works on this machine."""
+    """Whether torch.compile works on this machine."""
     return not complaint(device)
 
 

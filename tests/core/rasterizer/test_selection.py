@@ -1,6 +1,7 @@
 """What is left out before projection is what would have touched nothing."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ RULES = [
 CAMERAS = {
     "whole": front_camera(),
     "crop": front_camera(280, 208).crop(100, 60, 48, 40),
+    "whose rotation is twice one": replace(front_camera(), rotation=2 * front_camera().rotation),
     "beside its frame": front_camera(140, 104).crop(-20, 60, 90, 60),
 }
 

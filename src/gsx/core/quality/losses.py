@@ -4,6 +4,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from gsx.core.quality.similarity import compiled_slopes, similarity, ssim_slopes
@@ -80,6 +81,7 @@ class Photometric(torch.autograd.Function):
         return loss
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, by_loss):
         (gradient,) = ctx.saved_tensors
         return by_loss * gradient, None, None, None

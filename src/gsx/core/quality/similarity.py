@@ -21,7 +21,7 @@ def similarity(
 
 
 def ssim_slopes(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(SSIM, its slopes by the blurred image, image^2 and image target) from what `blurred` returns, each [C h w]."""
+    """(SSIM, its slopes by the blurred image, image^2 and image target) from what `blurred` returns, of any shape."""
     luminance, structure = similarity(x, y, xx, yy, xy)
     ssim, means, spreads = luminance * structure, x**2 + y**2 + C1, xx - x**2 + yy - y**2 + C2
     by_xx, by_xy = -ssim / spreads, 2 * luminance / spreads

@@ -98,10 +98,10 @@ def block_moments(
     job.loops.moments(rows, job.basis.x, job.basis.y, job.basis.products, before, behind, gradient, out)
 
 
-def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"], like: Tensor) -> Float[Tensor, "S K V L"]:
-    """Zeros for the moments of all blocks, in the format of light."""
+def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"]) -> Float[Tensor, "S K V L"]:
+    """Zeros for the moments of all blocks, in the format of their rows."""
     width = TABLE + job.rules.channels + 2 * job.rules.absolute
-    return like.new_zeros(*rows.shape[:2], width, rows.shape[3])
+    return rows.new_zeros(*rows.shape[:2], width, rows.shape[3])
 
 
 # -- chunks --------------------------------------------------------------------------------------------------------
@@ -200,7 +200,7 @@ def chunk_moments(
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, back to front; zero for blocks that were not blended."""
     behind = torch.zeros_like(kept.inside)
-    moments = room_for_moments(job, rows, kept.inside)
+    moments = room_for_moments(job, rows)
     for stage in reversed(kept.stages):
         rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
         found = take(moments, stage.blocks)
@@ -250,7 +250,7 @@ def segment_moments(
     shine = sum(channel * g for channel, g in zip(kept.contribution, seen, strict=True))
     own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
     behind = behind_blocks(kept.passed, own, job.lanes)
-    moments = room_for_moments(job, rows, kept.before)
+    moments = room_for_moments(job, rows)
     for part in parts(len(rows), job.batch):
         seen_here = [g[part] for g in seen]
         block_moments(job, rows[part], kept.before[part], behind[part], seen_here, moments[part])

@@ -46,6 +46,8 @@ class Lens(NamedTuple):
     bottom: Tensor
     deviations: Tensor
     """How many standard deviations away a splat still counts."""
+    stretch: Tensor
+    """By how much the rotation lengthens vectors: 1 but for matrices that are none."""
 
 
 def slope_bounds(
@@ -61,7 +63,7 @@ def slope_bounds(
 @torch.no_grad()
 def lens_of(
     camera: Camera, intrinsics: Float[Tensor, "4"], dilation: float, settings: RasterSettings
-) -> Float[Tensor, "15"]:
+) -> Float[Tensor, "16"]:
     """The numbers of a `Lens`; `intrinsics` count on the frame."""
     frame, around = camera.frame, max(WINDOW_TILE, settings.tile_size)
     edges = (
@@ -70,7 +72,8 @@ def lens_of(
     )
     limit = math.sqrt(2 * (OPACITY_SLACK - math.log(settings.alpha_min) + CUTOFF_SLACK))
     numbers = intrinsics.new_tensor([camera.near, dilation, *edges, max(3.0, limit)])
-    return torch.cat([intrinsics, *slope_bounds(intrinsics, frame, settings.jacobian_margin), numbers])
+    stretch = torch.linalg.norm(camera.rotation.to(intrinsics), 2).clamp_min(1)[None]
+    return torch.cat([intrinsics, *slope_bounds(intrinsics, frame, settings.jacobian_margin), numbers, stretch])
 
 
 def usable(
@@ -105,7 +108,7 @@ def near_raster(points: Float[Tensor, "N 3"], largest_scales: Float[Tensor, "N"]
     across, down = x / z, y / z
     steep_x, steep_y = across.clamp(lens.lowest_x, lens.highest_x), down.clamp(lens.lowest_y, lens.highest_y)
     stretch = (lens.fx * lens.fx) * (1 + steep_x * steep_x) + (lens.fy * lens.fy) * (1 + steep_y * steep_y)
-    trace = (largest_scales / z).square() * stretch + (2 * lens.dilation + LEAST_SPREAD)
+    trace = (largest_scales * lens.stretch / z).square() * stretch + (2 * lens.dilation + LEAST_SPREAD)
     reach = lens.deviations * trace.sqrt() + 1
     u, v = lens.fx * across + lens.cx, lens.fy * down + lens.cy
     beside = (u + reach > lens.left) & (u - reach < lens.right)
@@ -119,7 +122,7 @@ def select(
     quats: Float[Tensor, "N 4"],
     log_opacities: Float[Tensor, "N"],
     colours: Float[Tensor, "N C"],
-    numbers: Float[Tensor, "15"],
+    numbers: Float[Tensor, "16"],
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
     """(splats of which nothing is out of range, those of them that the camera may show). `points`: their means in the
     camera's frame, float64. A depth that rounds to the near plane is not beyond it."""
@@ -140,7 +143,7 @@ def compiled_select() -> Callable[..., tuple[Tensor, Tensor]]:
 
 @torch.no_grad()
 def selected(
-    splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "15"], compiled: bool
+    splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], compiled: bool
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
     """What `select` says of splats."""
     fields = (splats.means, splats.scales, splats.quats, splats.log_opacities, splats.colours)

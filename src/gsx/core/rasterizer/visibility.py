@@ -39,7 +39,7 @@ def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], q
 
 
 def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple[ScreenSplats, Bool[Tensor, "M"]]:
-    """(splats beyond the near plane, those of them whose published square's tiles touch the raster)."""
+    """(splats that the camera may show, those of them whose published square's tiles touch the raster)."""
     screen = project(splats, camera, settings)
     return screen, boxes_of(screen, camera, settings).radii > 0
 

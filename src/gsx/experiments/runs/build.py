@@ -82,6 +82,7 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
+    if training and device.type == "cpu":
         keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process

@@ -12,6 +12,7 @@ from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
+from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.path import compiles
 
@@ -34,19 +35,18 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
 
 
 def warm(settings: RasterSettings, device: torch.device) -> None:
-    """Have everything compiled before the first step, and say so."""
+    """Have the rasterizer and the loss compiled before the first step, and say so."""
     if compiles(settings, device.type):
         logger.info("compiling the rasterizer once; later runs find it on disk ...")
         logger.info("compiled in %.0f s", compile_now(settings, device))
 
 
 def compile_now(settings: RasterSettings, device: torch.device) -> float:
-    """Draw a small picture forward and backward, so that all loops get compiled; returns the seconds it took."""
+    """Learn from a small picture, so that all loops get compiled; returns the seconds it took."""
     begun = time.perf_counter()
-    splats = warm_splats(device)
-    rasterize(
-        splats, warm_camera(), replace(settings, training_focal=0.0)
-    ).image.sum().backward()  # as a camera of training
+    as_training = replace(settings, training_focal=0.0)
+    image = rasterize(warm_splats(device), warm_camera(), as_training).image
+    photometric(image, torch.zeros_like(image), 0.2, compiled=True).backward()
     return time.perf_counter() - begun
 
 
