@@ -60,8 +60,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
 
 def evaluation_of(scene: str, arm: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of a run, with the PSNR of its training views."""
-    told = {"scene.fill": f"scene.fill={FILL[scene]}", "iterations": ""}
-    wish = [word for word in (told.get(word, word) for word in ARMS[arm]) if word]
+    wish = [f"scene.fill={FILL[scene]}" if word == "scene.fill" else word for word in ARMS[arm] if word != "iterations"]
     words = [*words_of(wish, scene, BACKBONE, seed, given), "training.log_every=1"]
     if "iterations" in ARMS[arm]:
         steps = next(int(word.partition("=")[2]) for word in SUBJECTS[scene] if word.startswith("iterations="))

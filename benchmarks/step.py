@@ -15,7 +15,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +26,7 @@ from measuring.limits import BACKWARD_FLOPS, FLOAT, FORWARD_FLOPS, Limit, best, 
 from measuring.machine import ROOT, describe_machine, shown_command, told_load
 from measuring.results import Section, stamped, text_table, write_results
 from measuring.runs import train
-from measuring.stages import told_stages
+from measuring.stages import measure_stages
 
 RESULTS = Path(__file__).parent / "results"
 BACKBONES = ("gs3d", "mip_splatting", "octree_gs3d", "scaffold", "octree_scaffold")
@@ -151,24 +151,18 @@ def measured(given: argparse.Namespace, command: str) -> Section:
     """The table."""
     load, device = told_load(), torch.device("cpu")
     limits = measured_limits(device, sizes_of(device, False), True)
-    with checked_out(given.against) if given.against else no_source() as old:
+    with checked_out(given.against) if given.against else nullcontext() as old:
         rows = [row for name in given.backbones.split(",") for row in rows_of(name, given, limits, old)]
     notes = [NOTE, *([f"Before: revision {given.against}."] if given.against else [])]
     title = f"Stages of a training step, {'fox at a quarter' if given.scenes else 'the built-in scene'}"
     return stamped(title, COLUMNS, rows, notes, load, command)
 
 
-@contextmanager
-def no_source() -> Iterator[None]:
-    """Nothing to compare with."""
-    yield None
-
-
 def main(words: Sequence[str]) -> int:
     """Measure, write, and say what has become slower."""
     given = arguments(words)
     if given.stages_of:
-        print(told_stages(given.stages_of, given.steps))
+        print(json.dumps(vars(measure_stages(given.stages_of, given.steps))))
         return 0
     section = measured(given, shown_command(words, "benchmarks/step.py"))
     name = "fox" if given.scenes else "demo"

@@ -1,6 +1,5 @@
 """The stages of a training step, clocked from outside: each function's time without that of the stages within it."""
 
-import json
 import statistics
 import time
 from collections import defaultdict
@@ -138,8 +137,3 @@ def measure_stages(folder: Path, steps: int) -> Measured:
         "pixels": pixels,
     }
     return Measured(stages | {"step": whole}, counts)
-
-
-def told_stages(folder: Path, steps: int) -> str:
-    """What `measure_stages` finds, as a line of JSON."""
-    return json.dumps(vars(measure_stages(folder, steps)))

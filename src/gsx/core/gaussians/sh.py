@@ -1,10 +1,9 @@
 """Real spherical harmonics of bands 0..3 with the signs of 3D-GS (3D-GS, sh_utils.py)."""
 
-import math
-
 import torch
 from torch import Tensor
 
+from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.bands import BAND_0, bands, compiled_harmonics, harmonics_along
 from gsx.core.shapes import Float
 
@@ -56,7 +55,7 @@ def colours_of(
     if degree > 0:
         count = (degree + 1) ** 2 - 1
         if compiled and len(offsets) > 1:  # of all degrees, so that none compiles for itself
-            basis = compiled_harmonics(math.isqrt(1 + rest.shape[1]) - 1)(offsets)[:count]
+            basis = compiled_harmonics(degree_of(rest.shape[1]))(offsets)[:count]
         else:
             basis = harmonics_along(offsets, degree)
         colours = colours + Contraction.apply(basis.to(rest), rest[:, :count])

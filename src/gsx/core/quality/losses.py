@@ -42,8 +42,7 @@ def ssim_map(
 
     `padding` is 5 for INRIA's zero-padded windows, 0 for whole windows only.
     """
-    parts = blurred(image, target, padding)
-    luminance, structure = similarity(*parts)
+    luminance, structure, *_ = similarity(*blurred(image, target, padding))
     return luminance * structure
 
 

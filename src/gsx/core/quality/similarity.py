@@ -6,24 +6,21 @@ from collections.abc import Callable
 from torch import Tensor
 
 from gsx.core.compiling import compile_rows
-from gsx.core.shapes import Float
 
 C1, C2 = 0.01**2, 0.03**2
 """SSIM constants for values in [0, 1]."""
 
 
-def similarity(
-    x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor
-) -> tuple[Float[Tensor, "C h w"], Float[Tensor, "C h w"]]:
-    """SSIM's two factors, of means and of spreads, from what `blurred` returns."""
-    luminance = (2 * x * y + C1) / (x**2 + y**2 + C1)
-    return luminance, (2 * (xy - x * y) + C2) / (xx - x**2 + yy - y**2 + C2)
+def similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """SSIM's two factors, of means and of spreads, and their denominators, from what `blurred` returns."""
+    means, spreads = x**2 + y**2 + C1, xx - x**2 + yy - y**2 + C2
+    return (2 * x * y + C1) / means, (2 * (xy - x * y) + C2) / spreads, means, spreads
 
 
 def ssim_slopes(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(SSIM, its slopes by the blurred image, image^2 and image target) from what `blurred` returns, of any shape."""
-    luminance, structure = similarity(x, y, xx, yy, xy)
-    ssim, means, spreads = luminance * structure, x**2 + y**2 + C1, xx - x**2 + yy - y**2 + C2
+    luminance, structure, means, spreads = similarity(x, y, xx, yy, xy)
+    ssim = luminance * structure
     by_xx, by_xy = -ssim / spreads, 2 * luminance / spreads
     by_x = 2 * (y * structure - x * ssim) / means - 2 * x * by_xx - y * by_xy
     return ssim, by_x, by_xx, by_xy

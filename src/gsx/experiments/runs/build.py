@@ -68,6 +68,17 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 ALONE = Ranks()
 
 
+def prepare_process(device: torch.device, training: bool) -> None:
+    """What holds for the whole process: how memory is kept and counted, and where compiled code lies."""
+    if training and device.type == "cpu":
+        keep_freed_memory()
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
+    # torch would compile and load programs to see which vector registers there are: the system says so
+    os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
+
+
 def build(
     settings: Settings, scene: Scene, folder: Path, training: bool = False, start: Gaussians | None = None
 ) -> Run:
@@ -82,15 +93,9 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
-    if training and device.type == "cpu":
-        keep_freed_memory()
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
+    prepare_process(device, training)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
-    # torch would compile and load programs to see which vector registers there are: the system says so
-    os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
     own = settings.training.resolution(scene, general.iterations)
 
