@@ -561,15 +561,16 @@ def test_statistics_are_sums_over_pictures() -> None:
     for weight in (1.0, 1.0, 0.25, 1.0, 0.85):
         rows = torch.randperm(6, generator=generator)[:4]
         opacities = torch.rand(4, 3, generator=generator)
-        on_screen = [row * 3 + j for row in rows.tolist() for j in range(3) if (row + j) % 2]
-        gradients = torch.rand(len(on_screen), generator=generator)
-        observe(table, rows, opacities, torch.tensor(on_screen), gradients, torch.tensor([weight]))
+        slots = torch.tensor([row * 3 + j for row in rows.tolist() for j in range(3)])
+        seen = (slots % 2).float()  # the others have no radius
+        gradients = seen * torch.rand(len(slots), generator=generator)
+        observe(table, rows, opacities, slots, gradients, weight * seen, torch.tensor([weight]))
         for i, row in enumerate(rows.tolist()):
             wanted[0][row] += weight
             wanted[1][row] += weight * sum(opacities[i].tolist())
-        for slot, gradient in zip(on_screen, gradients.tolist(), strict=True):
+        for slot, gradient in zip(slots.tolist(), gradients.tolist(), strict=True):
             wanted[2][slot] += gradient
-            wanted[3][slot] += weight
+            wanted[3][slot] += weight if slot % 2 else 0.0
     names = ("visits", "opacity_sum", "gradient_sum", "gradient_count")
     for name, values in zip(names, wanted, strict=True):
         torch.testing.assert_close(table[name].flatten(), torch.tensor(values))

@@ -151,7 +151,8 @@ class Anchors:
             "opacities": decoded.opacities,
             "slots": seen["rows"],
             "gradients": seen["gradient"].to(decoded.opacities),
-            "weight": seen["weight"].to(decoded.opacities),
+            "seen": seen["weight"].to(decoded.opacities),
+            "weight": decoded.opacities.new_full((1,), weight),
         }
 
     def accumulate(self, seen: Observation) -> None:

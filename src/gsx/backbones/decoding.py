@@ -90,7 +90,7 @@ def lengths(log_scales: Float[Tensor, "A V"]) -> Float[Tensor, "A V"]:
 
 def identity_quats(values: Float[Tensor, "N *rest"]) -> Float[Tensor, "N 4"]:
     """(1, 0, 0, 0) for every row of `values`."""
-    return values.new_tensor([1.0, 0, 0, 0]).expand(len(values), 4)
+    return torch.eye(1, 4, dtype=values.dtype, device=values.device).expand(len(values), 4)
 
 
 def numbered(prefix: str, values: Float[Tensor, "N V"]) -> dict[str, Float[Tensor, "N"]]:

@@ -40,18 +40,19 @@ def observe(
     opacities: Float[Tensor, "A k"],
     slots: Int[Tensor, "M"],
     gradients: Float[Tensor, "M"],
+    seen: Float[Tensor, "M"],
     weight: Float[Tensor, "1"],
 ) -> None:
     """Count one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (Scaffold-GS).
 
-    `slots` and `gradients` are of Gaussians with a radius only; `opacities` are summed over an anchor's offsets. All
-    but gradients, which carry it already, are counted by the picture's weight in the step's loss (see
-    `core.training.density`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
+    `gradients` are 0 for Gaussians without a radius, as is `seen`, elsewhere the weight; `opacities` are summed over an
+    anchor's offsets. All but gradients, which carry it already, are counted by the picture's weight in the step's loss
+    (see `core.training.density`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
     """
     table["opacity_sum"][rows] += weight * opacities.sum(1)
     table["visits"][rows] += weight
     table["gradient_sum"].view(-1).index_add_(0, slots, gradients)
-    table["gradient_count"].view(-1).index_add_(0, slots, weight.expand(len(slots)))
+    table["gradient_count"].view(-1).index_add_(0, slots, seen)
 
 
 def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:

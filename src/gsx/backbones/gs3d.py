@@ -28,7 +28,7 @@ from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import Rendering, learns_compiled
+from gsx.core.rasterizer import Rendering, goes_compiled
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
@@ -146,7 +146,7 @@ class GS3D:
         shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
         scales, log_opacities = extents(self.table, shown, self.filter)
-        compiled = learns_compiled(self.raster, scales.device.type)
+        compiled = goes_compiled(self.raster, scales.device.type)
         splats = Splats(
             means=values["means"],
             scales=scales,

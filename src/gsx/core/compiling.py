@@ -3,11 +3,12 @@
 import functools
 import types
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+Result = TypeVar("Result")
 WHOLE_LOOPS: dict[str, str | int | bool] = {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
@@ -51,6 +52,23 @@ def compile_rows(function: Callable[..., Any], *last: Any) -> Callable[..., Any]
         return [(a, 0) for a in arguments if isinstance(a, Tensor) and a.dim() > 0 and len(a) == rows]
 
     return sizes_free(torch.compile(with_last(function, *last)), varying)
+
+
+@functools.lru_cache
+def with_any_sizes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` through torch.compile, once for tensors of all sizes."""
+    return torch.compile(function, dynamic=True)
+
+
+def fused(function: Callable[..., Result]) -> Callable[..., Result]:
+    """`function` of tensors; on a GPU, where launches cost, compiled into few kernels, on a CPU as it stands."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Result:
+        device = arguments[0].device.type
+        return (with_any_sizes(function) if device != "cpu" and available(device) else function)(*arguments)
+
+    return call
 
 
 def sizes_free(

@@ -3,11 +3,22 @@
 import platform
 
 import torch
+from torch import Tensor
 
 
 def device_name(device: torch.device) -> str:
     """Name of a GPU, or of the processor."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+
+
+def uploaded(values: Tensor, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """The values on a device, without waiting for what it is doing; differentiable.
+
+    Copies to a GPU that nobody waits for have to come from memory that is pinned.
+    """
+    if device.type == "cuda" and values.device.type == "cpu" and not values.requires_grad:
+        values = values.pin_memory()
+    return values.to(device, dtype or values.dtype, non_blocking=True)
 
 
 def machine_stamp(device: torch.device) -> tuple[str, int, str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsx.core.device import uploaded
 from gsx.core.shapes import Bool, Float
 
 NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
@@ -63,8 +64,9 @@ class Camera:
 
     def to_camera(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
         """World points in the camera's frame, float64: far from the origin float32 is too coarse."""
-        points = points.double()
-        return points @ self.rotation.T.to(points) + self.translation.to(points)
+        points, double = points.double(), torch.float64
+        rotation, translation = (uploaded(x, points.device, double) for x in (self.rotation.T, self.translation))
+        return points @ rotation + translation
 
     @property
     def size(self) -> tuple[int, int]:
@@ -141,7 +143,7 @@ def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Fl
 
     Far from the origin the centre itself, rounded first, would move by a grain of the coordinates (docs/numerics.md).
     """
-    return (points.double() - centre.to(points.device, torch.float64)).to(points)
+    return (points.double() - uploaded(centre, points.device, torch.float64)).to(points)
 
 
 def look_at(

@@ -1,5 +1,7 @@
 """Real spherical harmonics of bands 0..3 with the signs of 3D-GS (3D-GS, sh_utils.py)."""
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -24,22 +26,25 @@ class Contraction(torch.autograd.Function):
     @staticmethod
     def forward(ctx, basis, rest):
         ctx.save_for_backward(basis, rest)
-        by_band, by_channel = spreads(rest)
+        by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
         return (basis.T @ by_band).mul_(rest.flatten(1)) @ by_channel.T
 
     @staticmethod
     def backward(ctx, gradient):
         basis, rest = ctx.saved_tensors
-        by_band, by_channel = spreads(rest)
+        by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
         seen = gradient @ by_channel
         by_rest = (basis.T @ by_band).mul_(seen).view(rest.shape) if ctx.needs_input_grad[1] else None
         return by_band @ seen.mul_(rest.flatten(1)).T, by_rest
 
 
-def spreads(rest: Float[Tensor, "N B 3"]) -> tuple[Float[Tensor, "B B_3"], Float[Tensor, "3 B_3"]]:
-    """Matrices that copy the value of each band, and of each channel, to the coefficients that belong to it."""
-    count = rest.shape[1]
-    bands_, channels = (torch.eye(n, dtype=rest.dtype, device=rest.device) for n in (count, 3))
+@functools.lru_cache
+def spreads(
+    count: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "B B_3"], Float[Tensor, "3 B_3"]]:
+    """Matrices that copy the value of each of so many bands, and of each channel, to the coefficients that belong to
+    it."""
+    bands_, channels = (torch.eye(n, dtype=dtype, device=device) for n in (count, 3))
     return bands_.repeat_interleave(3, 1), channels.repeat(1, count)
 
 

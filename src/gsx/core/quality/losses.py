@@ -1,12 +1,15 @@
 """The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (3D-GS, loss_utils.py)."""
 
+import functools
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
+from gsx.core.compiling import sizes_free, with_last
 from gsx.core.quality.similarity import compiled_slopes, similarity, ssim_slopes
 from gsx.core.shapes import Float
 
@@ -70,12 +73,25 @@ def photometric_and_gradient(
     return loss, ((1 - ssim_weight) * difference.sign() - ssim_weight * by_ssim) / image.numel()
 
 
+@functools.lru_cache
+def compiled_photometric(ssim_weight: float) -> Callable[..., tuple[Tensor, Tensor]]:
+    """`photometric_and_gradient` through torch.compile, for pictures of any size."""
+
+    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
+        return [(picture, axis) for picture in arguments for axis in (1, 2)]
+
+    return sizes_free(torch.compile(with_last(photometric_and_gradient, ssim_weight, False)), varying)
+
+
 class Photometric(torch.autograd.Function):
     """The loss, with its gradient found on the way forward."""
 
     @staticmethod
     def forward(ctx, image, target, ssim_weight, compiled):
-        loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled)
+        if compiled and image.device.type != "cpu":  # launches cost; on a CPU the blur is as fast as it stands
+            loss, gradient = compiled_photometric(ssim_weight)(image, target)
+        else:
+            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled)
         ctx.save_for_backward(gradient)
         return loss
 

@@ -3,7 +3,7 @@
 import torch
 
 from gsx.core.rasterizer.batch import rasterize_batch
-from gsx.core.rasterizer.path import learns_compiled
+from gsx.core.rasterizer.path import goes_compiled
 from gsx.core.rasterizer.projection import drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
@@ -17,7 +17,7 @@ __all__ = [
     "ScreenStatistics",
     "TiledRendering",
     "drawable",
-    "learns_compiled",
+    "goes_compiled",
     "rasterize",
     "rasterize_batch",
     "rasterize_tiled",

@@ -5,6 +5,7 @@ have all ended leave. `segments`: the share of light that passes each block firs
 transmittance before every block; then all blocks at once. On the way back the scan runs from behind.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from gsx.core.compiling import available
 from gsx.core.rasterizer.composite import NOTHING
-from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
@@ -39,6 +40,13 @@ class Basis:
     y: Float[Tensor, "P 1"]
     products: Float[Tensor, "3 P 1"]
     """x^2, x y, y^2."""
+
+
+@functools.lru_cache
+def basis_of(tile: int, dtype: torch.dtype, device: torch.device) -> Basis:
+    """That of tiles of so many px."""
+    x, y = pixel_centres(tile, torch.empty(0, dtype=dtype, device=device))[:2, :, None].unbind(0)
+    return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -238,7 +246,7 @@ def blend_segments(
         job.loops.blend(rows[part], x, y, before[part], scratch[part], [channel[part] for channel in accumulated])
     total = inside.new_zeros(len(accumulated), *inside.shape)
     for active, base in zip(lanes.active, lanes.bases, strict=True):
-        total[:, :active] += accumulated[:, base : base + active]
+        total[:, :active].add_(accumulated[:, base : base + active])
     return list(total.unbind(0)), Segments(passed, before, accumulated)
 
 
@@ -313,11 +321,10 @@ def composite_compiled(
     batch = max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
     lanes = lay_out(intersections, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)
-    x, y = grid.basis(exact)[:2, :, None].unbind(0)
     job = Job(
         lanes=lanes,
         grid=grid,
-        basis=Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y])),
+        basis=basis_of(settings.tile_size, exact.dtype, exact.device),
         centre=centres(lanes, grid, exact),
         loops=kernels(rules),
         rules=rules,

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.rasterizer.exponent import EXPONENTS, Exponent
-from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.precision import Precision, power_of_two_above
 from gsx.core.rasterizer.settings import RasterSettings
@@ -95,7 +95,7 @@ def make_tables(
         rows=exponent.rows(offsets, table[..., 2:5], table[..., 5]),
         offsets=offsets,
         channels=table[..., 6:].to(precision.accumulation).contiguous(),
-        basis=exponent.basis(grid.basis(means.new_empty(0, dtype=precision.evaluation))),
+        basis=exponent.basis(pixel_centres(grid.tile, means.new_empty(0, dtype=precision.evaluation))),
         inside=grid.to_tiles(one)[:, 0],
         settings=settings,
         precision=precision,

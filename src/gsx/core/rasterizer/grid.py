@@ -42,12 +42,6 @@ class TileGrid:
         position = torch.stack([tiles % columns + self.first[0], tiles // columns + self.first[1]], 1)
         return position.to(like) * self.tile + self.tile / 2
 
-    def basis(self, like: Tensor) -> Float[Tensor, "3 P"]:
-        """x, y and 1 at the pixel centres of a tile, relative to its middle."""
-        offset = torch.arange(self.tile, device=like.device, dtype=like.dtype) + 0.5 - self.tile / 2
-        y, x = torch.meshgrid(offset, offset, indexing="ij")
-        return torch.stack([x.reshape(-1), y.reshape(-1), torch.ones_like(x).reshape(-1)])
-
     def to_raster(self, tiles: Float[Tensor, "T P C"]) -> Float[Tensor, "C H W"]:
         """Tiles laid out as a picture, cut to the raster."""
         columns, rows = self.shape
@@ -64,3 +58,10 @@ class TileGrid:
         padded = torch.nn.functional.pad(raster, padding)
         blocks = padded.view(len(raster), rows, self.tile, columns, self.tile).permute(1, 3, 0, 2, 4)
         return blocks.reshape(rows * columns, len(raster), self.tile**2)
+
+
+def pixel_centres(tile: int, like: Tensor) -> Float[Tensor, "3 P"]:
+    """x, y and 1 at the pixel centres of a tile of so many px, relative to its middle, as numbers like `like`."""
+    offset = torch.arange(tile, device=like.device, dtype=like.dtype) + 0.5 - tile / 2
+    y, x = torch.meshgrid(offset, offset, indexing="ij")
+    return torch.stack([x.reshape(-1), y.reshape(-1), torch.ones_like(x).reshape(-1)])

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsx.core.compiling import fused
 from gsx.core.data.camera import Camera
+from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
 from gsx.core.rasterizer.grid import TileGrid
@@ -36,9 +38,9 @@ class TileIntersections:
     """First intersection of each tile, then P."""
     slots: Int[Tensor, "P"]
     """Place of each in the list sorted by splat, nearest splat first: a permutation."""
-    order: Int[Tensor, "V"]
-    """Rows of the screen splats that have a tile in their box, nearest first."""
-    counts: Int[Tensor, "V"]
+    order: Int[Tensor, "M"]
+    """Rows of the screen splats, nearest first."""
+    counts: Int[Tensor, "M"]
     """How many each of them has."""
     radii: Int[Tensor, "M"]
     """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
@@ -77,7 +79,7 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> 
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
-    numbers = torch.tensor(raster, dtype=torch.int32, device=screen.means.device)
+    numbers = uploaded(torch.tensor(raster, dtype=torch.int32), screen.means.device)
     given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
     compiled = len(screen.ids) > 1 and compiles(settings, screen.means.device.type)
     *edges, radii, limits = compiled_boxes(*rules)(*given) if compiled else boxes(*given, *rules)
@@ -95,37 +97,61 @@ def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettin
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = torch.argsort(bits, stable=True)
-    order = order[(found.last > found.first).all(0)[order]]
-    sides = torch.stack([found.first[1], found.first[0], found.last[0], found.last[1]])[:, order]
-    heights = sides[3] - sides[0]
-    refuse_too_many(int(heights.sum()), grid, settings)
-    rank = torch.repeat_interleave(heights)
-    shapes = torch.cat([screen.means.T, screen.conic_factors.T, found.limits[None]])[:, order]
-    given = rank, shapes, sides[:3], heights.cumsum(0) - heights
+    shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
+    heights, placed, sides, starts = in_order(order, found.first, found.last, *shapes)
+    rank = torch.repeat_interleave(heights, output_size=refuse_too_many(heights, grid, settings))
+    given = rank, placed, sides, starts
     compiled = min(len(rank), len(order)) > 1 and compiles(settings, rank.device.type)
     rules = grid.tile, reach_of(settings)
     row, begin, widths = compiled_spans(*rules)(*given) if compiled else spans(*given, *rules)
-    refuse_too_many(int(widths.sum()), grid, settings)
-    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, grid, found.radii)
+    line = torch.repeat_interleave(widths, output_size=refuse_too_many(widths, grid, settings))
+    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, found.radii)
+
+
+@fused
+def in_order(
+    order: Int[Tensor, "M"],
+    first: Int[Tensor, "2 M"],
+    last: Int[Tensor, "2 M"],
+    means: Float[Tensor, "M 2"],
+    conic_factors: Float[Tensor, "M 3"],
+    limits: Float[Tensor, "M"],
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "6 M"], Int[Tensor, "3 M"], Int[Tensor, "M"]]:
+    """(rows of tiles of every splat, and its shape, sides and first row as `spans` wants them), nearest splats first;
+    none where a box has no columns."""
+    sides = torch.stack([first[1], first[0], last[0], last[1]])[:, order]
+    heights = (sides[3] - sides[0]).clamp_min(0) * (sides[2] > sides[1])
+    shapes = torch.cat([means.T, conic_factors.T, limits[None]])[:, order]
+    return heights, shapes, sides[:3], heights.cumsum(0) - heights
+
+
+@fused
+def pair_tiles(
+    line: Int[Tensor, "P"], row: Int[Tensor, "R"], begin: Int[Tensor, "R"], widths: Int[Tensor, "R"], columns: int
+) -> Int[Tensor, "P"]:
+    """Tile of every pair, where pairs of a span follow each other from its column `begin` on."""
+    before = widths.cumsum(0) - widths
+    place = torch.arange(line.shape[0], device=line.device)
+    return place + (row * columns + begin - before).index_select(0, line)
 
 
 def sorted_pairs(
-    order: Int[Tensor, "V"],
+    order: Int[Tensor, "M"],
     rank: Int[Tensor, "R"],
     row: Int[Tensor, "R"],
     begin: Int[Tensor, "R"],
     widths: Int[Tensor, "R"],
+    line: Int[Tensor, "P"],
     grid: TileGrid,
     radii: Int[Tensor, "M"],
 ) -> TileIntersections:
-    """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile."""
+    """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile.
+
+    `rank` names the splat of each span, `line` the span of each intersection.
+    """
     columns, rows = grid.shape
-    line = torch.repeat_interleave(widths)
-    before = widths.cumsum(0) - widths
-    place = torch.arange(len(line), device=line.device)
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
-    tiles = (place + (row * columns + begin - before).index_select(0, line)).to(narrow)
-    tiles, slots = torch.sort(tiles, stable=True)
+    tiles, slots = torch.sort(pair_tiles(line, row, begin, widths, columns).to(narrow), stable=True)
     counts = torch.zeros_like(order).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
     return TileIntersections(
@@ -139,10 +165,12 @@ def sorted_pairs(
     )
 
 
-def refuse_too_many(count: int, grid: TileGrid, settings: RasterSettings) -> None:
-    """Raise TooManyPairs before memory for too many pairs is asked for."""
+def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSettings) -> int:
+    """Their sum; raises TooManyPairs before memory for too many pairs is asked for."""
+    count = int(counts.sum())
     if count > settings.max_pairs:
         raise TooManyPairs(
             f"this picture of {grid.width}x{grid.height} px needs {count:,} splat-tile pairs, more than "
             f"rasterizer.max_pairs={settings.max_pairs:,}: render it in smaller pieces or raise the limit"
         )
+    return count

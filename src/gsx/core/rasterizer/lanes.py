@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from gsx.core.compiling import fused
+from gsx.core.device import uploaded
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.shapes import Float, Int
@@ -35,6 +38,8 @@ class Lanes:
     """Groups that have each chunk."""
     bases: list[int]
     """First block of each chunk."""
+    table: Int[Tensor, "2 N"]
+    """`active` and `bases`, where the entries are."""
     places: Int[Tensor, "P"]
     """Entry of each pair, pairs sorted by splat."""
 
@@ -44,47 +49,50 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
 
     The first two groups of every `batch` groups get equally many chunks (torch specialises on sizes of one).
     """
-    lengths = intersections.starts.diff()
-    ranks, tiles = rank_tiles(lengths)
-    longest = torch.cat([lengths, lengths.new_zeros(1)])[tiles[:, 0]].long()
-    counts = (longest + (chunk - 1)) // chunk  # of each group: those of its first, longest list
+    ranks, tiles, longest = rank_tiles(intersections.starts.diff())
+    counts = (longest.cpu() + (chunk - 1)) // chunk  # of each group: those of its first, longest list
+    counts = counts[: max(2, int((counts > 0).sum()))]
     counts[1::batch] = counts[::batch][: len(counts[1::batch])]
     active = (len(counts) - counts.bincount().cumsum(0))[:-1]
-    bases = active.cumsum(0) - active
-    places = entry_places(intersections, ranks, bases, chunk)
-    blocks = int(active.sum())
+    bases, blocks = active.cumsum(0) - active, int(active.sum())
+    table = uploaded(torch.stack([active, bases]), ranks.device)
+    places = entry_places(intersections.tiles, intersections.starts, ranks, table[1], chunk)
     entries = places.new_full((blocks * chunk * LANES,), splats)
     entries.scatter_(0, places.long(), intersections.splats.int())
-    chunks = torch.repeat_interleave(active)
+    chunks = torch.repeat_interleave(table[0], output_size=blocks)
     return Lanes(
-        tiles=tiles,
+        tiles=tiles[: len(counts)],
         entries=entries.view(blocks, chunk, LANES),
-        groups=torch.arange(blocks, device=chunks.device) - bases[chunks],
+        groups=torch.arange(blocks, device=chunks.device) - table[1][chunks],
         chunks=chunks,
         active=active.tolist(),
         bases=bases.tolist(),
+        table=table,
         places=torch.empty_like(places).scatter_(0, intersections.slots, places),
     )
 
 
-def rank_tiles(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "G L"]]:
-    """Rank of every tile by list length, longest first, and the tiles by rank in groups; at least two groups."""
-    order = torch.argsort(lengths, descending=True, stable=True)
+def rank_tiles(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "G L"], Int[Tensor, "G"]]:
+    """Rank of every tile by list length, longest first; the tiles by rank in groups, T where lists are empty; and the
+    longest list of each group. At least two groups."""
+    lengths, order = torch.sort(lengths, descending=True, stable=True)
     ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
-    filled = order[: int((lengths > 0).sum())]
-    groups = max(2, -(-len(filled) // LANES))
-    tiles = filled.new_full((groups * LANES,), len(lengths))
-    tiles[: len(filled)] = filled
-    return ranks, tiles.view(groups, LANES)
+    count = max(2, -(-len(order) // LANES)) * LANES
+    tiles = pad(torch.where(lengths > 0, order, len(order)), (0, count - len(order)), value=len(order))
+    return ranks, tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES].long()
 
 
+@fused
 def entry_places(
-    intersections: TileIntersections, ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int
+    tiles: Int[Tensor, "P"], starts: Int[Tensor, "T_1"], ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int
 ) -> Int[Tensor, "P"]:
-    """Place of every pair (sorted by tile) in the flat [S K L] entries; fewer than 2^31, as max_pairs sees to."""
+    """Place of every pair (sorted by tile) in the flat [S K L] entries; fewer than 2^31, as max_pairs sees to.
+
+    `tiles`, `starts`: those of `TileIntersections`.
+    """
     # per tile: place of a list's first entry but for its chunk, and where the list begins
     lane = (ranks // LANES * chunk * LANES + ranks % LANES).int()
-    lane, begin = torch.stack([lane, intersections.starts[:-1].int()], 1).index_select(0, intersections.tiles).unbind(1)
+    lane, begin = torch.stack([lane, starts[:-1].int()], 1).index_select(0, tiles).unbind(1)
     number = torch.arange(len(lane), device=lane.device, dtype=torch.int32) - begin
     step = torch.div(number, chunk, rounding_mode="floor")
     return lane + (number - step * chunk) * LANES + (bases * (chunk * LANES)).int().index_select(0, step)

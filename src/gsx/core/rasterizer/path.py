@@ -16,9 +16,10 @@ def compiles(settings: RasterSettings, device: str) -> bool:
     return settings.path == "compiled" and available(device)
 
 
-def learns_compiled(settings: RasterSettings, device: str) -> bool:
-    """Whether what is computed now with gradients goes the compiled way; without them it would compile once more."""
-    return torch.is_grad_enabled() and compiles(settings, device)
+def goes_compiled(settings: RasterSettings, device: str) -> bool:
+    """Whether what is computed now goes the compiled way; on a CPU not without gradients, for which it would compile
+    once more."""
+    return (torch.is_grad_enabled() or device != "cpu") and compiles(settings, device)
 
 
 @functools.lru_cache

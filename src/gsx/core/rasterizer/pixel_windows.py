@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsx.core.compiling import compile_rows
 from gsx.core.rasterizer.composite import sum_by_splat
-from gsx.core.rasterizer.grid import TileGrid
+from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.projection import ScreenSplats
@@ -193,7 +193,7 @@ def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
     grid, settings, like = lists.grid, lists.settings, lists.rows
     lengths, starts = lists.intersections.starts.diff()[tiles], lists.intersections.starts[tiles]
     step = compiled_step() if compiles(settings, like.device.type) and len(tiles) > 1 else behind_splat
-    x, y, one = (column.expand(len(tiles), -1) for column in grid.basis(like))
+    x, y, one = (column.expand(len(tiles), -1) for column in pixel_centres(grid.tile, like))
     inside = grid.to_tiles(like.new_ones(1, grid.height, grid.width))[:, 0]
     window: PixelWindow = (inside[tiles], x, y, one, one)
     rules = settings.alpha_min, settings.alpha_max, settings.transmittance_stop

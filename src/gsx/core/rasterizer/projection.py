@@ -11,11 +11,12 @@ from torch import Tensor
 
 from gsx.core.compiling import compile_rows
 from gsx.core.data.camera import Camera, Frame
+from gsx.core.device import uploaded
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.geometry import geometry
-from gsx.core.rasterizer.path import compiles, learns_compiled
-from gsx.core.rasterizer.selection import lens_of, selected, slope_bounds
+from gsx.core.rasterizer.path import compiles, goes_compiled
+from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
@@ -81,8 +82,8 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
 @torch.no_grad()
 def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
     """False for the splats that a render from this camera leaves out and counts as dropped."""
-    intrinsics = on_frame(intrinsics_of(camera, None), camera.frame).to(splats.means.device)
-    numbers = lens_of(camera, intrinsics, settings.dilation, settings)
+    numbers = lens_of(camera, on_frame(intrinsics_of(camera, None), camera.frame), settings.dilation, settings)
+    numbers = numbers.to(splats.means.device)
     return selected(splats, camera.to_camera(splats.means), numbers, compiled=False)[0]
 
 
@@ -98,26 +99,26 @@ def project(
     """
     intrinsics = intrinsics_of(camera, intrinsics)
     refuse_unusable(camera, intrinsics, settings.jacobian_margin)
-    intrinsics = on_frame(intrinsics, camera.frame).to(splats.means.device)
+    intrinsics = on_frame(intrinsics, camera.frame)
     compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
     dilation, drawn = settings.dilation, 0.0
     if not settings.published_dilation:
         dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
     points = camera.to_camera(splats.means)
-    good, shown = selected(splats, points, lens_of(camera, intrinsics, dilation, settings), compiled)
-    ids = shown.nonzero()[:, 0]  # selecting comes before any division
+    numbers = uploaded(lens_of(camera, intrinsics, dilation, settings), points.device)
+    ids, dropped = chosen_rows(*selected(splats, points, numbers, compiled))  # before any division
     points, scales, quats, log_opacities, channels = (
         take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     )
     rules = tuple[Any, ...]((dilation, settings.compensate))
     if not settings.published_dilation:  # numbers that differ from camera to camera are no constants of compiled code
-        rules = scales.new_tensor(dilation), False, scales.new_tensor(drawn) if drawn else None
-    low, high = slope_bounds(intrinsics, camera.frame, settings.jacobian_margin)
+        rules = scales.new_full((), dilation), False, scales.new_full((), drawn) if drawn else None
+    shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     compute = geometry
-    if len(ids) > 1 and learns_compiled(settings, ids.device.type):
+    if len(ids) > 1 and goes_compiled(settings, ids.device.type):
         compute = compiled_geometry(settings.published_dilation, settings.compensate, bool(drawn))
     means, covariances, conic_factors, compensation = compute(
-        points, scales, quats, camera.rotation.to(scales), intrinsics, low.to(scales), high.to(scales), *rules
+        points, scales, quats, uploaded(camera.rotation, ids.device, scales.dtype), *shape, *rules
     )
     if drawn and compensation is not None:  # nothing becomes more opaque than alpha_max by it
         most = log_opacities.clamp_min(math.log(settings.alpha_max))
@@ -130,7 +131,7 @@ def project(
         conic_factors=conic_factors,
         log_opacities=log_opacities if compensation is None else log_opacities + compensation,
         channels=channels,
-        dropped=len(good) - int(good.sum()),
+        dropped=dropped,
     )
 
 

@@ -43,7 +43,7 @@ class ScreenStatistics:
     def ndc_gradient(self, of: Tensor) -> Float[Tensor, "M 2"]:
         """Gradient of `means2d_offset` or `absgrad` in NDC units: pixels times half the raster (3D-GS, backward.cu)."""
         gradient = of.grad if of.grad is not None else torch.zeros_like(of)
-        return gradient * gradient.new_tensor(self.size) / 2
+        return torch.stack([along * side / 2 for along, side in zip(gradient.unbind(1), self.size, strict=True)], 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,7 +13,7 @@ from gsx.core.compiling import compile_rows
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE, RasterSettings
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Bool, Float, Int
 
 OPACITY_SLACK = 1e-3
 """ln of an opacity may exceed 0 by this, for rounding."""
@@ -60,11 +60,10 @@ def slope_bounds(
     return -centre / focal - extra, (size - centre) / focal + extra
 
 
-@torch.no_grad()
 def lens_of(
     camera: Camera, intrinsics: Float[Tensor, "4"], dilation: float, settings: RasterSettings
 ) -> Float[Tensor, "16"]:
-    """The numbers of a `Lens`; `intrinsics` count on the frame."""
+    """The numbers of a `Lens`; `intrinsics` count on the frame. Slopes' bounds are differentiable in these."""
     frame, around = camera.frame, max(WINDOW_TILE, settings.tile_size)
     edges = (
         *(frame.left - around, frame.left + camera.width + around),
@@ -72,7 +71,7 @@ def lens_of(
     )
     limit = math.sqrt(2 * (OPACITY_SLACK - math.log(settings.alpha_min) + CUTOFF_SLACK))
     numbers = intrinsics.new_tensor([camera.near, dilation, *edges, max(3.0, limit)])
-    stretch = torch.linalg.norm(camera.rotation.to(intrinsics), 2).clamp_min(1)[None]
+    stretch = torch.linalg.norm(camera.rotation.detach().to(intrinsics), 2).clamp_min(1)[None]
     return torch.cat([intrinsics, *slope_bounds(intrinsics, frame, settings.jacobian_margin), numbers, stretch])
 
 
@@ -149,4 +148,12 @@ def selected(
     fields = (splats.means, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     points, means, scales, quats, log_opacities, colours = (value.detach() for value in (points, *fields))
     choose = compiled_select() if compiled else select
-    return choose(points, means, scales, quats, log_opacities, colours, numbers)
+    return choose(points, means, scales, quats, log_opacities, colours, numbers.detach())
+
+
+def chosen_rows(good: Bool[Tensor, "N"], shown: Bool[Tensor, "N"]) -> tuple[Int[Tensor, "M"], int]:
+    """(the rows shown, how many are not good). A GPU is waited for once; on a CPU counting first takes longer."""
+    if good.device.type == "cpu":
+        return shown.nonzero()[:, 0], len(good) - int(good.sum())
+    count, lost = torch.stack([shown.sum(), (~good).sum()]).tolist()
+    return torch.nonzero_static(shown, size=count)[:, 0], lost

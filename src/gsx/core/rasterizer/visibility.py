@@ -27,7 +27,7 @@ def touches(
     opaque = without_colours(means, scales, quats)
     screen, on = on_screen(opaque, camera, settings)
     mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    mask.index_fill_(0, screen.ids[on], True)
+    mask.index_copy_(0, screen.ids, on)
     return mask | ~drawable(opaque, camera, settings) if screen.dropped else mask
 
 

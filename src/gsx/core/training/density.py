@@ -42,18 +42,20 @@ def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, 
 def densification_statistics(
     screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
 ) -> dict[str, Tensor]:
-    """Of one render after its backward pass the visible primitives, and the norms of their gradients (3D-GS).
+    """Of one render after its backward pass the norms of the screen gradients of primitives, and how much each was
+    seen: `weight`, that of the render in the loss, or 0 where it was not visible (3D-GS).
 
-    `drawn`: rows of the splats that were rendered; None: splat n is row n. `weight`: of the render in the loss.
+    `drawn`: rows of the splats that were rendered; None: splat n is row n.
     """
     visible = screen.visible
-    ids = screen.ids[visible]
     seen = {
-        "rows": ids if drawn is None else drawn[ids],
-        "gradient": screen.ndc_gradient(screen.means2d_offset)[visible].norm(dim=1),
-        "weight": screen.means2d_offset.new_tensor([weight]),
+        "rows": screen.ids if drawn is None else drawn[screen.ids],
+        "gradient": torch.where(visible, screen.ndc_gradient(screen.means2d_offset).norm(dim=1), 0.0),
+        "weight": visible.to(screen.means2d_offset.dtype) * weight,
     }
-    return seen if screen.absgrad is None else seen | {"absolute": screen.ndc_gradient(screen.absgrad)[visible].sum(1)}
+    if screen.absgrad is not None:
+        seen["absolute"] = torch.where(visible, screen.ndc_gradient(screen.absgrad).sum(1), 0.0)
+    return seen
 
 
 def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
@@ -76,7 +78,7 @@ def add_statistics(table: ParameterTable, seen: dict[str, Tensor]) -> None:
     """Count in what `densification_statistics` found in one render."""
     sums, rows = table.statistics, seen["rows"]
     sums["gradient"].index_add_(0, rows, seen["gradient"].to(sums["gradient"]))
-    sums["count"][rows] += seen["weight"].to(sums["count"])
+    sums["count"].index_add_(0, rows, seen["weight"].to(sums["count"]))
     if "absolute" in sums and "absolute" in seen:
         sums["absolute"].index_add_(0, rows, seen["absolute"].to(sums["absolute"]))
 

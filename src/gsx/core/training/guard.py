@@ -5,6 +5,7 @@ A run on several processes is also stopped when these no longer hold the same mo
 
 import hashlib
 import logging
+import math
 
 import torch
 
@@ -61,10 +62,12 @@ class Guard:
 
 def culprit(run: Run, step: Step) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
-    if not bool(torch.isfinite(step.loss)):
-        return f"the loss is {float(step.loss)}"
-    for name, gradient in gradients(run.backbone.table).items():
-        if not bool(torch.isfinite(gradient.sum())):
+    found = gradients(run.backbone.table)
+    loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in found.values())]).tolist()  # one wait
+    if not math.isfinite(loss):
+        return f"the loss is {loss}"
+    for (name, gradient), total in zip(found.items(), sums, strict=True):
+        if not math.isfinite(total):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
             if rows == 0:  # every value is finite, only their sum overflowed
                 continue

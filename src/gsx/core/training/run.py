@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.scene import Scene, View
+from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
@@ -19,6 +20,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
+from gsx.core.training.photographs import Photographs
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
 
@@ -163,6 +165,12 @@ class Run:
     """A step is being applied: parameters and statistics are neither those before it nor those after it."""
     curves: list[dict[str, float]] = field(default_factory=list)
     """Lines of metrics.jsonl so far."""
+    photograph_bytes: int = 0
+    """How many bytes photographs may take on the device (`core.training.photographs`)."""
+    photographs: Photographs = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.photographs = Photographs(self.device, self.photograph_bytes)
 
     @property
     def complete(self) -> bool:
@@ -186,7 +194,7 @@ class Run:
     @property
     def background(self) -> Float[Tensor, "3"]:
         """The scene's background on the run's device."""
-        return self.scene.background.to(self.device)
+        return uploaded(self.scene.background, self.device)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,10 +12,11 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
+from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
-from gsx.core.rasterizer import Rendering, learns_compiled, rasterize
+from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
@@ -54,8 +55,6 @@ def train_step(run: Run, plugins: Plugins) -> Step:
         step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.update(step.number)
     run.step, run.changing = step.number, False
-    if run.device.type == "cuda":
-        torch.cuda.synchronize(run.device)  # so that times mean something
     return step if not reason else replace(step, skipped=reason)
 
 
@@ -105,13 +104,13 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     compared with its own render.
     """
     counted, seen = counted_in_loss(run, view, number), list[Observation]()
-    target = blacked(view.image().to(run.device), counted)
+    target = blacked(run.photographs.of(view), counted)
     divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
-    compiled = learns_compiled(run.raster, run.device.type)
+    compiled = goes_compiled(run.raster, run.device.type)
     loss = photometric(blacked(rendering.image, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
@@ -208,5 +207,5 @@ def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weigh
 def background(run: Run) -> Float[Tensor, "3"]:
     """The scene's background, or a new random colour."""
     if run.training.random_background:
-        return torch.rand(3, generator=run.generator).to(run.device)
+        return uploaded(torch.rand(3, generator=run.generator), run.device)
     return run.background

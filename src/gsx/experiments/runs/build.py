@@ -18,6 +18,7 @@ from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import Ranks, ranks_here
+from gsx.core.training.photographs import room_for_photographs
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler
@@ -135,6 +136,7 @@ def build(
         device=device,
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
+        photograph_bytes=room_for_photographs(device) if training else 0,
         augmenters=[augmenter for augmenter, _ in augmenters],
         tallies=[tally for _, tally in augmenters],
         idle=settings.idle,

@@ -1,0 +1,37 @@
+"""Photographs where a run computes: bytes on the device, as long as there is room, made into numbers there."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.scene import View
+from gsx.core.device import uploaded
+from gsx.core.shapes import Float, UInt8
+
+SHARE = 0.25
+"""Of a GPU's free memory, at most, that photographs take."""
+
+
+def room_for_photographs(device: torch.device) -> int:
+    """Bytes that photographs may take on a device; on a CPU none, where scenes keep them."""
+    return int(SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
+
+
+@dataclass(eq=False)
+class Photographs:
+    """Of a run's training views."""
+
+    device: torch.device
+    room: int
+    """Bytes that are left for more of them."""
+    kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
+
+    def of(self, view: View) -> Float[Tensor, "3 H W"]:
+        """What `view.image()` is, on the device."""
+        picture = self.kept.get(view)
+        if picture is None:
+            picture = uploaded(view.source.image(view.camera), self.device)
+            if picture.nbytes <= self.room:
+                self.kept[view], self.room = picture, self.room - picture.nbytes
+        return picture.float() / 255.0

@@ -1,0 +1,26 @@
+"""Steps on a device that is not there (stand_in_gpu.py): the CPU's losses, few waits, few launches."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parents[2]
+MOST = {"gs3d": (5, 285), "octree_scaffold": (9, 560)}
+"""Waits and launches of a step: sizes of four lists and the guard, with anchors four more."""
+
+
+@pytest.mark.parametrize("backbone", MOST)
+def test_a_step_waits_for_a_gpu_seldom_and_launches_little(backbone: str) -> None:
+    """In a process of its own: nothing may have been compiled before."""
+    command = [sys.executable, str(TESTS / "stand_in_gpu.py"), f"backbone={backbone}"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))}
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert ended.returncode == 0, ended.stderr
+    told = json.loads(ended.stdout)
+    assert told["device"] == pytest.approx(told["cpu"], rel=1e-4)
+    for counts, most in zip((told["waits"], told["launches"]), MOST[backbone], strict=True):
+        assert 0 < sum(counts.values()) <= most, counts
