@@ -6,6 +6,8 @@ import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -14,6 +16,7 @@ from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
 from gsx.core.data.images import read_image
+from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.quality.metrics import bicubic, psnr
 from gsx.core.training.render import render
@@ -37,6 +40,10 @@ def pose_at(run: Run, number: int = 0, width: int = 48) -> Pose:
     from gsx.experiments.viewer.server import pose_of
 
     return pose_of(run.scene.test[number], width)
+
+
+def near(position: tuple[float, float, float], view: View) -> bool:
+    return math.dist(position, view.camera.centre.tolist()) < 1e-3
 
 
 def test_a_pose_is_the_camera_that_it_was_made_of(run: Run) -> None:
@@ -233,6 +240,30 @@ def test_what_fails_for_a_browser_ends_nothing(run: Run, caplog: pytest.LogCaptu
 
 
 @needs_viser
+def test_who_arrives_later_than_awaited_is_at_the_view(run: Run) -> None:
+    from gsx.experiments.viewer.server import Panel, pose_of
+
+    viewer, screen = MagicMock(), Screen(lambda image: None)
+    viewer.frames.model = RunModel(run)
+    panel, view = Panel(viewer, MagicMock(), screen), run.scene.test[1]
+
+    def move(x: float) -> str:
+        """The view that the browser looks from, once it has told where it is."""
+        pose = pose_of(view, 48)
+        position = (pose.position[0] + x, *pose.position[1:])
+        panel.moved(SimpleNamespace(position=position, wxyz=pose.wxyz, fov=pose.fov, image_width=48, image_height=36))
+        return screen.look.view
+
+    panel.jump(view.name)
+    assert move(1) == view.name  # still on its way
+    assert screen.pose is None
+    panel.patience = 0.0
+    assert move(1) == ""
+    assert move(0) == view.name
+    assert move(2) == ""
+
+
+@needs_viser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_a_browser_shows_the_model_and_its_panel(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from gsx.experiments.viewer.server import Viewer
@@ -250,7 +281,7 @@ def test_a_browser_shows_the_model_and_its_panel(run: Run, tmp_path: Path, monke
             def stands_at_first_view() -> bool:
                 """Whether the browser has answered with the place it was sent to, after its own first one."""
                 screens = [screen for screen in viewer.frames.screens.values() if screen.width]
-                return any(math.dist(at.pose.position, first.camera.centre.tolist()) < 1e-3 for at in screens)
+                return any(at.look.view == first.name and near(at.pose.position, first) for at in screens)
 
             while not stands_at_first_view():
                 page.value("1")  # so that its events are heard
@@ -258,7 +289,6 @@ def test_a_browser_shows_the_model_and_its_panel(run: Run, tmp_path: Path, monke
                 time.sleep(0.2)
             (screen,) = viewer.frames.screens.values()
             (panel,) = viewer.panels.values()
-            assert screen.look.view == first.name
             screen.choose(zoom=2.0)
             while screen.drawn is None or screen.drawn[1].zoom != 2.0 or screen.width < 640:
                 page.value("1")

@@ -123,7 +123,7 @@ class Panel:
     def __init__(self, viewer: Viewer, client: Any, screen: Screen) -> None:
         self.viewer, self.client, self.screen, gui = viewer, client, screen, client.gui
         self.lock, self.patience = threading.Lock(), 0.0
-        self.target: tuple[float, float, float] | None = None
+        self.target: tuple[str, tuple[float, float, float]] | None = None
         names = list(viewer.frames.model.views())
         self.state = gui.add_markdown("")
         pause = gui.add_checkbox("pause training", viewer.paused, visible=viewer.training)
@@ -183,7 +183,7 @@ class Panel:
         view = self.viewer.frames.model.views()[name]
         pose, camera = pose_of(view, 100), self.client.camera
         with self.lock:
-            self.target, self.patience = pose.position, time.monotonic() + ARRIVAL
+            self.target, self.patience = (name, pose.position), time.monotonic() + ARRIVAL
             with self.client.atomic():
                 camera.wxyz, camera.position, camera.fov = pose.wxyz, pose.position, pose.fov
             self.choose(view=name)
@@ -202,18 +202,25 @@ class Panel:
         self.tell()
 
     def on_its_way(self, pose: Pose) -> bool:
-        """Whether the browser has yet to arrive where it was sent; once there, what leads away leaves the view."""
+        """Whether the browser has yet to arrive where it was sent; once there, what leads away leaves the view.
+
+        One that arrives later than one would wait for it is at the view all the same.
+        """
         if self.target is None:
             return False
-        if math.dist(pose.position, self.target) <= 1e-4 * (1 + math.hypot(*self.target)):
-            self.patience = 0.0
-        elif time.monotonic() < self.patience:
+        name, position = self.target
+        arrived = math.dist(pose.position, position) <= 1e-4 * (1 + math.hypot(*position))
+        if not arrived and time.monotonic() < self.patience:
             return True
-        else:
-            self.target = None
-            self.choose(view="")
-            self.view.value = "-"
+        self.patience = 0.0
+        self.looks_from(name if arrived else "")
         return False
+
+    def looks_from(self, name: str) -> None:
+        """The browser is where this photograph was taken; "": elsewhere."""
+        if self.screen.look.view != name:
+            self.choose(view=name)
+            self.view.value = name or "-"
 
     def show_cameras(self, shown: bool) -> None:
         """Frusta of all cameras, or none."""
