@@ -2,14 +2,18 @@
 
 import os
 from collections import Counter
+from getpass import getuser
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import gettempdir
 
 import pytest
 from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
 os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")  # as runs do (build.py)
+# by content, so that it may serve all tests and the next time, too: runs would name one below their private cache
+os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(gettempdir()) / f"torchinductor_{getuser()}"))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -1,5 +1,6 @@
 """The smallest experiment that exercises everything: the built-in scene as thumbnails, a dozen steps."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import Scene
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
-from gsx.experiments.run_folder.files import RESULTS
+from gsx.experiments.run_folder.files import LOG, REPORT, RESULTS, SPLATS
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import start
@@ -70,13 +71,23 @@ def final_tensors(folder: Path) -> dict[str, Tensor]:
     return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
 
 
-def leave_results(folder: Path) -> None:
-    """Give a folder the files of a finished run that it lacks, with nothing in them."""
-    for name in ("environment.json", "metrics.jsonl", *RESULTS):
-        path = folder / name
+EMPTY = {SPLATS: "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n"}
+"""Contents of files of a run that hold nothing, where that is not an empty text or object."""
+
+
+def leave_results(folder: Path, step: int = 0) -> None:
+    """Give a folder the files that it lacks of a run finished at a step, with nothing in them."""
+    names = ("environment.json", "status.json", *RESULTS, LOG, REPORT, f"checkpoints/step_{step:07d}.safetensors")
+    for path in (folder / name for name in names):
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            path.write_text("{}" if path.suffix == ".json" else "")
+            path.write_text(EMPTY.get(path.name, "{}" if path.suffix == ".json" else ""))
+    head = b"{}"
+    path.write_bytes(len(head).to_bytes(8, "little") + head)
+    sidecar = {"schema": 1, "step": step, "seconds": 0.0, "sampler": [], "views": {"train": [], "test": []}}
+    path.with_suffix(".json").write_text(json.dumps(sidecar))
+    if not (folder / "metrics.jsonl").exists():
+        (folder / "metrics.jsonl").write_text('{"step": 1}\n')
 
 
 class StopAfter:

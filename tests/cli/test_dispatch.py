@@ -240,6 +240,20 @@ def test_a_mistake_in_a_multirun_is_refused_before_it_starts(capsys: pytest.Capt
     assert "'stpes' is no configuration key" in capsys.readouterr().err
 
 
+def test_a_wrong_value_in_a_multirun_is_kept_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    address = "tracker.mlflow.uri='https://me:secret@host'"
+    assert main(["-m", "seed=0,1", "tracker=[mlflow]", address, f"output={tmp_path / 'out'}"]) == 2
+    assert "holds a password" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_modules_in_the_current_folder_are_not_taken_for_libraries(tmp_path: Path) -> None:
+    for name in ("torch", "pluggy", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('mine')")
+    ended = subprocess.run([*GSX, "plugins"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def one_image_scene(folder: Path) -> Path:
     import pycolmap
 
@@ -345,6 +359,12 @@ BAD = {
     "sizes disagree": lambda t: ["scene=colmap", f"scene.path={resized_photo(synthetic(t / 's'))}"],
     "unknown camera model": lambda t: ["scene=colmap", f"scene.path={strange_camera(synthetic(t / 's'))}"],
     "render at zoom 0": lambda t: ["render", str(t / "run"), "--zoom", "0"],
+    "render at an endless zoom": lambda t: ["render", str(t / "run"), "--zoom", "1e308"],
+    "render at no number": lambda t: ["render", str(t / "run"), "--zoom", "nan"],
+    "render without end": lambda t: ["render", str(t / "run"), "--orbit", str(t / "o.gif"), "--frames", "9" * 400],
+    "render at no speed": lambda t: ["render", str(t / "run"), "--orbit", str(t / "o.gif"), "--fps", "1e-300"],
+    "export too closely": lambda t: ["export", str(t / "run"), "--bake", "1e308"],
+    "compact without end": lambda t: ["compact", str(empty_folder(t / "run")), "--steps", "9" * 26],
     "trade nothing": lambda t: ["trade"],
     "trade something else": lambda t: ["trade", "resterizer"],
     "trade nowhere": lambda t: ["trade", "rasterizer", str(t / "nowhere")],

@@ -33,10 +33,18 @@ def test_no_cell_is_a_formula_and_numbers_stay_numbers() -> None:
         {"run": "=cmd|' /C calc'!A1", "psnr": -1.5, "more": "left out"},
         {"run": "+1", "psnr": None},
         {"run": "a=b"},
+        {"run": " =1+1"},
+        {"run": "\u3000\tsay \uff1d"},
+        {"run": "\u200b\uff1d1+1"},
+        {"run": "\tword"},
     ]
     read = list(csv.DictReader(csv_text(("run", "psnr"), rows).splitlines()))
     assert read == [
         {"run": "'=cmd|' /C calc'!A1", "psnr": "-1.5"},
         {"run": "'+1", "psnr": ""},
         {"run": "a=b", "psnr": ""},
+        {"run": "' =1+1", "psnr": ""},
+        {"run": "\u3000\tsay \uff1d", "psnr": ""},
+        {"run": "'\u200b\uff1d1+1", "psnr": ""},
+        {"run": "'\tword", "psnr": ""},
     ]

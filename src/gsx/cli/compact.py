@@ -5,7 +5,9 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, positive, whole
+from gsx.cli.runs import refuse_beyond
 from gsx.core.errors import InputError
+from gsx.core.ranges import MOST_STEPS, Range
 
 
 def verb_compact(arguments: list[str]) -> int:
@@ -29,6 +31,7 @@ def verb_compact(arguments: list[str]) -> int:
     parser.add_argument("--steps", type=whole, metavar="N", help="of learning on, in each try (a tenth of the run's)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="new run folder (RUN_compact)")
     given = parser.parse_intermixed_args(arguments)
+    refuse_beyond("gsx compact --steps", given.steps or 0, Range(0, MOST_STEPS))
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
     from gsx.experiments.compact.compact import compact

@@ -11,9 +11,15 @@ from gsx.cli.arguments import Parser, positive, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
+from gsx.core.ranges import Range
 from gsx.experiments.runs.job import train
 
 logger = logging.getLogger("gsx.cli")
+
+ZOOMS = Range(1 / 64, 64)
+"""Times a resolution, as eval.zoom."""
+MOST_FRAMES = 100_000
+"""Of an orbit, whose cameras are held in memory."""
 
 
 def verb_eval(arguments: list[str]) -> int:
@@ -54,16 +60,24 @@ def verb_render(arguments: list[str]) -> int:
     parser.add_argument("--zoom", type=float, default=1, help="times the training resolution, or that of the path (1)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for pictures (RUN/renders/test, or path)")
     given = parser.parse_args(arguments)
-    if not 0 < given.zoom < float("inf") or given.frames < 1:
-        raise InputError(f"gsx render got --zoom {given.zoom:g} and --frames {given.frames}: both must be positive")
+    refuse_beyond("gsx render --zoom", given.zoom, ZOOMS)
+    refuse_beyond("gsx render --frames", given.frames, Range(1, MOST_FRAMES))
+    refuse_beyond("gsx render --fps", given.fps, Range(0.1, 240))
     if (given.movie and not given.path) or (given.orbit and given.path):
         raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
     sys.stdout.write(f"{rendered(given)}\n")
     return 0
 
 
+def refuse_beyond(flag: str, value: float, bounds: Range) -> None:
+    """Raise InputError for a number of the command line that is outside of its range."""
+    if value not in bounds:
+        raise InputError(f"{flag} is {value:,}: give a number {bounds}")
+
+
 def rendered(given: argparse.Namespace) -> Path:
     """Carry out `gsx render`; returns the file or folder written."""
+    from gsx.core.files import remove_partial
     from gsx.experiments.runs.open import open_run
     from gsx.experiments.runs.render import file_pictures, render_orbit, render_path, render_test_views, run_pictures
     from gsx.experiments.viewer.camera_path import read_camera_path
@@ -75,6 +89,7 @@ def rendered(given: argparse.Namespace) -> Path:
         to = given.movie or given.to or given.target.parent / "path"
         return render_path(way, file_pictures(given.target), to, bool(given.movie), given.zoom)
     run, settings = open_run(given.target, plugins())
+    remove_partial(given.target / "renders")
     if way is not None:
         to = given.movie or given.to or given.target / "renders" / "path"
         return render_path(way, run_pictures(run, settings), to, bool(given.movie), given.zoom)
@@ -141,6 +156,8 @@ def verb_export(arguments: list[str]) -> int:
 
     if given.file:
         refuse_export(given.file)
+    if given.bake:
+        refuse_beyond("gsx export --bake", given.bake, ZOOMS)
     if given.view and given.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
     run, settings = open_run(given.run, plugins())

@@ -21,7 +21,7 @@ class TooManyPairs(InputError):
 
 
 class CheckpointError(GsxError):
-    """A checkpoint is missing, truncated, altered or of another schema."""
+    """A checkpoint is missing, truncated or altered."""
 
 
 class TrainingError(GsxError):

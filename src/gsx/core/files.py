@@ -9,7 +9,9 @@ import platform
 import re
 import secrets
 import shutil
+import string
 import time
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -106,7 +108,9 @@ def gone(machine: str, process: int, path: Path) -> bool:
 
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""How texts begin that spreadsheets carry out."""
+"""How texts begin that spreadsheets carry out, in any width of letters and after any space."""
+UNSEEN = "\ufeff\u200b"
+"""Marks without width that may stand before."""
 
 
 def csv_text(fields: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
@@ -121,7 +125,10 @@ def csv_text(fields: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 def as_text(value: Any) -> Any:
     """A cell; a text that begins like a formula with the sign by which spreadsheets know texts."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    if not isinstance(value, str):
+        return value
+    seen = unicodedata.normalize("NFKC", value).lstrip(f"{string.whitespace}{UNSEEN}")
+    return f"'{value}" if value.startswith(FORMULA) or seen.startswith(FORMULA) else value
 
 
 def finite(content: Any) -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
@@ -53,11 +53,28 @@ class MLflowOptions:
     """Least time between requests during training; what is due meanwhile goes together."""
 
     def __post_init__(self) -> None:
-        if ":" in urlsplit(self.uri).netloc.rpartition("@")[0]:  # config.yaml, the report and logs would tell it
+        if holds_secret(self.uri):  # config.yaml, the report and logs would tell it
             raise ValueError(
-                "tracker.mlflow.uri holds a password; leave it out: for a server set MLFLOW_TRACKING_USERNAME and "
-                "MLFLOW_TRACKING_PASSWORD, for a database use its own means, such as PGPASSWORD"
+                "tracker.mlflow.uri holds a password or token; leave it out: for a server set MLFLOW_TRACKING_USERNAME "
+                "and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN, for a database use its own means, such as "
+                "PGPASSWORD"
             )
+
+
+SECRET = re.compile("pass|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE)
+"""What names of secrets have in them."""
+
+
+def holds_secret(uri: str) -> bool:
+    """Whether an address tells more of a user than a name for a database, or has a parameter that is named as secrets
+    are. What servers take for a name may be a token."""
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return False
+    user, at, _ = parts.netloc.rpartition("@")
+    named = any(SECRET.search(name) for name, _ in parse_qsl(parts.query, keep_blank_values=True))
+    return named or (bool(at) and (":" in user or parts.scheme in ("http", "https")))
 
 
 class MLflow:

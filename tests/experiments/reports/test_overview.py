@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 import pytest
 import torch
+from tiny import leave_results
 
 from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
@@ -38,7 +39,7 @@ def make_run(folder: Path, config: dict[str, Any] | None = None, **figures: Any)
     (folder / "status.json").write_text('{"state": "ok", "step": 100}')
     write_lines(folder, [(10.0, None), (20.0, 25.0), (50.0, 30.0)])
     make_pictures(folder / "renders")
-    (folder / "point_cloud.ply").write_bytes(b"ply")
+    leave_results(folder, 100)
     return folder
 
 
@@ -423,6 +424,36 @@ def test_the_page_is_written_whatever_one_file_of_a_run_holds(tmp_path: Path, na
         assert page.row("damaged")[1].startswith("corrupted")
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *(("evaluation.json", {key: 1e308}) for key in ("psnr", "train_seconds", "megabytes", "primitives")),
+        ("evaluation.json", {"psnr": 1e99, "views": [{"name": "one", "psnr": 1e99}, {"name": "two", "psnr": 1e99}]}),
+        ("evaluation.json", {"train_seconds": 1e99, "megabytes": 5e-324, "primitives": 1e31}),
+        ("evaluation.json", {"step": 10**400}),
+        ("evaluation.json", {"views": [{"name": []}]}),
+        ("evaluation.json", {"zoom": {"1e99": {"psnr": 20.0}, "1": {"psnr": 30.0}}}),
+        ("evaluation.json", {"pseudo": {"upscale": {"dropped": {}, "warned": 5}}}),
+        ("renders/index.json", {"views": [{"size": [10**400, 3]}]}),
+        ("renders/index.json", {"zoom": [{"factor": 10**400}]}),
+        ("status.json", {"step": 10**400}),
+        ("metrics.jsonl", {"step": 10**400}),
+        ("metrics.jsonl", {"seconds": 10**308, "test_psnr": 1e308}),
+        ("environment.json", {"scene": {"notes": 5}}),
+    ],
+)
+def test_figures_that_no_run_has_end_neither_page(tmp_path: Path, name: str, content: dict[str, Any]) -> None:
+    for run in ("a", "b"):
+        make_run(tmp_path / run, {"variant": run})
+    path = tmp_path / "b" / name
+    lines = path.read_text().splitlines() if name == "metrics.jsonl" else [path.read_text()]
+    changed = [*lines[:-1], json.dumps(json.loads(lines[-1]) | content)]
+    path.write_text("\n".join(changed))
+    assert report_on([tmp_path / "b"]) == tmp_path / "b" / "report.html"
+    write_overview(tmp_path)
+    assert list(rows(tmp_path)) == ["a", "b"]
+
+
 def test_every_state_is_shown_with_its_reason_beside_sound_runs(tmp_path: Path) -> None:
     for name in ("ok", "running", "interrupted", "failed", "corrupted"):
         make_run(tmp_path / name, {"variant": name})
@@ -498,7 +529,7 @@ def test_the_page_goes_where_it_is_told_to(folders: Path, capsys: pytest.Capture
     assert main(["report", str(folders / "mon" / "a"), "--to", str(there)]) == 0
     assert capsys.readouterr().out == f"{there / 'report.html'}\n"
     assert list(rows(there)) == ["../../mon/a"]
-    assert not (folders / "mon" / "a" / "report.html").exists()
+    assert (folders / "mon" / "a" / "report.html").read_text() == "", "its own is left as it was"
 
 
 def test_no_overview_replaces_the_report_of_a_run(folders: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from tiny import leave_results
 
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
@@ -106,7 +107,7 @@ def make_run(folder: Path, config: str = CONFIG, result: dict[str, Any] | None =
     (folder / "evaluation.json").write_text(json.dumps(result or evaluation()))
     (folder / "status.json").write_text(json.dumps({"state": "ok", "reason": "", "step": 1000}))
     make_pictures(folder / "renders")
-    (folder / "point_cloud.ply").write_bytes(b"ply")
+    leave_results(folder, 1000)
     return folder
 
 
@@ -397,6 +398,8 @@ def test_runs_of_one_protocol_are_not_flagged(tmp_path: Path) -> None:
 
 
 def test_the_overview_links_to_the_reports_there_are(sweep: Path) -> None:
+    for name in ("damaged", "failed", "garden/b", "garden/c", "garden/d"):
+        (sweep / name / "report.html").unlink()
     page = Page(write_overview(sweep))
     reports = [link for tag, link in page.links if tag == "a" and not link.startswith("#")]
     assert set(reports) == {"garden/a/report.html"}
@@ -453,6 +456,14 @@ def test_charts_of_constant_and_single_values() -> None:
     assert "polyline" in flat
     assert "nan" not in flat
     assert line_chart([Series(name="one", x=[1], y=[2])], x_label="x") == ""
+
+
+@pytest.mark.parametrize("far", [1e308, 1e31, 5e-324, 0.0])
+def test_axes_have_room_for_any_number(far: float) -> None:
+    for log in (False, True):
+        for values in ([far, 3.0], [far, far], [-far, 3.0]):
+            chart = line_chart([Series(name="far", x=[1, 2], y=values)], x_label="x", log=log)
+            assert "polyline" in chart
 
 
 def test_names_cannot_break_out_of_a_chart() -> None:

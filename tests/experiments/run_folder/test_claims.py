@@ -1,9 +1,11 @@
 """One process at a time trains in a run folder: the other is told who does, and nothing is touched."""
 
+import contextlib
 import errno
 import os
 import platform
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -95,6 +97,34 @@ def test_a_link_in_place_of_a_lock_is_neither_followed_nor_emptied(tmp_path: Pat
     with pytest.raises(InputError, match=r"\.lock, by which processes know of each other, cannot be opened"):
         claimed(tmp_path).__enter__()
     assert (tmp_path / "letter.txt").read_text() == "dear"
+
+
+@pytest.mark.parametrize("kind", ["hard link", "pipe", "device"])
+def test_what_is_no_file_of_its_own_is_no_lock_and_keeps_its_content(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    if kind == "hard link":
+        (tmp_path / LOCK).hardlink_to(tmp_path / "letter.txt")
+    elif kind == "pipe":
+        os.mkfifo(tmp_path / LOCK)
+    else:
+        with contextlib.suppress(PermissionError):
+            os.mknod(tmp_path / LOCK, 0o600 | stat.S_IFCHR, os.makedev(1, 3))
+        if not (tmp_path / LOCK).exists():
+            pytest.skip("devices are made by root alone")
+    with pytest.raises(InputError, match="is no file of its own, but a link, pipe or device: remove it"):
+        claimed(tmp_path).__enter__()
+    assert (tmp_path / "letter.txt").read_text() == "dear"
+
+
+def test_a_lock_of_another_user_has_a_sentence_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    (tmp_path / LOCK).touch()
+    owner = (tmp_path / LOCK).owner()
+    monkeypatch.setattr("gsx.experiments.run_folder.claims.os.open", refused)  # root may open everything
+    with pytest.raises(InputError, match=rf"is {owner}'s: have them take it away, or share .* \(chmod g\+w\)"):
+        claimed(tmp_path).__enter__()
 
 
 def test_without_locks_a_run_goes_on_and_says_so_and_a_shared_name_is_refused(

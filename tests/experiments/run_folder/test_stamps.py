@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from gsx.experiments.run_folder.stamps import tree_stamp
+from gsx.experiments.run_folder.stamps import READ, tree_stamp
 
 
 def scene_in(folder: Path) -> Path:
@@ -23,7 +23,10 @@ def test_a_folder_is_known_by_what_it_holds_wherever_it_lies(tmp_path: Path) -> 
     assert tree_stamp(tmp_path / "elsewhere", Path("outputs")) == stamp
     photo = second / "images" / "a.png"
     os.utime(photo, ns=(0, 10**9 + 1))
-    touched = tree_stamp(second, Path("outputs"))
+    assert tree_stamp(second, Path("outputs")) == stamp
+    photo.write_text("images/b.png")
+    os.utime(photo, ns=(0, 10**9))
+    other = tree_stamp(second, Path("outputs"))
     photo.write_text("another photo")
     os.utime(photo, ns=(0, 10**9))
     larger = tree_stamp(second, Path("outputs"))
@@ -34,7 +37,16 @@ def test_a_folder_is_known_by_what_it_holds_wherever_it_lies(tmp_path: Path) -> 
     renamed = tree_stamp(second, Path("outputs"))
     (second / "images" / "c.png").rename(second / "a.png")
     moved = tree_stamp(second, Path("outputs"))
-    assert len({stamp, touched, larger, renamed, moved}) == 5
+    assert len({stamp, other, larger, renamed, moved}) == 5
+
+
+def test_large_files_are_known_by_their_size_and_time(tmp_path: Path) -> None:
+    large, stamps = tmp_path / "points3D.bin", []
+    large.write_bytes(bytes(READ + 1))
+    for time in (10**9, 10**9, 10**9 + 1):
+        os.utime(large, ns=(0, time))
+        stamps.append(tree_stamp(tmp_path, Path("outputs")))
+    assert stamps[0] == stamps[1] != stamps[2]
 
 
 def test_what_gsx_writes_beside_photos_and_hidden_names_change_no_stamp(tmp_path: Path) -> None:

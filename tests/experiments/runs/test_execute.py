@@ -1,5 +1,6 @@
 """Whole runs: what they leave, exact resume, repeatability, zoom evaluation, interruption."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -134,7 +135,7 @@ def test_only_the_newest_checkpoints_are_kept(finished: Path) -> None:
     assert len(list((finished / "checkpoints").glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "no sidecar data", "schema", "head", "views", "order"])
+@pytest.mark.parametrize("damage", ["truncate", "flip", "gone", "no sidecar data", "head", "views", "order"])
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -154,13 +155,42 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
     elif damage in ("views", "order"):
         changed = {"views": {"train": None}} if damage == "views" else {"sampler": [6]}  # of views 0 to 5
         sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | changed))
-    elif damage == "schema":
-        sidecar.write_text(sidecar.read_text().replace('"schema": 1', '"schema": 99'))
+    elif damage == "gone":
+        newest.unlink()
     else:
         sidecar.write_text("{")
     run, _ = open_run(folder, plugins())
     assert run.step == 3
     assert str(newest.with_suffix("")) in caplog.text
+
+
+@pytest.mark.parametrize("hindrance", ["schema", "permission"])
+def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
+    tmp_path: Path, hindrance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3"), stop_after=5)
+    newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
+    read_bytes = Path.read_bytes
+
+    def refused(path: Path) -> bytes:
+        if path == newest:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return read_bytes(path)
+
+    if hindrance == "schema":
+        sidecar = newest.with_suffix(".json")
+        sidecar.write_text(sidecar.read_text().replace('"schema": 1', '"schema": 2'))
+    else:
+        monkeypatch.setattr(Path, "read_bytes", refused)
+    before = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    capsys.readouterr()
+    assert main(["resume", str(folder)]) == 2
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith("gsx: ")
+    assert str(newest) in said
+    assert ("has schema 2, this gsx reads schema 1" if hindrance == "schema" else "Permission denied") in said
+    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == before
 
 
 def test_without_any_usable_checkpoint_the_error_says_so(tmp_path: Path) -> None:

@@ -143,8 +143,26 @@ def test_a_run_that_is_asked_to_stop_leaves_an_event_at_once(tmp_path: Path, mon
     assert_ends_as(run.folder, tmp_path / "whole")
 
 
+def test_a_batch_is_left_between_its_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = (*SHORT, "training.batch=3")
+    tiny_run(tmp_path / "whole", batch)
+    view_loss, seen = trainer.view_loss, list[int]()
+
+    def stopping(run: Run, *given: Any) -> Any:
+        seen.append(run.step)
+        run.stopping = len(seen) == 8  # the second view of the third step
+        return view_loss(run, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "view_loss", stopping)
+        run = tiny_run(tmp_path / "run", batch)
+    assert (run.step, len(seen)) == (2, 8)
+    assert all(parameter.grad is None for parameter in run.backbone.table.parameters.values())
+    assert_ends_as(run.folder, tmp_path / "whole")
+
+
 class Sending:
-    """Listener: sends a signal to this process after a step."""
+    """Listener: sends a signal to this process after a step, and again before the checkpoint is written."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -153,6 +171,11 @@ class Sending:
     def gsx_step_finished(self, run: Run) -> None:
         if run.step == 3:
             os.kill(os.getpid(), self.number)
+
+    @hookimpl(tryfirst=True)
+    def gsx_training_finished(self, run: Run) -> None:
+        assert not list((run.folder / "checkpoints").glob("*.json"))
+        os.kill(os.getpid(), self.number)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR2"])
@@ -165,7 +188,7 @@ def test_signals_of_a_jobs_end_keep_its_last_step(tmp_path: Path, name: str) -> 
             train(tiny_settings(tmp_path / "run", *SHORT), loaded, [])
     finally:
         signal.signal(number, before)
-    assert received == [name]  # once stopped, it goes to whoever waited for it before
+    assert received == [name]  # once stopped and saved, it goes to whoever waited for it before
     assert ended.value.code == 128 + number
     assert [path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.json")] == ["step_0000003"]
 
@@ -184,10 +207,14 @@ def test_a_signal_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
 def test_resume_finishes_what_was_killed_after_the_evaluation(whole: Path, tmp_path: Path, gone: str) -> None:
     copy = tmp_path / "run"
     shutil.copytree(whole, copy)
+    (copy / "log.txt").touch()  # that of the command line
     assert main(["resume", str(copy)]) == 2  # there is nothing left to do
     (copy / gone).unlink()
     (copy / "status.json").write_text('{"state": "running", "step": 8}')
-    assert state_of(read_run(copy))[0] == ("ok" if gone == "report.html" else "running")
+    assert state_of(read_run(copy)) == (
+        "running",
+        f"under way or killed: 8 of 8 steps, evaluated at step 8, without {gone}",
+    )
     assert main(["resume", str(copy)]) == 0
     assert (copy / gone).is_file()
     assert state_of(read_run(copy)) == ("ok", "")

@@ -103,6 +103,46 @@ def test_an_edited_config_is_refused_and_an_override_is_kept(run: Path, caplog: 
     assert changed["training.ssim_weight"] == [0.2, 0.1]
 
 
+def test_an_edited_config_is_refused_by_another_source_too(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    alter(run, source="0123")
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("ssim_weight: 0.2", "ssim_weight: 0.3"))
+    with pytest.raises(InputError, match=r"other options \(config.yaml was edited, or another rev.* --changed"):
+        resumed(run)
+    (run / "config.yaml").write_text(text.replace("  pixel: sample\n", ""))  # as of a gsx that had no such option
+    with pytest.raises(InputError, match=r"this one reads otherwise: rasterizer\.pixel\)"):
+        resumed(run)
+    assert "history" not in facts(run)
+    resumed(run, changed=True)
+    assert "the run goes on with other options (config.yaml was edited" in caplog.text
+    (entry,) = facts(run)["history"]
+    assert {"source", "rasterizer.pixel"} <= entry["changed"].keys()
+
+
+@pytest.mark.parametrize("content", [None, "{", '{"history": 3}'])
+def test_without_what_it_began_with_a_run_says_so_and_goes_on(
+    run: Path, content: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    began = facts(run)
+    path = run / "environment.json"
+    if content is None:
+        path.unlink()
+    else:
+        path.write_text(content)
+    resumed(run)
+    (said,) = warned(caplog)
+    assert "environment.json is missing" in said if content is None else "environment.json" in said
+    assert "is not known; that file is written anew" in said
+    now = facts(run)
+    assert now["source"] == f"unknown+{began['source']}"
+    assert now["scene"] == began["scene"]
+    assert [(entry["step"], list(entry["changed"])) for entry in now["history"]] == [(1, ["environment.json"])]
+    assert content is None or (run / "environment.damaged").read_text() == content
+    caplog.clear()
+    resumed(run)
+    assert warned(caplog) == [], "compared with what was written anew"
+
+
 def test_a_config_that_lags_behind_its_history_goes_on(run: Path) -> None:
     """Killed between both: the history has the digest of options that config.yaml has not got yet."""
     resumed(run, "iterations=6")

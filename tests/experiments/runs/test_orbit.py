@@ -248,6 +248,7 @@ def test_videos_hold_the_frames(tmp_path: Path, suffix: str) -> None:
         ("a", 10, r"use \.gif"),
         ("a.gif", 0, "0 frames per second"),
         ("a.gif", 60, "60 frames per second.*50"),
+        ("a.gif", 1e-300, "1e-300 frames per second: use 0.1 to 50"),
     ],
 )
 def test_unsuitable_requests_are_refused(tmp_path: Path, name: str, fps: float, message: str) -> None:

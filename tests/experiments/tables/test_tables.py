@@ -12,9 +12,10 @@ import pytest
 from tiny import leave_results
 
 from gsx.core.cache import source_revision
+from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published
-from gsx.experiments.tables.table import Table, protocol_differences, table_of
+from gsx.experiments.tables.table import Table, measured, protocol_differences, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
 
 DATASET = {"title": "Set & Co", "folder": "set", "needs": [], "scenes": {"one": "Scene One", "two": "Scene Two"}}
@@ -44,7 +45,7 @@ def write_run(place: Path, psnr: float | None) -> None:
     zoom = {"1": {"psnr": psnr}, "2": {"psnr": psnr - 1, "detail": {"render": {"explained": psnr / 100}}}}
     evaluation = figures | {"train_seconds": 12.0, "groups": groups, "zoom": zoom}
     (place / "evaluation.json").write_text(json.dumps(evaluation))
-    leave_results(place)
+    leave_results(place, 10)
 
 
 @pytest.fixture
@@ -68,6 +69,17 @@ def table(tmp_path: Path) -> Table:
     )  # fmt: skip
     published = Published(name="p", figures=figures, notes=["a slip"])
     return table_of(experiment, {"set": DATASET}, cells, published, {}, ["iterations=10 (paper: 40000)"])
+
+
+def test_figures_hold_when_checkpoints_were_deleted_and_not_when_results_were(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", 20.0)
+    for path in (tmp_path / "run" / "checkpoints").iterdir():
+        path.unlink()
+    files = read_run(tmp_path / "run")
+    assert state_of(files)[0] == "interrupted"
+    assert measured(files, "PSNR", "") == 20.0
+    (tmp_path / "run" / "point_cloud.ply").unlink()
+    assert measured(read_run(tmp_path / "run"), "PSNR", "") is None
 
 
 def test_means_over_scenes_of_means_over_seeds_and_half_their_range(table: Table) -> None:

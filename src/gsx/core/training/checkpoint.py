@@ -1,7 +1,8 @@
 """Checkpoints: safetensors and a JSON sidecar with its sha256, written atomically, no pickle.
 
 A checkpoint holds everything a resumed run needs to continue bit for bit. The sidecar is written last: a checkpoint
-without one does not exist. A damaged checkpoint is named, and the one before it is used.
+without one does not exist. A damaged checkpoint is named, and the one before it is used; one that this process may not
+read, or of another gsx, is not damaged, and nobody goes on from an older one.
 """
 
 import hashlib
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.errors import CheckpointError
+from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, write_json
 from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.run import Run
@@ -90,7 +91,9 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Sidecar and tensors of one checkpoint.
 
     Raises:
-        CheckpointError: it is missing, truncated, altered, or of another schema.
+        CheckpointError: it is missing, truncated, altered, or not what gsx writes.
+        InputError: it is of another schema.
+        OSError: this process may not read it, or cannot now, which says nothing of it.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
@@ -98,23 +101,29 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     path = sidecar.with_suffix(".safetensors")
     try:
         meta, data = read_json(sidecar), path.read_bytes()
-    except (OSError, ValueError) as error:
+    except (FileNotFoundError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
     if not isinstance(meta, dict):
         raise CheckpointError(f"checkpoint {sidecar} holds no JSON object: remove it to use an older one")
-    if meta.get("schema") != SCHEMA:
-        raise CheckpointError(
-            f"checkpoint {path} has schema {meta.get('schema')}, this gsx reads schema {SCHEMA}: "
-            "use the version of gsx named in the run's environment.json"
-        )
+    refuse_other_schema(meta, path)
     if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
         raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
-    if not sound(meta, step_of(sidecar)):
+    if meta.get("schema") != SCHEMA or not sound(meta, step_of(sidecar)):
         raise CheckpointError(f"checkpoint {sidecar} is not what gsx writes: remove it to use an older one")
     try:
         return meta, from_bytes(data)
     except SafetensorError as error:
         raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+
+
+def refuse_other_schema(meta: dict[str, Any], path: Path) -> None:
+    """Raise InputError for a checkpoint of another gsx."""
+    schema = meta.get("schema")
+    if isinstance(schema, int) and schema != SCHEMA:
+        raise InputError(
+            f"checkpoint {path} has schema {schema}, this gsx reads schema {SCHEMA}: use the version of gsx named in "
+            "the run's environment.json, or move the checkpoint away to use an older one"
+        )
 
 
 def sound(meta: dict[str, Any], step: int) -> bool:
@@ -139,6 +148,7 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]
 
     Raises:
         CheckpointError: there is none.
+        InputError, OSError: a newer one is not damaged, but cannot be read here.
     """
     problems, damaged = [], list[Path]()
     for sidecar in reversed(sidecars(folder / "checkpoints")):
@@ -158,6 +168,10 @@ def restore(run: Run, training: bool = False) -> None:
 
     Where it is to go on (`training`), newer ones that were read and found damaged are set aside: they must not outlive
     good ones. Who only looks changes nothing: what it cannot read may be another process's, half written.
+
+    Raises:
+        CheckpointError: there is no usable one, or it is of a run with other views or options.
+        InputError, OSError: a newer one is not damaged, but cannot be read here.
     """
     meta, tensors, damaged = newest(run.folder)
     refuse_other_views(run, meta["views"])

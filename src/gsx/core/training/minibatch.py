@@ -25,6 +25,7 @@ def taken_or_not(run: Run) -> Iterator[None]:
     except BaseException:
         run.generator.set_state(colours)
         run.sampler.put_back()
+        zero_grad(run.backbone.table)
         raise
 
 

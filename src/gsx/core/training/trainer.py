@@ -88,6 +88,7 @@ def backward(run: Run) -> Step:
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
     views, steps = run.resolution.views(number), []
     for view, terms, colour in zip(picked, asked, colours, strict=True):
+        run.refuse_if_stopping()
         with gradients_added(run.backbone.table):
             given = [term for term in terms if term is not None]
             steps.append(view_loss(run, number, views[view], given, colour))

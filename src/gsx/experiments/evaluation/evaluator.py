@@ -280,7 +280,7 @@ class Evaluator:
             "render_fps": 1 / statistics.median(self.times[1:11] or self.times),  # after the first, which warms up
             "render_path": path_of(run.raster, run.device),
             "train_seconds": run.seconds,
-            "peak_memory_mb": highest([peak_memory_mb(run.device), *(line["memory_mb"] for line in run.curves)]),
+            "peak_memory_mb": highest([peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.curves)]),
             "groups": {name: group_figures(vs) for name, vs in by_group.items()},
             "zoom": self.zooms(views, drawing, advance),
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],

@@ -23,6 +23,8 @@ COLOURS, DASHES = 6, 3
 """Colours of the page, and ways to draw each: solid, dashed or hollow, dotted or faint."""
 STYLES = COLOURS * DASHES
 """Curves or points that can be told apart."""
+LEAST, MOST = 1e-30, 1e30
+"""Sizes between which logarithmic axes, and beyond which no axes, have room for numbers."""
 DIGITS_DECADES, MOST_DECADES = 4, 8
 """A logarithmic axis over more decades is marked with powers of ten only; over yet more, with every other one."""
 
@@ -108,10 +110,10 @@ def linear_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
 
 
 def axis_of(values: Iterable[float], log: bool = False, zero: bool = False) -> Axis:
-    """An axis around the values; `zero`: it begins at 0."""
-    known = list(values)
+    """An axis around the values, at most up to MOST; `zero`: it begins at 0."""
+    known = [min(max(value, -MOST), MOST) for value in values]
     low, high = min(known), max(known)
-    if log and low > 0:
+    if log and low >= LEAST:
         room = max((high / low) ** PADDING, 1.05)
         return Axis(low / room, high * room, True)
     room = PADDING * (high - low) or max(abs(high) * PADDING, 0.5)

@@ -52,7 +52,7 @@ def write_report(folder: Path) -> Path:
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
     path = folder / "report.html"
-    remove_partial(folder, below=False)
+    remove_partial(folder)
     replace_text(path, template("reports/report.html").render(report_context(read_run(folder))))
     return path
 
@@ -77,7 +77,7 @@ def report_on(folders: Sequence[Path], to: Path | None = None) -> Path:
 
 def report_context(run: RunFiles) -> dict[str, Any]:
     """What the template of a run's report needs."""
-    state, reason = state_of(run)
+    state, reason = state_of(run, reporting=True)
     evaluation, environment = run.evaluation, run.environment
     drawn = run.pictures.get("views", [])
     return {
@@ -366,7 +366,7 @@ def bars(views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     if not known:
         return []
     low = min(known) - 0.25 * (max(known) - min(known)) - 0.5
-    scale = 100 / (max(known) - low)
+    scale = 100 / ((max(known) - low) or 1)  # of huge figures 0.5 is nothing
     return [
         {"name": view.get("name", "?"), "psnr": view["psnr"], "height": round((view["psnr"] - low) * scale, 1)}
         for view in views

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import platform
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -106,13 +107,31 @@ def opened(path: Path, folder: Path) -> IO[str]:
         InputError: it cannot be opened.
     """
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    known = f"{path}, by which processes know of each other,"
     try:
-        return os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
+        number = os.open(path, flags, 0o666)
+    except PermissionError as error:
+        raise InputError(
+            f"{known} is {owner(path)}'s: have them take it away, or share {folder} with you (chmod g+w)"
+        ) from error
     except OSError as error:
         raise InputError(
-            f"{path}, by which processes know of each other, cannot be opened ({error.strerror}): it must be writable "
-            f"and no link; see who trains in {folder} before you remove it"
+            f"{known} cannot be opened ({error.strerror}): it must be writable and no link; see who trains in {folder} "
+            "before you remove it"
         ) from error
+    found = os.fstat(number)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:  # its content would be lost
+        os.close(number)
+        raise InputError(f"{known} is no file of its own, but a link, pipe or device: remove it")
+    return os.fdopen(number, "r+", encoding="utf-8")
+
+
+def owner(path: Path) -> str:
+    """The user whose file it is, in words; of a file in a folder that cannot be written to, the folder's."""
+    try:
+        return (path if path.exists() else path.parent).owner()
+    except (OSError, KeyError, NotImplementedError):
+        return "another user"
 
 
 def same_file(stream: IO[str], path: Path) -> bool:

@@ -1,13 +1,15 @@
 """What a run folder holds, read from files alone: any of them may be missing, cut short or damaged."""
 
 import json
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from gsx.core.files import read_json
+from gsx.core.files import is_file, read_json
+from gsx.core.gaussians.suffixes import suffix_of
+from gsx.experiments.run_folder.heads import checkpoint_problem, newest_checkpoint, splats_problem
 from gsx.experiments.run_folder.renamed import renamed
 
 DETAIL_OF = ("render", "enlarged", "photograph")
@@ -15,6 +17,15 @@ DETAIL_OF = ("render", "enlarged", "photograph")
 SPLATS = "point_cloud.ply"
 RESULTS = ("evaluation.json", "renders/index.json", SPLATS)
 """Files that end every run; `gsx eval` makes them again."""
+BEGUN, LOG = ("environment.json", "metrics.jsonl"), "log.txt"
+"""Files that a run begins with."""
+COMPACT = "compact.json"
+"""Of a folder that `gsx compact` made, which has no log, and of the others of BEGUN those of the run it was given."""
+REPORT = "report.html"
+LOST = ("metrics.jsonl", "checkpoints/")
+"""What nothing makes again of a run that is trained to its end; but from an older checkpoint, the newest."""
+LARGEST = 1e100
+"""Numbers beyond it are none that a run has, and not safe to reckon with."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -51,18 +62,53 @@ class RunFiles:
     @property
     def remedy(self) -> str:
         """The command that completes the run."""
-        verb = "eval" if 0 < self.iterations <= self.step else "resume"
+        only_results = not any(name.startswith((*self.begun, "checkpoints/")) for name in self.lacking)
+        verb = "eval" if only_results and 0 < self.iterations <= self.step else "resume"
         return f"gsx {verb} {self.folder}"
 
     @property
+    def begun(self) -> tuple[str, ...]:
+        """Files that its beginning leaves."""
+        made = read_mapping(self.folder, COMPACT, {}, lambda content: isinstance(content.get("from"), str))
+        if not made:
+            return (*BEGUN, LOG)
+        return () if suffix_of(Path(made["from"])) else BEGUN
+
+    @cached_property
     def missing(self) -> list[str]:
         """Files that a complete run has and this one lacks; but for its report, which is made of them."""
-        return [name for name in ("environment.json", "metrics.jsonl", *RESULTS) if not (self.folder / name).is_file()]
+        names = [*self.begun, *RESULTS, *pictures_in(self.pictures), "status.json"]
+        step = max(newest_checkpoint(self.folder), int(self.evaluation.get("step") or 0))
+        if self.evaluation:
+            names += [f"checkpoints/step_{step:07d}{suffix}" for suffix in (".safetensors", ".json")]
+        return [name for name in names if not is_file(self.folder / name)]
+
+    @cached_property
+    def damaged(self) -> dict[str, str]:
+        """What is wrong, by file, with those that a complete run has: what is read of them, and sizes of the others."""
+        found = {name: told for name, told in self.problems.items() if name not in LOST}
+        if self.iterations > 0 and not self.lines and "metrics.jsonl" in self.begun:
+            found["metrics.jsonl"] = "metrics.jsonl holds no line of the run"
+        found[SPLATS] = splats_problem(self.folder / SPLATS)
+        found["checkpoints/"] = checkpoint_problem(self.folder)
+        return {name: told for name, told in found.items() if told and name not in self.missing}
+
+    @property
+    def lacking(self) -> list[str]:
+        """Files that are missing or damaged."""
+        return [*self.missing, *self.damaged]
+
+    @property
+    def lost(self) -> list[str]:
+        """Those of LOST."""
+        return [name for name in self.lacking if name.startswith(LOST)]
 
     @property
     def unfinished(self) -> list[str]:
-        """Those of `missing` that are results."""
-        return [name for name in self.missing if name in RESULTS]
+        """Those that a run makes again which goes on: results, and with a checkpoint whatever else is not `lost`."""
+        kept = not any(name.startswith("checkpoints/") for name in self.lacking)
+        results = (*RESULTS, "renders/", "pseudo/")
+        return [name for name in self.lacking if name.startswith(results) or (kept and name not in self.lost)]
 
     @property
     def scene(self) -> str:
@@ -125,7 +171,9 @@ def sound_evaluation(content: dict[str, Any]) -> bool:
     """Whether the parts of an evaluation.json that there are have the form that gsx gives them."""
     zoom, groups = content.get("zoom", {}), content.get("groups", {})
     named = all(isinstance(node, dict) and rows(list(node.values())) for node in (zoom, groups))
-    sound = sound_step(content) and named and all(map(is_decimal, zoom)) and rows(content.get("views", []))
+    views = content.get("views", [])
+    called = rows(views) and all(isinstance(view.get("name", ""), str) for view in views)
+    sound = sound_step(content) and named and called and all(map(is_decimal, zoom))
     return sound and sound_incidents(content) and sound_protocol(content.get("protocol", {}))
 
 
@@ -147,14 +195,18 @@ def sound_incidents(content: dict[str, Any]) -> bool:
     cap, pseudo, left_out = content.get("withheld", {}), content.get("pseudo", {}), content.get("left_out", 0)
     if not (isinstance(cap, dict) and isinstance(pseudo, dict) and rows(list(pseudo.values())) and is_number(left_out)):
         return False
+    if not all(isinstance(facts.get("warned", {}), dict) for facts in pseudo.values()):
+        return False
     by_scale = [node for facts in pseudo.values() for node in (facts.get("dropped"), *part(facts, "warned").values())]
     numbers = all(isinstance(node, dict) and all(map(is_number, node.values())) for node in by_scale)
     return numbers and (not cap or is_number(cap.get("step")))
 
 
 def sound_environment(content: dict[str, Any]) -> bool:
-    """Whether the history of an environment.json has the form that gsx gives it."""
+    """Whether the history and notes of an environment.json have the form that gsx gives them."""
     history = content.get("history", [])
+    if not isinstance(part(content, "scene").get("notes", []), list):
+        return False
     changes = [change for entry in history for change in part(entry, "changed").values()] if rows(history) else [None]
     return all(isinstance(change, list) and len(change) == 2 for change in changes)
 
@@ -169,6 +221,34 @@ def sound_pictures(content: dict[str, Any]) -> bool:
     return sized and all(isinstance(name, str) and Path(name).name not in ("", "..") for name in names)
 
 
+def pictures_in(index: dict[str, Any]) -> list[str]:
+    """Pictures that a sound renders/index.json names, as files of the run's folder."""
+    entries = [*index.get("views", []), *index.get("zoom", [])]
+    names = [name for entry in entries for name in part(entry, "files").values()]
+    flight = part(index, "flight").get("file")
+    names += [flight] if isinstance(flight, str) and flight else []
+    return [f"renders/{Path(name).name}" for name in names]
+
+
+def sound_line(line: Any) -> bool:
+    """Whether it is a line of metrics.jsonl, as far as a run reads it again."""
+    if not (isinstance(line, dict) and is_number(line.get("step"))):
+        return False
+    figures = all(line.get(key) is None or is_number(line[key]) for key in ("memory_mb", "withheld", "test_psnr"))
+    accounts = line.get("pseudo", {})
+    return figures and isinstance(accounts, dict) and all(map(sound_account, accounts.values()))
+
+
+def sound_account(account: Any) -> bool:
+    """Whether it counts pictures of pseudo views by scale: those asked for, dropped, and by check warned of."""
+    warned = account.get("warned") if isinstance(account, dict) else None
+    if not isinstance(warned, dict):
+        return False
+    counts = [account.get("asked"), account.get("dropped"), *warned.values()]
+    by_scale = all(isinstance(count, dict) and all(map(is_decimal, count)) for count in counts)
+    return by_scale and all(is_number(number) for count in counts for number in count.values())
+
+
 def sound_step(content: dict[str, Any]) -> bool:
     """Whether the step, where there is one, is a number."""
     return content.get("step") is None or is_number(content["step"])
@@ -180,9 +260,9 @@ def rows(value: Any) -> bool:
 
 
 def is_decimal(word: str) -> bool:
-    """Whether a key, of JSON and so a text, is a finite number."""
+    """Whether a key, of JSON and so a text, is a number as in `is_number`."""
     try:
-        return math.isfinite(float(word))
+        return is_number(float(word))
     except ValueError:
         return False
 
@@ -238,7 +318,7 @@ def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
             line = json.loads(text)
         except (ValueError, RecursionError):
             line = None
-        if isinstance(line, dict) and is_number(line.get("step")):
+        if sound_line(line):
             intact.append(line)
         else:
             damaged += 1
@@ -248,8 +328,8 @@ def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Whether it is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether it is a finite number of a size that a run may have."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
 
 
 def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
@@ -264,29 +344,44 @@ def detail_share(entry: dict[str, Any], kind: str = "render") -> float | None:
     return share if is_number(share) else None
 
 
-def state_of(files: RunFiles) -> tuple[str, str]:
-    """One of STATES, and the reason where it is not `ok`."""
+def state_of(files: RunFiles, reporting: bool = False) -> tuple[str, str]:
+    """One of STATES, and the reason where it is not `ok`; `reporting`: its report is about to be written."""
     recorded = files.status.get("state")
     for name in ("config.yaml", "evaluation.json"):
         if name in files.problems:
             return "corrupted", files.problems[name]
     if recorded == "failed":
         return "failed", str(files.status.get("reason") or "no reason recorded")
-    evaluated = int(files.evaluation.get("step") or 0)
-    done = files.evaluation and evaluated >= max(files.step, files.iterations)
-    if done and not files.unfinished:
+    evaluated, done = int(files.evaluation.get("step") or 0), judged(files)
+    if done and files.damaged:
+        return "corrupted", "; ".join(files.damaged.values())
+    without = [*files.missing, *([] if reporting or is_file(files.folder / REPORT) else [REPORT])]
+    if done and not without:
         return "ok", ""
     progress = f"{files.step:,} of {files.iterations:,} steps, "
     progress += f"evaluated at step {evaluated:,}" if files.evaluation else "not evaluated"
     if done:
-        progress += f", without {', '.join(files.unfinished)}"
+        progress += f", without {', '.join(without)}"
     return ("running", f"under way or killed: {progress}") if recorded == "running" else ("interrupted", progress)
+
+
+def judged(files: RunFiles) -> bool:
+    """Whether its last state was evaluated."""
+    return bool(files.evaluation) and int(files.evaluation.get("step") or 0) >= max(files.step, files.iterations)
+
+
+def has_figures(files: RunFiles) -> bool:
+    """Whether a run is done, if perhaps without what nothing makes again, such as checkpoints that were deleted."""
+    if state_of(files)[0] == "ok":
+        return True
+    sound = files.status.get("state") == "ok" and "config.yaml" not in files.problems
+    return sound and judged(files) and set(files.lacking) <= set(files.lost)
 
 
 def reported(folder: Path) -> bool:
     """Whether a run's report is of its last state, which is recorded before the report is written."""
     try:
-        return (folder / "report.html").stat().st_mtime_ns >= (folder / "status.json").stat().st_mtime_ns
+        return (folder / REPORT).stat().st_mtime_ns >= (folder / "status.json").stat().st_mtime_ns
     except OSError:
         return False
 

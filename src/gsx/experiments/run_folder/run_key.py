@@ -45,8 +45,8 @@ def without(node: Any, keys: Collection[str], prefix: str = "") -> Any:
 
 
 def scene_stamp(config: dict[str, Any]) -> str:
-    """What the scene of a composition holds: names, sizes and times of the files in its folder, wherever that lies;
-    and of the splat file that it begins with, if there is one.
+    """What the scene of a composition holds: names, sizes and contents (of large files, times) of all in its folder,
+    wherever that lies; and of the splat file that it begins with, if there is one.
 
     Empty for scenes without a folder; `absent: FOLDER` where it is not there. Files outside of the folder count if an
     option of the scene names them.

@@ -1,6 +1,8 @@
 """From settings to a run in memory: device, backbone, augmenters."""
 
+import logging
 import os
+import platform
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.allocator import keep_freed_memory
-from gsx.core.cache import cache_root
+from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
@@ -27,6 +29,8 @@ from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
 from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
+
+logger = logging.getLogger(__name__)
 
 
 def choose_device(name: str) -> torch.device:
@@ -75,9 +79,21 @@ def prepare_process(device: torch.device, training: bool) -> None:
         keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_root() / "compiled"))  # torch's own is lost on restart
+    keep_compiled_code()
     # torch would compile and load programs to see which vector registers there are: the system says so
     os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
+
+
+def keep_compiled_code() -> None:
+    """Have torch keep what it compiles in an entry of the cache: its own place is lost on restart. Where nothing can be
+    written it stays with that."""
+    folder = cache_folder("compiled", content_key(torch.__version__, platform.python_version()))
+    try:
+        (make_folder(folder) / MANIFEST).touch()
+    except (InputError, OSError) as error:
+        logger.info("compiled code is not kept in the cache: %s", error)
+    else:
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
 
 
 def build(

@@ -278,14 +278,14 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
 
 
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
-    """Refuse wrong groups and keys of a multirun before Hydra starts it; of swept values the first is composed.
+    """Refuse wrong groups, keys and values of a multirun before Hydra starts it; of swept values the first is composed.
 
     Returns the folder that its runs go to.
     """
     with hydra_session(plugins):
         parsed = parse_overrides(overrides)
         composed = compose_raw([first_of(override) for override in parsed if override.input_line])
-        return Path(str(composed.output))
+        return Path(settings_from(composed, plugins).general.output)
 
 
 def first_of(override: Any) -> str:

@@ -1,6 +1,7 @@
 """What a run went on with: what differs from its beginning is told, recorded, and refused where it makes another run.
 
-environment.json holds how the run began, and under `history` what had changed each time that it went on.
+environment.json holds how the run began, and under `history` what had changed each time that it went on. Where it is
+gone, it is written anew.
 """
 
 import logging
@@ -13,9 +14,10 @@ from gsx.core.files import remove_partial, write_json
 from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
 from gsx.core.training.run import Run
-from gsx.experiments.run_folder.files import part, read_run
+from gsx.experiments.run_folder.files import RunFiles, part, read_run
 from gsx.experiments.run_folder.run_key import composition_key, trained
 from gsx.experiments.runs.environment import environment
+from gsx.experiments.runs.settings import read_config
 
 logger = logging.getLogger(__name__)
 
@@ -24,8 +26,13 @@ COMPARED = (
     "options",
 )
 """Entries of environment.json that may change between the parts of a run; the bits of its results may, too."""
-DEFINING = {"scene.cameras": "cameras (poses, intrinsics, sizes)", "options": "options (config.yaml was edited)"}
-"""Entries that say which run it is, in words."""
+FACTS = "environment.json"
+CAMERAS, EDITED = "cameras (poses, intrinsics, sizes)", "options (config.yaml was edited)"
+"""What says which run it is, in words."""
+
+
+UNKNOWN = "unknown"
+"""The source that began a run whose environment.json is gone."""
 
 
 def circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,14 +57,17 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
     remove_partial(run.folder)
     files = read_run(run.folder)
     if not files.environment:
+        write_anew(run, plugins, files.problems.get(FACTS, f"{FACTS} is missing"))
         return
     before, now = circumstances(files.environment), circumstances(environment(run, plugins))
     differing = {key: pair for key, pair in changes(before, now).items() if can_be_compared(key, before, now)}
     known = known_options(files.environment)
-    edited = known and composition_key(files.config, "", run.idle) not in known
+    edited = bool(known) and composition_key(files.config, "", run.idle) not in known
+    others = [options_told(run, files, plugins, "source" in differing)] if edited else []
     if not changed:
-        others = ["options"] if edited and "source" not in differing else []  # another source may read it otherwise
-        refuse_another(run, [*(key for key in differing if key != "options"), *others])
+        refuse_another(run, [*([CAMERAS] if "scene.cameras" in differing else []), *others])
+    for words in others:
+        logger.warning("the run goes on with other %s", words)
     asked = changes(trained(files.config, run.idle), trained(run.config, run.idle)) if files.config else {}
     for key, (then, value) in (differing | asked).items():
         if key != "options":
@@ -85,9 +95,34 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tupl
     return {key: (then.get(key), later.get(key)) for key in keys if then.get(key) != later.get(key)}
 
 
-def refuse_another(run: Run, differing: Sequence[str]) -> None:
-    """Raise InputError if what defines a run is among the entries that differ."""
-    names = [words for key, words in DEFINING.items() if key in differing]
+def options_told(run: Run, files: RunFiles, plugins: Plugins, other_source: bool) -> str:
+    """Options that are not those of the run, in words: by another source they may be the same, and read otherwise."""
+    if not other_source:
+        return EDITED
+    read = read_config(run.folder / "config.yaml", plugins).resolved
+    otherwise = ", ".join(changes(trained(files.config, run.idle), trained(read, run.idle)))
+    named = f"; this one reads otherwise: {otherwise}" if otherwise else ""
+    return f"options (config.yaml was edited, or another revision of gsx's source told them apart otherwise{named})"
+
+
+def write_anew(run: Run, plugins: Plugins, problem: str) -> None:
+    """Tell and record that nobody knows what the run began with; what is there of a damaged file is kept beside it."""
+    path = run.folder / FACTS
+    if path.exists():
+        path.replace(path.with_suffix(".damaged"))
+    logger.warning(
+        "%s, %s: whether the run goes on with the scene, options and versions that it began with is not known; that "
+        "file is written anew",
+        run.folder,
+        problem,
+    )
+    facts = environment(run, plugins)
+    facts["source"] = f"{UNKNOWN}+{facts['source']}"
+    write_json(path, facts | {"history": [entry_of(run, {FACTS: (problem, "written anew")})]})
+
+
+def refuse_another(run: Run, names: Sequence[str]) -> None:
+    """Raise InputError if something that defines a run differs."""
     if names:
         raise InputError(
             f"{run.folder} was trained to step {run.step} with other {' and '.join(names)}: restore them, or go on all "
@@ -113,11 +148,14 @@ def record(run: Run, facts: dict[str, Any], differing: Mapping[str, tuple[Any, A
     source = str(facts.get("source", ""))
     if "source" in differing:
         source = "+".join(filter(None, [source, differing["source"][1]]))
-    entry = {
+    history = [*facts.get("history", []), entry_of(run, differing)]
+    write_json(run.folder / FACTS, facts | {"source": source, "history": history})
+
+
+def entry_of(run: Run, differing: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
+    """What has changed now, for the history."""
+    return {
         "step": run.step,
         "at": datetime.now().isoformat(sep=" ", timespec="seconds"),
         "changed": {key: list(values) for key, values in differing.items()},
     }
-    write_json(
-        run.folder / "environment.json", facts | {"source": source, "history": [*facts.get("history", []), entry]}
-    )

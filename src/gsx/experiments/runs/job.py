@@ -52,8 +52,8 @@ def logged_to(folder: Path) -> Iterator[None]:
 def interruptible(run: "Run") -> Iterator[object]:
     """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
 
-    So do the signals by which a cluster takes a machine back (STOPPING): with a checkpoint at hand they are sent again,
-    to whoever waited for them before.
+    The signals by which a cluster takes a machine back (STOPPING) end training, too; they may come again until the
+    checkpoint is written. Then the first is sent again, to whoever waited for it before.
 
     Yields a listener that takes the handlers away when training is over. Threads but the main one hear no signals.
     """
@@ -64,23 +64,23 @@ def interruptible(run: "Run") -> Iterator[object]:
     def stop(number: int, frame: Any) -> None:
         run.stopping = True
         received.append(number)
-        give_back()
+        give_back(signal.SIGINT)
 
-    def give_back() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def give_back(*numbers: int) -> None:
+        for number in numbers:
+            signal.signal(number, before[number])
 
     class UntilTrained:
-        @hookimpl
+        @hookimpl(trylast=True)  # the checkpoint first
         def gsx_training_finished(self) -> None:
-            give_back()
+            give_back(*before)
 
     main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *heeded()) if main}
+    before = {int(number): signal.signal(number, stop) for number in (signal.SIGINT, *heeded()) if main}
     try:
         yield UntilTrained()
     finally:
-        give_back()
+        give_back(*before)
     if received and received[0] in STOPPING and not run.complete:
         logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
         signal.raise_signal(received[0])

@@ -11,7 +11,7 @@ from pathlib import Path
 from gsx.core.cache import source_revision
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, InputError
-from gsx.core.files import write_json
+from gsx.core.files import keep_names, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -58,15 +58,17 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
     if settings.general.folder:
         folder = Path(settings.general.folder)
         folder.mkdir(parents=True, exist_ok=True)
+        keep_names(folder.parent)
         return folder
     parent = Path(settings.general.output) / scene.name / settings.backbone.component.name
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     for suffix in ("", *(f"_{n}" for n in range(2, 1000))):
         try:
             (parent / (stamp + suffix)).mkdir(parents=True)
-            return parent / (stamp + suffix)
         except FileExistsError:  # another run began in the same second
             continue
+        keep_names(parent)
+        return parent / (stamp + suffix)
     raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
@@ -175,7 +177,8 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
     folder = place_of(settings.resolved, stamp, settings.idle)
     files = read_run(folder)
     if finished(files, settings.resolved, stamp, settings.idle):
-        logger.info("finished earlier%s: %s", by_another(files), folder)
+        lost = f", {', '.join(files.lost)} lost since" if files.lost else ""
+        logger.info("finished earlier%s%s: %s", by_another(files), lost, folder)
         return folder, None
     at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:

@@ -34,6 +34,8 @@ LEAST_SWING = math.radians(2)
 """Smallest half-swing, so that something moves with a single camera."""
 LARGEST_EDGE = 8192
 """Frames larger than this in either direction are refused, px; each frame is written before the next is rendered."""
+SLOWEST, FASTEST = 0.1, 1000
+"""Frames per second of an animation."""
 GIF_FASTEST = 50
 """GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
 
@@ -198,8 +200,9 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
         InputError: the suffix, the speed or a frame size is unsuitable, there are no frames, or PyAV is missing.
     """
     writer = writer_for(path)
-    if not 0 < fps <= (GIF_FASTEST if writer is write_gif else 1000):
-        raise InputError(f"{path} cannot play at {fps} frames per second: use 1 to {GIF_FASTEST}")
+    fastest = GIF_FASTEST if writer is write_gif else FASTEST
+    if not SLOWEST <= fps <= fastest:
+        raise InputError(f"{path} cannot play at {fps:g} frames per second: use {SLOWEST:g} to {fastest}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         writer(partial, checked(path, frames), fps)

@@ -10,7 +10,7 @@ from gsx.core.cache import source_revision
 from gsx.core.files import read_json
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
-from gsx.experiments.run_folder.files import RunFiles, detail_share, is_number, part, read_run, state_of
+from gsx.experiments.run_folder.files import RunFiles, detail_share, has_figures, is_number, part, read_run, state_of
 from gsx.experiments.run_folder.run_key import NAMES, WHERE, asked_for, comparable, other_revision, without
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
@@ -225,7 +225,7 @@ def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
 
 def measured(files: RunFiles, metric: str, group: str) -> float | None:
     """A figure of a run that is done."""
-    if state_of(files)[0] != "ok":
+    if not has_figures(files):
         return None
     if " x" in metric:
         value = None if group else zoom_figure(files.evaluation, metric)
@@ -252,7 +252,7 @@ def problem_of(
         state, why = state_of(files[cell.folder])
         if not files[cell.folder].config:
             return "not run yet"
-        if state != "ok":
+        if not has_figures(files[cell.folder]):
             return f"{state}: {why}"
     remedy = ": give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE" if metric == "LPIPS" else ""
     return f"{metric} is not measured{remedy}" if cells else "not run"
