@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,9 @@ def write(folder: Path, split: str, poses: list[Any], **changes: Any) -> None:
     content = {"camera_angle_x": FOV, "frames": frames} | changes
     (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     for i in range(len(poses)):
-        write_image(folder / split / f"r_{i}.png", picture(i))
+        photo = folder / split / f"r_{i}.png"
+        write_image(photo, picture(i))
+        photo.write_bytes(photo.read_bytes() + split.encode())  # after its end: pictures are alike, files are not
 
 
 @pytest.fixture
@@ -147,7 +150,7 @@ def test_validation_views_stand_in_for_test_views(folder: Path) -> None:
 def test_missing_images_are_named_and_skipped(folder: Path) -> None:
     write(folder, "train", [FRONT, SIDE, FRONT])
     (folder / "train" / "r_1.png").unlink()
-    with pytest.raises(InputError, match=r"1 of the 3 images of .*train/r_1.*scene\.missing=0\.33"):
+    with pytest.raises(InputError, match=r"1 of the 3 images of .*train/r_1.*scene\.missing=0\.34"):
         load(options(folder))
     scene = load(options(folder, missing=0.5))
     assert [view.name for view in scene.train] == ["train/r_0", "train/r_2"]
@@ -167,7 +170,25 @@ def test_names_with_suffix_are_found(folder: Path) -> None:
 
 def test_an_image_of_both_files_is_refused(folder: Path) -> None:
     (folder / "transforms_test.json").write_bytes((folder / "transforms_train.json").read_bytes())
-    with pytest.raises(InputError, match=r"transforms_test.json' lists 2 images that are trained on, too .*r_0.png"):
+    with pytest.raises(
+        InputError, match=r"2 test photographs of .*transforms_test.json' are trained on, too .*r_0.png"
+    ):
+        load(options(folder))
+
+
+@pytest.mark.parametrize("way", [Path.symlink_to, Path.hardlink_to, lambda new, old: new.write_bytes(old.read_bytes())])
+def test_a_training_image_under_another_name_cannot_be_tested_on(folder: Path, way: Callable[..., object]) -> None:
+    (folder / "test" / "r_0.png").unlink()
+    way(folder / "test" / "r_0.png", folder / "train" / "r_1.png")
+    with pytest.raises(InputError, match=r"'[^']*train/r_1\.png' is '[^']*test/r_0\.png' byte for byte\): remove one"):
+        load(options(folder))
+
+
+@pytest.mark.parametrize("way", [Path.symlink_to, Path.hardlink_to])
+def test_one_image_under_two_names_is_refused(folder: Path, way: Callable[..., object]) -> None:
+    (folder / "train" / "r_1.png").unlink()
+    way(folder / "train" / "r_1.png", folder / "train" / "r_0.png")
+    with pytest.raises(InputError, match=r"train\.json' has 'train/r_0' and 'train/r_1', which are one file.*: remove"):
         load(options(folder))
 
 
@@ -212,6 +233,11 @@ def test_unreadable_files_are_refused(folder: Path) -> None:
         ("[]", "no JSON object"),
         ('{"camera_angle_x": 1, "frames": []}', "no frames"),
         ('{"camera_angle_x": 1, "frames": [{}]}', "without 'file_path'"),
+        (f'{{"camera_angle_x": {10**400}, "frames": [{{"file_path": "train/r_0"}}]}}', r"camera_angle_x 10+\.\.\.0+, "),
+        (
+            '{"camera_angle_x": 5e-324, "frames": [{"file_path": "train/r_0"}]}',
+            "camera_angle_x 5e-324, which is no angle",
+        ),
         ('{"fl_x": 1, "frames": [{"file_path": "train/r_0"}]}', "camera_angle_x None.*scene=transforms"),
     ]:
         file.write_text(text)
@@ -225,6 +251,8 @@ def test_unreadable_files_are_refused(folder: Path) -> None:
 def test_options_that_make_no_sense_are_refused(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"scene\.split is 'every:8'"):
         load(options(folder, split="every:8"))
+    with pytest.raises(ConfigError, match=r"scene\.split is 'every:8{194}\.\.\.', but"):
+        load(options(folder, split="every:" + "8" * 5000))
     with pytest.raises(ConfigError, match=r"Did you mean 'centred'\?"):
         load(options(folder, principal_point="centered"))
     with pytest.raises(ConfigError, match="give red, green and blue"):

@@ -42,7 +42,9 @@ def write(folder: Path, count: int = 8, **content: Any) -> None:
     file = {"poses": poses, "scene_scale": SCENE_SCALE, "scene_origin": [0, 0, -6371011], "scale_split": [7, 5, 3, 0]}
     (folder / "poses_enu.json").write_text(json.dumps(file | content))
     for i in range(count):
-        write_image(folder / "images" / f"city_{i:03d}.jpeg", torch.full((3, HEIGHT, WIDTH), i / 10))
+        photo = folder / "images" / f"city_{i:03d}.jpeg"
+        write_image(photo, torch.full((3, HEIGHT, WIDTH), i / 10))
+        photo.write_bytes(photo.read_bytes() + bytes([i]))  # after its end: from number 10 on pictures are alike
 
 
 def write_colmap(folder: Path, count: int = 8) -> None:
@@ -144,7 +146,7 @@ def test_lod_split_in_a_scene(tmp_path: Path) -> None:
         load(options(tmp_path, split="lod:7"))
     with pytest.raises(InputError, match="at least 2 images"):
         load(options(tmp_path, split="lod:6"))
-    for rule in ("lod", "lod:0", "lod:x"):
+    for rule in ("lod", "lod:0", "lod:x", "lod:-1", "lod:nan", f"lod:{'8' * 5000}"):
         with pytest.raises(ConfigError, match="above 0 after lod"):
             load(options(tmp_path, split=rule))
 
@@ -223,6 +225,8 @@ def test_points_of_the_original_data(tmp_path: Path) -> None:
         ({"scale_split": [0, 3, 5, 7]}, r"scale_split \[0, 3, 5, 7\]"),
         ({"scale_split": [7, 5, 3]}, "falling to 0"),
         ({"scene_scale": 0}, "scene_scale 0"),
+        ({"scene_scale": 10**400}, r"scene_scale 10+\.\.\.0+, give a number"),
+        ({"poses": [[10**400] * 17]}, "no table of numbers"),
     ],
 )
 def test_damaged_poses_are_refused(tmp_path: Path, content: dict[str, Any], message: str) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -93,6 +94,7 @@ def test_the_sub_model_with_most_images_is_taken_and_named(tmp_path: Path) -> No
     write_scene(synthesize(frames=3), tmp_path, sparse="sparse/0")
     write_scene(synthesize(frames=6), tmp_path, sparse="sparse/1", text=True)
     write_scene(synthesize(frames=2), tmp_path, sparse="sparse/2")
+    write_photos(synthesize(frames=6), tmp_path / "images")  # over those of the others, of which one is like another
     scene = load(colmap_options(tmp_path))
     assert len(views(scene)) == 6
     assert scene.notes[0] == "Took sub-model 1 with 6 images; not used, with images: 0 (3), 2 (2)."
@@ -286,6 +288,20 @@ def test_binary_file_cut_anywhere_is_named(tmp_path: Path, name: str) -> None:
             check_binary(model)
     file.write_bytes(content[:-1])
     with pytest.raises(InputError, match=rf"{name}\.bin is truncated"):
+        load(colmap_options(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_binary_file_that_goes_on_after_its_last_record_is_named(tmp_path: Path, name: str) -> None:
+    model = write_scene(synthesize(cameras=2, frames=2), tmp_path)
+    file = model / f"{name}.bin"
+    content = file.read_bytes()
+    file.write_bytes(content + b"\0")
+    with pytest.raises(InputError, match=rf"{name}\.bin goes on for 1 bytes after its \d+ records: .* again"):
+        load(colmap_options(tmp_path))
+    (count,) = struct.unpack("<Q", content[:8])
+    file.write_bytes(struct.pack("<Q", count - 1) + content[8:])
+    with pytest.raises(InputError, match=rf"{name}\.bin goes on for \d+ bytes after its {count - 1} records"):
         load(colmap_options(tmp_path))
 
 
@@ -499,6 +515,74 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     content = (model / "images.bin").read_bytes()
     (model / "images.bin").write_bytes(content.replace(b"camera000001_frame000000", b"camera000001_frame00000\xff", 1))
     with pytest.raises(InputError, match=r"names an image by bytes that are no UTF-8 .*rename the photo"):
+        load(colmap_options(tmp_path))
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("prefix", ["", "./", "folder/../"])
+def test_an_image_that_is_registered_twice_is_refused(tmp_path: Path, text: bool, prefix: str) -> None:
+    reconstruction = synthesize()
+    first, second = (image for image in list(reconstruction.images.values())[:2])
+    second.name = f"{prefix}{first.name}"
+    (tmp_path / "images" / "folder").mkdir(parents=True)
+    model = write_scene(reconstruction, tmp_path, text=text)
+    with pytest.raises(
+        InputError, match=rf"'{model}' has .*{first.name}'.*, perhaps to train on and to test on: remove"
+    ):
+        load(colmap_options(tmp_path))
+
+
+@pytest.mark.parametrize("way", ["link", "copy"])
+def test_a_photo_of_two_images_is_refused(tmp_path: Path, way: str) -> None:
+    write_scene(synthesize(), tmp_path)
+    held_out, trained_on = sorted((tmp_path / "images").iterdir())[:2]
+    trained_on.unlink()
+    if way == "link":
+        trained_on.hardlink_to(held_out)
+        said = f"has '{held_out.name}' and '{trained_on.name}', which are one file"
+    else:
+        trained_on.write_bytes(held_out.read_bytes())
+        said = f"'{trained_on}' is '{held_out}' byte for byte"
+    with pytest.raises(InputError, match=re.escape(said)):
+        load(colmap_options(tmp_path))
+
+
+def changed_pose(tmp_path: Path, **changes: float) -> str:
+    """Writes a text model of COLMAP 3 with other numbers for its first image, and returns the name of that."""
+    model = write_scene(synthesize(), tmp_path, text=True)
+    for name in ("rigs.txt", "frames.txt"):
+        (model / name).unlink()
+    lines = (model / "images.txt").read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    words = lines[at].split()
+    for key, value in changes.items():
+        words[("id", "qw", "qx", "qy", "qz", "tx", "ty", "tz").index(key)] = str(value)
+    lines[at] = " ".join(words)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    return words[-1]
+
+
+def test_a_camera_far_off_all_others_is_refused_by_name(tmp_path: Path) -> None:
+    name = changed_pose(tmp_path, tx=1e9)
+    with pytest.raises(InputError, match=rf"camera of '.*{name}' is 2\.3e\+08 times as far from .*: correct its pose"):
+        load(colmap_options(tmp_path))
+
+
+@pytest.mark.parametrize("changes", [{"qw": 1e9}, {"qw": 1e300}, {"qw": 0, "qx": 0, "qy": 0, "qz": 0}])
+def test_a_quaternion_that_is_no_rotation_is_refused_by_name(tmp_path: Path, changes: dict[str, float]) -> None:
+    name = changed_pose(tmp_path, **changes)
+    with pytest.raises(InputError, match=rf"turns {name} by a quaternion of length .* instead of 1: correct"):
+        load(colmap_options(tmp_path))
+
+
+@pytest.mark.parametrize("value", [1e12, 1e300, math.nan, math.inf])
+def test_a_lens_beyond_recognition_is_refused(tmp_path: Path, value: float) -> None:
+    model = write_scene(synthesize("SIMPLE_RADIAL", BENT), tmp_path)
+    content = (model / "cameras.bin").read_bytes()
+    (model / "cameras.bin").write_bytes(content[:-8] + struct.pack("<d", value))
+    with pytest.raises(
+        InputError, match=r"\.png' cannot be undistorted: The SIMPLE_RADIAL camera .*: correct its intr"
+    ):
         load(colmap_options(tmp_path))
 
 

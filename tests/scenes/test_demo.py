@@ -504,6 +504,8 @@ def test_a_cache_that_cannot_be_written_only_costs_time(tmp_path, monkeypatch, c
         ({"downscale": 0}, r"scene\.downscale=0"),
         ({"test_views": 9}, r"scene\.test_views=9"),
         ({"background": [0.5, 2.0, 0.0]}, r"scene\.background"),
+        *(({"split": f"every:{word}"}, r"scene\.split is 'every:") for word in ("0", "-1", "nan", "8" * 5000)),
+        ({"split": "evry:8"}, r"scene\.split is 'evry:8', use one of .*Did you mean 'every:K'"),
     ],
 )
 def test_impossible_counts_are_refused(changes, words):

@@ -186,6 +186,18 @@ def test_photos_that_cannot_be_read_are_skipped_and_named(tmp_path: Path) -> Non
         load(options(tmp_path))
 
 
+def test_too_many_photos_that_cannot_be_read_are_refused_before_anything_is_reconstructed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", None)
+    two_photos(tmp_path)
+    (tmp_path / "c.jpg").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"1 of the 3 images .* cannot be read \(c\.jpg\): export.*missing=0\.34 or"):
+        load(options(tmp_path, missing=0.33))
+    with pytest.raises(TypeError):  # where it is reconstructed
+        load(options(tmp_path, missing=0.34))
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gsx.core.errors import ConfigError, InputError
-from gsx.scenes.splits import split_names
+from gsx.scenes.splits import check_rule, split_names
 
 NAMES = [f"{i:02d}.jpg" for i in range(17)]
 
@@ -76,11 +76,23 @@ def test_a_stem_that_fits_several_images_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "rule", ["evry:8", "every", "every:0", "every:-1", "every:2.5", "none:1", "counts:5", "files:a,", ""]
+    "rule",
+    [
+        *("evry:8", "every", "every:0", "every:-1", "every:nan", "every:2.5", "none:1", "counts:5", "files:a,", ""),
+        *(f"every:{'8' * 5000}", f"counts:{'8' * 5000},1", "8" * 5000),
+    ],
 )
-def test_unreadable_rules_are_refused(rule: str) -> None:
-    with pytest.raises(ConfigError, match=r"scene\.split is"):
+def test_unreadable_rules_are_refused_in_a_sentence(rule: str) -> None:
+    with pytest.raises(ConfigError, match=r"scene\.split is") as refusal:
         split_names(NAMES, rule)
+    assert len(str(refusal.value)) < 500
+    with pytest.raises(ConfigError, match=r"scene\.split is"):
+        check_rule(rule)
+
+
+@pytest.mark.parametrize("rule", ["every:8", "none", "counts:1,2", "files:a.txt,b.txt"])
+def test_readable_rules_pass_before_there_are_names(rule: str) -> None:
+    check_rule(rule)
 
 
 def test_a_typo_gets_a_suggestion() -> None:

@@ -35,7 +35,10 @@ def write(folder: Path, poses: list[Any] = POSES, image: torch.Tensor | None = N
     file = COMMON | {"frames": frames} | content
     (folder / "transforms.json").write_text(json.dumps({k: v for k, v in file.items() if v is not None}))
     for i in range(len(poses)):
-        write_image(folder / "images" / f"{i}.png", torch.zeros(3, HEIGHT, WIDTH) if image is None else image)
+        photo = folder / "images" / f"{i}.png"
+        photo.unlink(missing_ok=True)
+        write_image(photo, torch.zeros(3, HEIGHT, WIDTH) if image is None else image)
+        photo.write_bytes(photo.read_bytes() + bytes([i]))  # after its end: pictures are alike, files are not
 
 
 def frame_changes(**changes: Any) -> list[dict[str, Any]]:
@@ -170,9 +173,14 @@ def test_centred_principal_point(tmp_path: Path) -> None:
         ({"cx": "middle"}, "cx 'middle'"),
         ({"w": 0}, "size 0 x 90"),
         ({"w": 1e20}, r"size 1e\+20 x 90"),
+        ({"w": 10**400}, r"w 10+\.\.\.0+, which is no finite number"),
+        ({"fl_x": None, "camera_angle_x": 5e-324}, "no angle between 0 and pi"),
+        ({"k1": math.nan}, "k1 nan"),
+        ({"k4": 10**400}, "k4 10+"),
         ({"frames": frame_changes(transform_matrix=None)}, "pose that is no matrix"),
         ({"frames": frame_changes(transform_matrix=[*POSES[0][:3], [0, 0, 4, 1]])}, "fourth row .*transposed"),
         ({"frames": frame_changes(transform_matrix=[[math.inf] * 4] * 4)}, "finite numbers"),
+        ({"frames": frame_changes(transform_matrix=[[10**400] * 4] * 4)}, "pose that is no matrix"),
     ],
 )
 def test_cameras_that_cannot_be_used_are_refused_by_name(tmp_path: Path, content: dict[str, Any], message: str) -> None:
@@ -181,11 +189,64 @@ def test_cameras_that_cannot_be_used_are_refused_by_name(tmp_path: Path, content
         load(options(tmp_path))
 
 
+@pytest.mark.parametrize("value", [1e12, 1e300, -1e300])
+@pytest.mark.parametrize("key", ["k1", "k2", "p1", "p2", "k3"])
+def test_a_distortion_beyond_recognition_is_refused(tmp_path: Path, key: str, value: float) -> None:
+    write(tmp_path, **{key: value})
+    with pytest.raises(InputError, match=r"images/0\.png' cannot be undistorted.* of a 120x90 photo .*: correct its"):
+        load(options(tmp_path))
+
+
 @pytest.mark.parametrize("name", ["images/0.png", "./images/0.png", "images\\0.png"])
 def test_a_photo_that_is_listed_twice_is_refused(tmp_path: Path, name: str) -> None:
     """One of them could be trained on and the other tested on."""
     write(tmp_path, frames=frame_changes(file_path=name))
     with pytest.raises(InputError, match=r"has 'images/0\.png' twice"):
+        load(options(tmp_path))
+
+
+@pytest.mark.parametrize("way", ["symbolic link", "hard link", "detour", "no suffix"])
+def test_a_photo_under_two_names_is_refused(tmp_path: Path, way: str) -> None:
+    write(tmp_path)
+    one, other = tmp_path / "images" / "0.png", tmp_path / "images" / "1.png"
+    if way == "symbolic link":
+        other.unlink()
+        other.symlink_to(one)
+    elif way == "hard link":
+        other.unlink()
+        other.hardlink_to(one)
+    name = {"detour": "images/../images/0.png", "no suffix": "images/0"}.get(way, "images/1.png")
+    content = json.loads((tmp_path / "transforms.json").read_text()) | {"frames": frame_changes(file_path=name)}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"transforms\.json' has 'images/0\.png' and '{name}', which are one file"):
+        load(options(tmp_path))
+
+
+def test_a_copy_of_a_training_photo_cannot_be_tested_on(tmp_path: Path) -> None:
+    names = ("0", "1", "2")
+    write(tmp_path, train_filenames=[f"images/{i}.png" for i in names[1:]], test_filenames=["images/0.png"])
+    photos = [tmp_path / "images" / f"{i}.png" for i in names]
+    photos[2].write_bytes(photos[1].read_bytes())
+    assert len(load(options(tmp_path)).train) == 2  # trained on twice, which gives no test away
+    photos[2].write_bytes(photos[0].read_bytes())
+    with pytest.raises(InputError, match=r"1 test photographs .*'[^']*images/2\.png' is '[^']*images/0\.png' byte for"):
+        load(options(tmp_path))
+
+
+@pytest.mark.parametrize("name", [*(f"images/{chr(code)}.png" for code in (0, 0xD800, 0xDCFF))])
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path, name: str) -> None:
+    write(tmp_path, frames=frame_changes(file_path=name))
+    with pytest.raises(InputError, match=r"names a photo 'images/\\[xu][0-9a-f]+\.png', which is no text: rename"):
+        load(options(tmp_path, missing=1.0))
+
+
+@pytest.mark.parametrize("listed", [None, 5, "images/0.png", {"images/0.png": 1}])
+@pytest.mark.parametrize("key", ["train_filenames", "test_filenames"])
+def test_lists_that_are_none_are_refused(tmp_path: Path, key: str, listed: object) -> None:
+    write(tmp_path, train_filenames=["images/1.png", "images/2.png"], test_filenames=["images/0.png"])
+    content = json.loads((tmp_path / "transforms.json").read_text()) | {key: listed}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"{key} of .*transforms\.json' is .*: give a list"):
         load(options(tmp_path))
 
 
@@ -202,6 +263,29 @@ def test_a_camera_that_is_nowhere_near_is_refused(tmp_path: Path) -> None:
         load(options(tmp_path))
 
 
+def test_a_camera_far_off_all_others_is_refused_by_name(tmp_path: Path) -> None:
+    """Half of them are within two units of their middle."""
+    for away, refused in ((1e3, False), (1e6, True)):
+        write(tmp_path, frames=frame_changes(transform_matrix=[[1, 0, 0, away], *POSES[0][1:]]))
+        if refused:
+            with pytest.raises(InputError, match=r"images/1\.png' is 5e\+05 times as far .*: correct its pose, or"):
+                load(options(tmp_path))
+        else:
+            assert len(views(load(options(tmp_path)))) == 3
+
+
+def test_most_cameras_may_stand_on_a_tripod(tmp_path: Path) -> None:
+    """Turned about a corner far from the origin: rounding moves their centres, and the last one stands elsewhere."""
+    poses = []
+    for turn in (0.0, 0.3, 0.9, 2.0):
+        c, s = math.cos(turn), math.sin(turn)
+        poses.append([[c, 0, s, 1e3 / 3], [s, 0, -c, 2e3 / 3], [0, 1, 0, 7.1], [0, 0, 0, 1]])
+    poses.append([*[[*row[:3], row[3] + 1] for row in poses[0][:3]], [0, 0, 0, 1]])
+    write(tmp_path, poses=poses)
+    scene = load(options(tmp_path, split="none"))
+    assert scene.extent == pytest.approx(1.1 * 0.8 * math.sqrt(3))
+
+
 def test_a_file_of_brackets_alone_is_one_sentence(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "transforms.json").write_text("[" * 100_000)
@@ -212,7 +296,7 @@ def test_a_file_of_brackets_alone_is_one_sentence(tmp_path: Path) -> None:
 def test_missing_photos_are_named_and_skipped(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "images" / "1.png").unlink()
-    with pytest.raises(InputError, match=r"1 of the 3 images of .*not on disk \(images/1\.png\).*scene\.missing=0\.33"):
+    with pytest.raises(InputError, match=r"1 of the 3 images of .*not on disk \(images/1\.png\).*scene\.missing=0\.34"):
         load(options(tmp_path, split="none", missing=0.32))
     scene = load(options(tmp_path, split="none", missing=0.34))
     assert [view.name for view in scene.train] == ["images/0.png", "images/2.png"]

@@ -107,6 +107,14 @@ def gone(machine: str, process: int, path: Path) -> bool:
     return False
 
 
+def file_count(folder: Path) -> int:
+    """Files of a folder that are not hidden; none where it cannot be looked at."""
+    try:
+        return sum(path.is_file() and not path.name.startswith(".") for path in folder.iterdir())
+    except OSError:
+        return 0
+
+
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """How texts begin that spreadsheets carry out, in any width of letters and after any space."""
 UNSEEN = "\ufeff\u200b"

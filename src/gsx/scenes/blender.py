@@ -1,7 +1,8 @@
 """NeRF-synthetic scenes: RGBA renderings with poses in transforms_{train,val,test}.json (3D-GS)."""
 
 import math
-from collections.abc import Iterator, Sequence
+import reprlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,13 +19,14 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
+from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
+    finite_number,
     frames_line,
-    named,
     plain_name,
     pose_from_opengl,
     present_frames,
@@ -34,6 +36,7 @@ from gsx.scenes.posed import (
     refuse_too_few,
     views_of,
 )
+from gsx.scenes.splits import short
 
 POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and conversions put a real one
 
@@ -70,15 +73,15 @@ def load(options: BlenderOptions) -> Scene:
         InputError: a file is missing or damaged, there are fewer than two training images, or a scale divides no image.
     """
     if options.split != "json":
-        raise ConfigError(f"scene.split is '{options.split}', but transforms_*.json hold the split: use json.")
+        raise ConfigError(f"scene.split is '{short(options.split)}', but transforms_*.json hold the split: use json.")
     folder = Path(options.path).expanduser()
     train_file, test_file = folder / "transforms_train.json", _test_file(folder)
     train_shots, train_notes = read_shots(train_file, options.missing)
     test_shots, test_notes = read_shots(test_file, options.missing)
-    refuse_shared(train_shots, test_shots, test_file)
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
     train, test = views[: len(train_shots)], views[len(train_shots) :]
     refuse_too_few(train, train_file)
+    refuse_shared(train, test, test_file)
     grouped = list(options.test_scales) != [1]
     train = [reduced(view, factor) for factor in options.scales for view in train]
     test = [reduced(view, factor, grouped) for factor in options.test_scales for view in test]
@@ -96,16 +99,6 @@ def load(options: BlenderOptions) -> Scene:
             options, views, test_file=test_file.name, points=options.points, **_scales_named(options)
         ),
     )
-
-
-def refuse_shared(train: Sequence[Shot], test: Sequence[Shot], file: Path) -> None:
-    """Raise InputError for an image that is trained on and tested on."""
-    shared = sorted({shot.photo.resolve() for shot in train} & {shot.photo.resolve() for shot in test})
-    if shared:
-        raise InputError(
-            f"'{file}' lists {len(shared)} images that are trained on, too ({named([path.name for path in shared])}): "
-            "remove them from one of the files."
-        )
 
 
 def reduced(view: View, factor: int, grouped: bool = False) -> View:
@@ -165,10 +158,11 @@ def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
         InputError: the file is missing or damaged, or too few of its photos are there.
     """
     content, frames = read_frames(file)
-    angle = content.get("camera_angle_x")
-    if not isinstance(angle, float | int) or not 0 < angle < math.pi:
+    angle = finite_number(content.get("camera_angle_x"))
+    if angle is None or not 0 < angle / 2 < math.pi / 2:  # its half is what the tangent is taken of
         raise InputError(
-            f"'{file}' has camera_angle_x {angle}, which is no angle below pi: with fl_x use scene=transforms."
+            f"'{file}' has camera_angle_x {reprlib.repr(content.get('camera_angle_x'))}, which is no angle below pi: "
+            "with fl_x use scene=transforms."
         )
     present, notes = present_frames(file.parent, frames, file, missing)
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes

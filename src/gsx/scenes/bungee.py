@@ -9,6 +9,7 @@ Train and test views keep the order of the sorted file names, so the first n tra
 augmentation uses are `scene.train[:n]`.
 """
 
+import reprlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,10 +28,20 @@ from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_model import model_folders
+from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.points import grey_points, read_points
-from gsx.scenes.posed import Shot, pose_from_opengl, provenance, read_json, reduction_of, refuse_too_few, views_of
-from gsx.scenes.splits import Split, split_names
+from gsx.scenes.posed import (
+    Shot,
+    finite_number,
+    pose_from_opengl,
+    provenance,
+    read_json,
+    reduction_of,
+    refuse_too_few,
+    views_of,
+)
+from gsx.scenes.splits import Split, positive, short, split_names
 
 POSES_FILE = "poses_enu.json"
 POSE_VALUES = 17  # 3 x 5 [R | t | height, width, focal], near, far
@@ -73,11 +84,13 @@ def load(options: BungeeOptions) -> Scene:
     groups, basis = _scales(scene.train, centre, folder, options.images)
     views = [replace(view, group=f"scale-{scale}") for view, scale in zip(scene.train, groups, strict=True)]
     train, test = split_views([view.name for view in views], options.split, folder)
-    refuse_too_few(train_views := [views[i] for i in train], folder)
+    train_views, test_views = ([views[i] for i in side] for side in (train, test))
+    refuse_too_few(train_views, folder)
+    refuse_shared(train_views, test_views, folder)
     return replace(
         scene,
         train=train_views,
-        test=[views[i] for i in test],
+        test=test_views,
         extent=extent_of([view.camera for view in train_views]),
         notes=[*scene.notes, _scale_note(views, basis)],
         provenance={**scene.provenance, "format": options.name, "split": options.split, "scales": basis},
@@ -94,13 +107,14 @@ def split_views(names: Sequence[str], rule: str, folder: Path) -> Split:
     kind, _, number = rule.partition(":")
     if kind != "lod":
         return split_names(list(names), rule, folder)
-    if not number.isdecimal() or int(number) < 1:
-        raise ConfigError(f"scene.split is '{rule}', give a whole number above 0 after lod, for example lod:30.")
+    last = positive(number)
+    if last is None:
+        raise ConfigError(f"scene.split is '{short(rule)}', give a whole number above 0 after lod, as in lod:30.")
     order, _ = split_names(list(names), "none")
-    first, rest = order[: int(number) + 1], order[int(number) + 1 :]  # up to and including N, as published
+    first, rest = order[: last + 1], order[last + 1 :]  # up to and including N, as published
     if not rest:
         raise InputError(f"scene.split '{rule}' leaves none of {len(names)} images over, choose a smaller number.")
-    return (rest, first) if int(number) < FEW_HELD_OUT else (first, rest)
+    return (rest, first) if last < FEW_HELD_OUT else (first, rest)
 
 
 def load_enu(options: BungeeOptions, folder: Path) -> Scene:
@@ -149,7 +163,7 @@ def image_files(folder: Path) -> list[Path]:
 def _poses(content: dict[str, Any], file: Path) -> Float[Tensor, "N 17"]:
     try:
         poses = torch.tensor(content.get("poses"), dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"'{file}' has poses that are no table of numbers, copy it anew.") from None
     if poses.ndim != 2 or poses.shape[1] != POSE_VALUES or not poses.isfinite().all():
         raise InputError(f"'{file}' has poses that are not rows of {POSE_VALUES} finite numbers, copy it anew.")
@@ -185,10 +199,11 @@ def _points(
     if options.points != "random":
         cloud = read_points(file.parent / options.points)
         return cloud, f"Starts from the {len(cloud)} points of {options.points}."
-    scale = content.get("scene_scale")
-    if not isinstance(scale, float | int) or not 0 < scale < float("inf"):
+    scale = finite_number(content.get("scene_scale"))
+    if scale is None or scale <= 0:
         raise InputError(
-            f"'{file}' has scene_scale {scale!r}, give a number above 0 or set scene.points to a PLY file."
+            f"'{file}' has scene_scale {reprlib.repr(content.get('scene_scale'))}, give a number above 0 or set "
+            "scene.points to a PLY file."
         )
     generator = torch.Generator().manual_seed(options.seed)
     cameras = [view.camera for view in views]

@@ -17,6 +17,7 @@ from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
+from gsx.scenes.duplicates import refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.posed import (
@@ -70,15 +71,17 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
     train, test = split_names([view.name for view in views], options.split, path)
-    refuse_too_few([views[index] for index in train], path)
+    train_views, test_views = ([views[index] for index in side] for side in (train, test))
+    refuse_too_few(train_views, path)
+    refuse_shared(train_views, test_views, photos)
     return Scene(
         name=path.resolve().name,
-        train=[views[index] for index in train],
-        test=[views[index] for index in test],
+        train=train_views,
+        test=test_views,
         points=model.points,
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
-        extent=extent_of([views[index].camera for index in train]),
+        extent=extent_of([view.camera for view in train_views]),
         notes=[
             *notes,
             *model.notes,
@@ -95,7 +98,7 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     """The images of the model whose photo exists.
 
     Raises:
-        InputError: none or only one exists, or more than the share `missing` does not.
+        InputError: none or only one exists, more than the share `missing` does not, or two images are one file.
     """
     present = [image for image in model.images if is_file(photos / image.name)]
     if not present and model.images:
@@ -109,6 +112,7 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
             f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
         )
     refuse_partial(_missing(model, present), len(model.images), model.folder, missing)
+    refuse_file_twice([image.name for image in present], [photos / image.name for image in present], model.folder)
     return present
 
 

@@ -31,6 +31,7 @@ RIG, SENSOR, FRAME = struct.Struct("<II"), struct.Struct("<iI?"), struct.Struct(
 RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and translation; (type, id, data id)
 IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
 POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
+QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,7 +146,7 @@ def check_binary(folder: Path) -> None:
     """Walk every binary file of a model to its end.
 
     Raises:
-        InputError: a file ends within a record, or names a camera model that pycolmap does not know.
+        InputError: a file ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
     """
     walks = {
         "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig,
@@ -186,6 +187,11 @@ def _walk(file: Path, skip: Callable[[mmap.mmap, int], int]) -> None:
                 raise InputError(f"{file} is corrupt at record {index}: {problem}; make the model again.") from None
             if at > size:
                 raise _truncated(file, index, count)
+    if at < size:
+        raise InputError(
+            f"{file} goes on for {size - at} bytes after its {count} records: its count is wrong or its end foreign, "
+            "copy or make the model again."
+        )
 
 
 def _truncated(file: Path, index: int, count: int) -> InputError:
@@ -272,6 +278,12 @@ def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) 
         raise InputError(f"{file} is truncated: {name} observes its point {lost}; copy or make the model again.")
     observed = _stack([positions[point.point3D_id] for point in seen], 3)
     usable, pose = _usable(observed), image.cam_from_world()
+    length = pose.rotation.norm()
+    if not abs(length - 1) <= QUATERNION_TOLERANCE:
+        raise InputError(
+            f"The model {file.parent} turns {name} by a quaternion of length {length:.3g} instead of 1: correct its "
+            "pose, or make the model again."
+        )
     return ModelImage(
         name=name,
         camera_id=image.camera_id,

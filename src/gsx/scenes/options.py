@@ -38,7 +38,8 @@ class SceneOptions:
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
-    """Share of the images named by a file of poses that may be absent from the disk; more are refused."""
+    """Share of the images named by a file of poses that may be absent from the disk, or of photographs that may be
+    unreadable; more are refused."""
     masks: str = "auto"
     """auto | alpha | none: which pixels of photographs count (gsx.scenes.masked)."""
     split: str = "every:8"

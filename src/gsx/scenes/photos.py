@@ -23,7 +23,7 @@ from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions
-from gsx.scenes.posed import named
+from gsx.scenes.posed import named, refuse_partial
 
 logger = logging.getLogger(__name__)
 
@@ -48,11 +48,15 @@ def load(options: PhotosOptions) -> Scene:
 
     Raises:
         ConfigError: an option has no such value.
-        InputError: there are fewer than two photos, or they cannot be reconstructed.
+        InputError: there are fewer than two photos, more than the share `missing` of them cannot be read, or they
+            cannot be reconstructed.
     """
     refuse_unknown(options)
     folder, photos = find_photos(Path(options.path).expanduser())
     sizes, notes = readable_sizes(folder, photos)
+    refuse_partial(
+        sorted({*photos} - sizes.keys()), len(photos), folder, options.missing, "cannot be read", "export them again"
+    )
     model = read_model(reconstruct(folder, sizes, options))
     notes += report(model, list(sizes))
     scene = colmap.build(model, folder, _colmap_options(options, folder), notes)

@@ -1,5 +1,6 @@
 """What the loaders of photographs with poses share: reading, axes, lenses, views, provenance."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.files import is_file
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
+from gsx.scenes.duplicates import refuse_file_twice
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
@@ -27,6 +29,10 @@ MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
 FARTHEST = 1e9
 """A camera at a larger coordinate is a mistake: single precision could not tell it from its neighbours."""
+STRAY = 1e4
+"""A camera farther from the middle of all, in median distances of them from it, is a mistake: what one of them sees is
+a speck to the others. A city from the street to the sky spans some 1e2."""
+SAME_PLACE = 1e-9  # of the coordinates: cameras that are no farther apart, as on a tripod, differ by rounding alone
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
 PRINCIPAL_POINTS = ("exact", "centred")
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
@@ -68,7 +74,10 @@ def shot_through(
     Raises:
         InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
     """
-    pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
+    try:
+        pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
+    except InputError as problem:
+        raise InputError(f"'{photo}' cannot be undistorted: {problem}") from None
     size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))
     return Shot(
         name=name,
@@ -117,11 +126,28 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise InputError(f"'{path}' lists no frames, export it anew.")
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
+    refuse_no_text([frame["file_path"] for frame in frames], path)
     counts = Counter(plain_name(frame["file_path"]) for frame in frames)
     for name, count in counts.items():
         if count > 1:
             raise InputError(f"'{path}' has '{name}' twice, perhaps to train on and to test on: remove one.")
     return content, frames
+
+
+def refuse_no_text(names: Sequence[str], path: Path) -> None:
+    """Raise InputError for a file name that holds a NUL character, or half of a character."""
+    for name in names:
+        if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in name):
+            raise InputError(f"'{path}' names a photo {name!a}, which is no text: rename the photo, and it here.")
+
+
+def finite_number(value: Any) -> float | None:
+    """A number of a file; None for what is no number, not finite, or larger than those of double precision."""
+    try:
+        number = float(value) if isinstance(value, float | int) else math.nan
+    except OverflowError:  # an integer of hundreds of digits
+        return None
+    return number if math.isfinite(number) else None
 
 
 def plain_name(file_path: str) -> str:
@@ -138,12 +164,20 @@ def find_photo(folder: Path, file_path: str) -> Path | None:
     return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
-def refuse_partial(missing: Sequence[str], count: int, place: Path, allowed: float) -> None:
-    """Raise InputError if more than the share `allowed` of the `count` images of a file of poses is absent."""
-    if len(missing) > allowed * count:
+def refuse_partial(
+    missing: Sequence[str],
+    count: int,
+    place: Path,
+    allowed: float,
+    fault: str = "are not on disk",
+    remedy: str = "complete them",
+) -> None:
+    """Raise InputError if more than the share `allowed` of the `count` images of `place` cannot be used."""
+    share = len(missing) / count
+    if share > allowed:
         raise InputError(
-            f"{len(missing)} of the {count} images of '{place}' are not on disk ({named(missing)}): complete them, or "
-            f"train on what is there with scene.missing={len(missing) / count:.2g} or more."
+            f"{len(missing)} of the {count} images of '{place}' {fault} ({named(missing)}): {remedy}, or train on what "
+            f"is there with scene.missing={math.ceil(100 * share) / 100:g} or more."
         )
 
 
@@ -153,7 +187,7 @@ def present_frames(
     """The frames whose photo is on disk with its path, and a note that names the others.
 
     Raises:
-        InputError: no photo is there, or more than the share `allowed` is not.
+        InputError: no photo is there, more than the share `allowed` is not, or one is there under two names.
     """
     photos = [find_photo(folder, frame["file_path"]) for frame in frames]
     present = [(frame, photo) for frame, photo in zip(frames, photos, strict=True) if photo is not None]
@@ -164,6 +198,7 @@ def present_frames(
             " there or correct the names in the file."
         )
     refuse_partial(missing, len(frames), file, allowed)
+    refuse_file_twice([plain_name(frame["file_path"]) for frame, _ in present], [photo for _, photo in present], file)
     note = f"Skipped {len(missing)} of the {len(frames)} images of {file.name}, not on disk: {named(missing)}."
     return present, [note] if missing else []
 
@@ -179,7 +214,7 @@ def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Flo
     """
     try:
         world_from_camera = torch.tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{place} has a pose that is no matrix of numbers, export it anew.") from None
     if world_from_camera.shape not in ((3, 4), (4, 4)) or not world_from_camera.isfinite().all():
         raise InputError(f"{place} has a pose that is not 3 x 4 or 4 x 4 finite numbers, remove or repair it.")
@@ -197,8 +232,9 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
 
     Raises:
         ConfigError: an option of the resize rule, of masks or the principal point is unknown.
-        InputError: a mask that the scene names is not there.
+        InputError: a mask that the scene names is not there, or a camera is far off all others.
     """
+    refuse_stray(shots)
     if options.principal_point not in PRINCIPAL_POINTS:
         hint = nearest(options.principal_point, PRINCIPAL_POINTS)
         raise ConfigError(f"scene.principal_point is '{options.principal_point}', use exact or centred.{hint}")
@@ -206,6 +242,19 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
     rule = ResizeRule(filter=options.resize_filter, light=options.resize_light, background=(red, green, blue))
     cache = ImageCache(int(options.cache_gb * 1e9))
     return [_view(shot, options, rule, cache) for shot in shots]
+
+
+def refuse_stray(shots: Sequence[Shot]) -> None:
+    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as half of them."""
+    centres = torch.stack([shot.whole.centre.double() for shot in shots])
+    middle = centres.median(dim=0).values
+    distances = (centres - middle).norm(dim=1)
+    usual, farthest = float(distances.median()), int(distances.argmax())
+    if usual > SAME_PLACE * middle.abs().max() and distances[farthest] > STRAY * usual:
+        raise InputError(
+            f"The camera of '{shots[farthest].photo}' is {distances[farthest] / usual:.2g} times as far from the middle"
+            f" of all cameras as half of them (more than {STRAY:g}): correct its pose, or remove it."
+        )
 
 
 def reduction_of(options: SceneOptions) -> Reduction:

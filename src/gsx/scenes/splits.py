@@ -5,6 +5,8 @@ from pathlib import Path, PurePosixPath
 from gsx.core.errors import ConfigError, InputError, nearest
 
 RULES = ("every:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
+DIGITS = 9  # of numbers of images
+SHOWN = 200  # letters of a rule in an error
 Split = tuple[list[int], list[int]]
 """Positions of the training and of the test names in the list that was split, each in sorted order."""
 
@@ -21,21 +23,44 @@ def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
         ConfigError: the rule cannot be read.
         InputError: a split file is unusable, or the rule leaves no image to train on or none to test on.
     """
+    check_rule(rule)
     kind, _, argument = rule.partition(":")
     order = sorted(range(len(names)), key=lambda i: sort_key(names[i]))
-    if kind == "none" and not argument:
-        train, test = order, list[int]()
-    elif kind == "every":
+    train, test = order, list[int]()
+    if kind == "every":
         k = _count(argument, rule)
         train, test = [i for position, i in enumerate(order) if position % k], order[::k]
     elif kind == "counts":
         train, test = _counts(order, *(_count(count, rule) for count in _pair(argument, rule)))
     elif kind == "files":
         train, test = _files(names, *(folder / part for part in _pair(argument, rule)))
-    else:
-        raise ConfigError(f"scene.split is '{rule}', use one of {', '.join(RULES)}.{nearest(rule, RULES)}")
     _refuse_empty(len(names), len(train), len(test), rule)
     return train, test
+
+
+def check_rule(rule: str) -> None:
+    """Raise ConfigError for a rule that cannot be read, also where a scene has a split of its own."""
+    kind, _, argument = rule.partition(":")
+    if kind == "every":
+        _count(argument, rule)
+    elif kind == "counts":
+        for count in _pair(argument, rule):
+            _count(count, rule)
+    elif kind == "files":
+        _pair(argument, rule)
+    elif rule != "none":
+        raise ConfigError(f"scene.split is '{short(rule)}', use one of {', '.join(RULES)}.{nearest(rule, RULES)}")
+
+
+def positive(text: str) -> int | None:
+    """A whole number above 0; None for anything else, and for more digits than images have."""
+    word = text.strip()
+    return int(word) if word.isdecimal() and len(word) <= DIGITS and int(word) > 0 else None
+
+
+def short(text: str) -> str:
+    """As much of a text as an error has room for."""
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def sort_key(name: str) -> tuple[str, str]:
@@ -90,14 +115,17 @@ def _find(names: list[str], word: str, file: Path) -> int:
 def _pair(argument: str, rule: str) -> list[str]:
     parts = [part.strip() for part in argument.split(",")]
     if len(parts) != 2 or not all(parts):
-        raise ConfigError(f"scene.split is '{rule}' and needs two values separated by a comma after the colon.")
+        raise ConfigError(f"scene.split is '{short(rule)}' and needs two values separated by a comma after the colon.")
     return parts
 
 
 def _count(text: str, rule: str) -> int:
-    if not text.strip().isdecimal() or int(text) < 1:
-        raise ConfigError(f"scene.split is '{rule}' and '{text}' in it is no positive whole number.")
-    return int(text)
+    count = positive(text)
+    if count is None:
+        raise ConfigError(
+            f"scene.split is '{short(rule)}' and '{short(text)}' in it is no positive whole number of images."
+        )
+    return count
 
 
 def _refuse_empty(total: int, train: int, test: int, rule: str) -> None:

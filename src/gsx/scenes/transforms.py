@@ -6,6 +6,7 @@ those of COLMAP scenes are.
 """
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,11 +20,13 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.core.ranges import Points, Seed
+from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
+    finite_number,
     frames_line,
     lens_notes,
     plain_name,
@@ -76,6 +79,7 @@ def load(options: TransformsOptions) -> Scene:
     views = views_of(shots, options)
     (train, test), split_notes = _split(content, views, options.split, file)
     refuse_too_few(train, file)
+    refuse_shared(train, test, file)
     points, points_note = _points(content, views, options, file)
     bent = any(shot.remap is not None for shot in shots)
     return Scene(
@@ -171,7 +175,7 @@ def _focal(entry: Mapping[str, Any], width: int, height: int, place: str) -> tup
 
 def _focal_of_angle(entry: Mapping[str, Any], key: str, side: int, place: str) -> float:
     angle = _number(entry, key, math.nan, place)
-    if angle <= 0 or angle >= math.pi:
+    if angle / 2 <= 0 or angle >= math.pi:  # its half is what the tangent is taken of
         raise InputError(f"{place} has {key} {angle:g}, no angle between 0 and pi: give fl_x and fl_y instead.")
     return side / (2 * math.tan(angle / 2))
 
@@ -181,9 +185,10 @@ def _number(entry: Mapping[str, Any], key: str, default: float, place: str) -> f
     value = entry.get(key)
     if value is None:
         return default
-    if not isinstance(value, float | int) or not math.isfinite(value):
-        raise InputError(f"{place} has {key} {value!r}, which is no finite number.")
-    return float(value)
+    number = finite_number(value)
+    if number is None:
+        raise InputError(f"{place} has {key} {reprlib.repr(value)}, which is no finite number.")
+    return number
 
 
 def _split(
@@ -216,7 +221,10 @@ def _listed_split(content: Mapping[str, Any], names: Sequence[str], file: Path) 
 
 
 def _listed(content: Mapping[str, Any], key: str, known: set[str], file: Path) -> set[str]:
-    listed = {plain_name(str(name)) for name in content.get(key, ())}
+    names = content.get(key, [])
+    if not isinstance(names, list):
+        raise InputError(f"{key} of '{file}' is {reprlib.repr(names)}: give a list, or another scene.split.")
+    listed = {plain_name(str(name)) for name in names}
     unknown = sorted(listed - known)
     if unknown:
         raise InputError(f"{key} of '{file}' names '{unknown[0]}', which is no frame.{nearest(unknown[0], known)}")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,9 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
+OUTSIDE = 1.0
+"""An undistorted picture that would show what lies farther outside its photo, in sides of it, comes of no real lens."""
+STEPS = 9  # along each side of the picture, at which that is looked at
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
 
 
@@ -32,18 +36,31 @@ def pinhole_of(camera: Any) -> Any:
     """The pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
 
     Raises:
-        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can.
+        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, or has a senseless distortion.
     """
     import pycolmap
 
-    if is_pinhole(camera):
+    if is_pinhole(camera) and np.isfinite(camera.params).all():  # to pycolmap distortion by no number is none
         return camera
     if not camera.is_perspective():
         raise InputError(
             f"Camera model {camera.model_name} of a {camera.width}x{camera.height} photo has no pinhole equivalent: "
             "cut the photos into perspective views and reconstruct those."
         )
-    return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    refuse_nonsense(camera, pinhole)
+    return pinhole
+
+
+def refuse_nonsense(camera: Any, pinhole: Any) -> None:
+    """Raise InputError if what `pinhole` sees lies nowhere near the photo of `camera`; both are pycolmap cameras."""
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    seen = torch.cat(list(_distorted_pixels(camera, pinhole, (STEPS, STEPS)))) / size
+    if not (seen - 0.5).abs().max() <= 0.5 + OUTSIDE:  # neither for numbers that are none
+        raise InputError(
+            f"The {camera.model_name} camera of a {camera.width}x{camera.height} photo bends it beyond recognition "
+            f"({camera.params_to_string()}): correct its intrinsics."
+        )
 
 
 def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:

@@ -32,7 +32,7 @@ def write_transforms(folder: Path, name: str, photos: int, absent: int = 0) -> N
         pose[0, 3] = number
         frames.append({"file_path": f"./{number}", "transform_matrix": pose.tolist()})
         if number < photos:
-            write_image(folder / f"{number}.png", torch.zeros(3, 12, 16))
+            write_image(folder / f"{number}.png", torch.full((3, 12, 16), number / 100))
     folder.mkdir(exist_ok=True)
     (folder / name).write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -9,6 +10,7 @@ from gsx.core.data.camera import offsets_from
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.files import file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import Settings
@@ -25,6 +27,7 @@ def load_scene(settings: Settings) -> Scene:
     """
     options = settings.scene.options
     loaded = settings.scene.component.factory(options)
+    loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
     scene = warned_of_units(measured(in_units(loaded, options.unit if isinstance(options, InUnits) else 1.0)))
     if not scene.test:
         raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
@@ -34,6 +37,17 @@ def load_scene(settings: Settings) -> Scene:
             "elsewhere, which gives no depth and no scale: use photos from different places"
         )
     return with_more_points(scene, options.fill, settings.general.seed) if isinstance(options, Fillable) else scene
+
+
+def count_notes(settings: Settings) -> list[str]:
+    """What to know where the folder of a published scene holds another number of images than was published."""
+    dataset, path = settings.dataset, getattr(settings.scene.options, "path", "")
+    published = dataset.images.get(dataset.scene) if dataset else None
+    if not (published and path):
+        return []
+    found = file_count(Path(path).expanduser() / "images")
+    compared = "figures cannot be compared with published ones"
+    return [] if found == published else [f"images/ holds {found} files, published are {published}: {compared}."]
 
 
 def with_more_points(scene: Scene, count: int, seed: int) -> Scene:

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from gsx.core.files import file_count
+
 
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     """What keeps a scene from being trained; empty if it is all there."""
@@ -16,17 +18,9 @@ def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     if absent:
         return f"{folder} lacks {', '.join(absent)}"
     published = dataset.get("images", {}).get(scene, 0)
-    found = image_count(folder / "images") if published else 0
+    found = file_count(folder / "images") if published else 0
     few = f"{folder}/images holds {found} of the {published} published images"
     return f"{few} (++dataset.images.{scene}={found} takes them)" if found < published else ""
-
-
-def image_count(folder: Path) -> int:
-    """Files of a folder that are not hidden; none where it cannot be looked at."""
-    try:
-        return sum(path.is_file() and not path.name.startswith(".") for path in folder.iterdir())
-    except OSError:
-        return 0
 
 
 def described(dataset: dict[str, Any], root: Path) -> Iterator[str]:

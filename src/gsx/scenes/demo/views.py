@@ -23,6 +23,7 @@ from gsx.core.shapes import Float, UInt8
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import rays_through, render, shade, trace
 from gsx.scenes.options import SceneOptions
+from gsx.scenes.splits import check_rule
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +37,7 @@ SAME = 1e-6  # intrinsics that agree to this many pixels are the same
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(SceneOptions):
-    """The built-in scene; `path`, `split` and what concerns photographs do not apply to it."""
+    """The built-in scene; `path`, `split` (which must be readable) and what concerns photographs do not apply to it."""
 
     width: Annotated[int, Range(1, 16384)]
     """Width of the pictures before `downscale`, pixels."""
@@ -136,8 +137,10 @@ def check(options: DemoOptions) -> None:
     """Refuse options that make no scene.
 
     Raises:
-        ConfigError: a count is too small, there are more test than training views, or the background is no colour.
+        ConfigError: a count is too small, there are more test than training views, the background is no colour, or
+            the split is unreadable.
     """
+    check_rule(options.split)
     if options.path:
         raise ConfigError(
             f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "

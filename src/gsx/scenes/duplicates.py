@@ -1,0 +1,107 @@
+"""The same photograph under two names, by which what is tested on could be trained on."""
+
+import hashlib
+import os
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
+
+from gsx.core.data.scene import FromFile, View
+from gsx.core.errors import InputError
+
+BLOCK = 1 << 16
+"""Bytes read at the beginning, in the middle and at the end of files of equal size before they are read whole."""
+Sides = tuple[list[Path], list[Path]]
+"""Photographs to train on, and those to test on, of which some may be the same."""
+
+
+def refuse_file_twice(names: Sequence[str], photos: Sequence[Path], place: Path) -> None:
+    """Raise InputError if two of the names that `place` gives lead to one file: by links, `a/../b`, or no suffix."""
+    known: dict[Hashable, str] = {}
+    for name, photo in zip(names, photos, strict=True):
+        key = identity(photo)
+        if key in known:
+            both = f"'{name}' twice" if name == known[key] else f"'{known[key]}' and '{name}', which are one file"
+            raise InputError(f"'{place}' has {both}, perhaps to train on and to test on: remove one.")
+        known[key] = name
+
+
+def identity(photo: Path) -> Hashable:
+    """The same for all names of a file; with its size and time, as some systems number files anew.
+
+    Raises:
+        InputError: the file cannot be looked at.
+    """
+    try:
+        status = photo.stat()
+    except OSError as problem:
+        raise _unreadable(photo, problem) from None
+    return status.st_dev, status.st_ino or photo.resolve(), status.st_size, status.st_mtime_ns
+
+
+def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> None:
+    """Raise InputError if a photograph to test on is trained on: the file itself, or one with the same bytes.
+
+    Only files of equal size are opened, and only those read whole that are alike at three places.
+    """
+    candidates: list[Sides] = [(photos_of(train), photos_of(test))]
+    for key in (size, digest_of_parts, digest):
+        candidates = [part for pair in candidates for part in alike(pair, key)]
+    if candidates:
+        one, other = candidates[0][0][0], candidates[0][1][0]
+        names = f"'{one}'" if one == other else f"'{one}' is '{other}' byte for byte"
+        shared = sum(len(tested) for _, tested in candidates)
+        raise InputError(
+            f"{shared} test photographs of '{place}' are trained on, too ({names}): remove one of each two."
+        )
+
+
+def photos_of(views: Iterable[View]) -> list[Path]:
+    """The files that views are read from, each once."""
+    return list(dict.fromkeys(view.source.path for view in views if isinstance(view.source, FromFile)))
+
+
+def alike(candidates: Sides, key: Callable[[Path], Hashable]) -> list[Sides]:
+    """The candidates by equal `key`, where those to train on and those to test on share one.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    groups: dict[Hashable, Sides] = defaultdict(lambda: ([], []))
+    for side, photos in enumerate(candidates):
+        for photo in photos:
+            groups[_told(key, photo)][side].append(photo)
+    return [group for group in groups.values() if all(group)]
+
+
+def size(photo: Path) -> int:
+    """Of a file, bytes."""
+    return photo.stat().st_size
+
+
+def digest_of_parts(photo: Path) -> bytes:
+    """A digest of three blocks of a file."""
+    found = hashlib.sha256()
+    with photo.open("rb") as stream:
+        end = max(stream.seek(0, os.SEEK_END) - BLOCK, 0)
+        for start in (0, end // 2, end):
+            stream.seek(start)
+            found.update(stream.read(BLOCK))
+    return found.digest()
+
+
+def digest(photo: Path) -> bytes:
+    """A digest of a file."""
+    with photo.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
+
+
+def _told(key: Callable[[Path], Hashable], photo: Path) -> Hashable:
+    try:
+        return key(photo)
+    except OSError as problem:
+        raise _unreadable(photo, problem) from None
+
+
+def _unreadable(photo: Path, problem: OSError) -> InputError:
+    return InputError(f"Image '{photo}' cannot be read ({problem.strerror}): restore it, or its permissions.")

@@ -1,0 +1,98 @@
+"""Photographs that are the same, and how little is read to tell."""
+
+from pathlib import Path
+
+import pytest
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import View
+from gsx.core.errors import InputError
+from gsx.scenes import duplicates
+from gsx.scenes.duplicates import BLOCK, Sides, alike, digest, digest_of_parts, refuse_file_twice, refuse_shared, size
+
+
+class Source:
+    """Of a view: nothing but its file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def image(self, camera: Camera) -> Tensor:
+        raise AssertionError("nothing is decoded")
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+def shared(sides: Sides) -> list[Sides]:
+    found = [sides]
+    for key in (size, digest_of_parts, digest):
+        found = [part for one in found for part in alike(one, key)]
+    return found
+
+
+def views(*photos: Path) -> list[View]:
+    camera = look_at((0, 0, 0), (1, 0, 0), fov_x=1, width=8, height=8)
+    return [View(photo.name, camera, Source(photo)) for photo in photos]
+
+
+def written(folder: Path, **contents: bytes) -> list[Path]:
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    return [folder / name for name in contents]
+
+
+def test_only_files_of_equal_size_on_both_sides_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Equal sizes among what is trained on alone do not matter."""
+    train = written(tmp_path, a=b"1", b=b"2", c=b"33")
+    test = written(tmp_path, d=b"444", e=b"55")
+    opened: list[str] = []
+
+    def noted(path: Path) -> bytes:
+        opened.append(path.name)
+        return digest(path)
+
+    monkeypatch.setattr(duplicates, "digest_of_parts", noted)
+    monkeypatch.setattr(duplicates, "digest", noted)
+    refuse_shared(views(*train), views(*test), tmp_path)
+    assert sorted(opened) == ["c", "e"]
+
+
+def test_only_what_is_alike_at_three_places_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = written(tmp_path, one=b"1", other=b"2")
+    monkeypatch.setattr(duplicates, "digest", None)
+    refuse_shared(views(one), views(other), tmp_path)
+
+
+def test_files_that_differ_where_only_a_whole_reading_shows_it_are_not_the_same(tmp_path: Path) -> None:
+    long = bytes(8 * BLOCK)
+    odd = bytearray(long)
+    odd[2 * BLOCK] = 1
+    one, other, twin = written(tmp_path, one=long, other=bytes(odd), twin=long)
+    assert digest_of_parts(one) == digest_of_parts(other)
+    assert shared(([one], [other])) == []
+    assert shared(([one], [other, twin])) == [([one], [twin])]
+
+
+def test_files_as_short_as_a_block_are_compared(tmp_path: Path) -> None:
+    one, other, empty, void = written(tmp_path, one=b"ab", other=b"ac", empty=b"", void=b"")
+    assert shared(([one, empty], [other, void])) == [([empty], [void])]
+
+
+def test_a_photo_that_vanishes_is_a_sentence(tmp_path: Path) -> None:
+    gone = tmp_path / "gone.png"
+    with pytest.raises(InputError, match=r"Image '.*gone\.png' cannot be read \(No such file or directory\): restore"):
+        alike(([gone], [gone]), size)
+    with pytest.raises(InputError, match=r"Image '.*gone\.png' cannot be read"):
+        refuse_file_twice(["gone"], [gone], tmp_path)
+
+
+def test_where_files_have_no_numbers_their_paths_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Status:
+        st_dev, st_ino, st_size, st_mtime_ns = 1, 0, 1, 1
+
+    one, other = written(tmp_path, one=b"1", other=b"1")
+    monkeypatch.setattr(Path, "stat", lambda path, **_: Status)
+    assert duplicates.identity(one) != duplicates.identity(other)
+    assert duplicates.identity(one) == duplicates.identity(tmp_path / "x" / ".." / "one")
