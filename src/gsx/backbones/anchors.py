@@ -31,7 +31,7 @@ from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_dis
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.losses import volume_loss
-from gsx.core.rasterizer import Rendering, touches
+from gsx.core.rasterizer import Rendering, goes_compiled, touches
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.density import densification_statistics
@@ -130,7 +130,12 @@ class Anchors:
         degree, every = self.sh
         degree = min(degree, step // max(1, self.schedule.step(every)))
         return VisibleAnchors(
-            rows=rows, weights=weights[rows], camera=camera, view=self.views.get(camera, -1), sh_degree=degree
+            rows=rows,
+            weights=weights[rows],
+            camera=camera,
+            view=self.views.get(camera, -1),
+            sh_degree=degree,
+            compiled=goes_compiled(self.raster, weights.device.type),
         )
 
     def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:

@@ -37,6 +37,8 @@ class VisibleAnchors:
     view: int
     """Number of the training view, -1 for any other camera."""
     sh_degree: int
+    compiled: bool = False
+    """Whether their colours go the compiled way."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -214,7 +216,7 @@ class Explicit:
             scales=scales,
             quats=row["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree),
+            colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree, visible.compiled),
         )
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 

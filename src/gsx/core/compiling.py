@@ -40,18 +40,21 @@ def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
     return types.FunctionType(code, function.__globals__, function.__name__, values or function.__defaults__)
 
 
-def compile_rows(function: Callable[..., Any], *last: Any) -> Callable[..., Any]:
+def compile_rows(
+    function: Callable[..., Any], *last: Any, options: dict[str, str | int | bool] | None = None
+) -> Callable[..., Any]:
     """`function` through torch.compile, once for any number of rows, with these values of its last arguments.
 
-    Tensors with as many rows as the first argument are taken to vary in number; every other size is a constant of the
-    compiled code, which is faster and compiles sooner than leaving all sizes open. There must be more than one row.
+    Tensors with as many rows, or columns, as the first argument has rows are taken to vary in number; every other size
+    is a constant of the compiled code, which is faster and compiles sooner than leaving all sizes open. There must be
+    more than one row. `options`: of the compiler.
     """
 
     def varying(arguments: tuple[Any, ...]) -> list[tuple[Tensor, int]]:
-        rows = len(arguments[0])
-        return [(a, 0) for a in arguments if isinstance(a, Tensor) and a.dim() > 0 and len(a) == rows]
+        rows, tensors = len(arguments[0]), [a for a in arguments if isinstance(a, Tensor)]
+        return [(a, axis) for a in tensors for axis in range(min(2, a.dim())) if a.shape[axis] == rows]
 
-    return sizes_free(torch.compile(with_last(function, *last)), varying)
+    return sizes_free(torch.compile(with_last(function, *last), options=options), varying)
 
 
 @functools.lru_cache

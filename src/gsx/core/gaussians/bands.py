@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import compile_rows
+from gsx.core.compiling import WHOLE_LOOPS, compile_rows
 from gsx.core.shapes import Float
 
 BAND_0 = 0.28209479177387814
@@ -41,3 +41,29 @@ def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor,
 def compiled_harmonics(degree: int) -> Callable[..., Tensor]:
     """`harmonics_along` and its backward through torch.compile, for any number of offsets."""
     return compile_rows(harmonics_along, degree)
+
+
+def contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
+    """sum over b of basis[b, n] rest[n, b, c], in one loop over splats once it is compiled."""
+    bands_, coefficients = basis.unbind(), rest.flatten(1).unbind(1)
+    channels = [sum(map(torch.mul, bands_, coefficients[channel::3])) for channel in range(3)]
+    return torch.stack(channels, 1)
+
+
+def contraction_slopes(
+    gradient: Float[Tensor, "N 3"], rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]
+) -> tuple[Float[Tensor, "N B 3"], Float[Tensor, "B N"]]:
+    """Gradients of `rest` and `basis` by that of their contraction."""
+    channels, coefficients = gradient.unbind(1), rest.flatten(1).unbind(1)
+    by_rest = torch.stack([band * channel for band in basis for channel in channels], 1)
+    by_basis = [sum(map(torch.mul, channels, coefficients[3 * band : 3 * band + 3])) for band in range(len(basis))]
+    return by_rest.view(rest.shape), torch.stack(by_basis)
+
+
+@functools.lru_cache
+def compiled_contraction(count: int) -> tuple[Callable[..., Tensor], Callable[..., tuple[Tensor, Tensor]]]:
+    """`contraction` and `contraction_slopes` of so many bands through torch.compile, for any number of splats."""
+    return (
+        compile_rows(contraction, options=WHOLE_LOOPS),
+        compile_rows(contraction_slopes, options=WHOLE_LOOPS),
+    )

@@ -4,9 +4,10 @@ import functools
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from gsx.core.gaussians.arrays import degree_of
-from gsx.core.gaussians.bands import BAND_0, bands, compiled_harmonics, harmonics_along
+from gsx.core.gaussians.bands import BAND_0, bands, compiled_contraction, compiled_harmonics, harmonics_along
 from gsx.core.shapes import Float
 
 
@@ -17,25 +18,38 @@ def harmonics(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N
 
 
 class Contraction(torch.autograd.Function):
-    """sum over b of basis[b, n] rest[n, b, c].
-
-    Rows of B x 3 coefficients are multiplied as they lie in memory; matrices of zeros and ones spread what belongs to
-    a band or to a channel over them, and gather it.
-    """
+    """sum over b of basis[b, n] rest[n, b, c]."""
 
     @staticmethod
-    def forward(ctx, basis, rest):
+    def forward(ctx, basis, rest, compiled):
         ctx.save_for_backward(basis, rest)
-        by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
-        return (basis.T @ by_band).mul_(rest.flatten(1)) @ by_channel.T
+        ctx.compiled = compiled
+        return (compiled_contraction(len(basis))[0] if compiled else spread_contraction)(rest, basis)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, gradient):
         basis, rest = ctx.saved_tensors
-        by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
-        seen = gradient @ by_channel
-        by_rest = (basis.T @ by_band).mul_(seen).view(rest.shape) if ctx.needs_input_grad[1] else None
-        return by_band @ seen.mul_(rest.flatten(1)).T, by_rest
+        slopes_of = compiled_contraction(len(basis))[1] if ctx.compiled else spread_slopes
+        by_rest, by_basis = slopes_of(gradient.contiguous(), rest, basis)
+        return by_basis, by_rest, None
+
+
+def spread_contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
+    """`contraction` in few operations: rows of B x 3 coefficients are multiplied as they lie in memory; matrices of
+    zeros and ones spread what belongs to a band or to a channel over them, and gather it."""
+    by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
+    return (basis.T @ by_band).mul_(rest.flatten(1)) @ by_channel.T
+
+
+def spread_slopes(
+    gradient: Float[Tensor, "N 3"], rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]
+) -> tuple[Float[Tensor, "N B 3"], Float[Tensor, "B N"]]:
+    """`contraction_slopes` in the same way."""
+    by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
+    seen = gradient @ by_channel
+    by_rest = (basis.T @ by_band).mul_(seen).view(rest.shape)
+    return by_rest, by_band @ seen.mul_(rest.flatten(1)).T
 
 
 @functools.lru_cache
@@ -57,14 +71,16 @@ def colours_of(
 ) -> Float[Tensor, "N 3"]:
     """max(0, 0.5 + SH): colours seen along `offsets` (splat minus camera centre, any length) up to `degree`."""
     colours = 0.5 + BAND_0 * constant[:, 0]
-    if degree > 0:
-        count = (degree + 1) ** 2 - 1
-        if compiled and len(offsets) > 1:  # of all degrees, so that none compiles for itself
-            basis = compiled_harmonics(degree_of(rest.shape[1]))(offsets)[:count]
-        else:
-            basis = harmonics_along(offsets, degree)
-        colours = colours + Contraction.apply(basis.to(rest), rest[:, :count])
-    return colours.clamp_min(0)
+    if degree == 0:
+        return colours.clamp_min(0)
+    count = (degree + 1) ** 2 - 1
+    if not compiled or len(offsets) < 2:
+        basis = harmonics_along(offsets, degree).to(rest)
+        return (colours + Contraction.apply(basis, rest[:, :count], False)).clamp_min(0)
+    basis = compiled_harmonics(degree_of(rest.shape[1]))(offsets).to(rest)  # of all bands: compiled once
+    if count < len(basis):
+        basis = torch.cat([basis[:count], torch.zeros_like(basis[count:])])
+    return (colours + Contraction.apply(basis, rest, True)).clamp_min(0)
 
 
 def constant_from_colour(colour: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
