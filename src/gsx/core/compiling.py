@@ -40,9 +40,7 @@ def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
     return types.FunctionType(code, function.__globals__, function.__name__, values or function.__defaults__)
 
 
-def compile_rows(
-    function: Callable[..., Any], *last: Any, options: dict[str, str | int | bool] | None = None
-) -> Callable[..., Any]:
+def compile_rows(function: Callable[..., Any], *last: Any, options: dict[str, Any] | None = None) -> Callable[..., Any]:
     """`function` through torch.compile, once for any number of rows, with these values of its last arguments.
 
     Tensors with as many rows, or columns, as the first argument has rows are taken to vary in number; every other size

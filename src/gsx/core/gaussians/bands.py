@@ -1,7 +1,7 @@
 """Spherical harmonics of directions, compiled or not, with the signs of 3D-GS (3D-GS, sh_utils.py)."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -45,9 +45,16 @@ def compiled_harmonics(degree: int) -> Callable[..., Tensor]:
 
 def contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
     """sum over b of basis[b, n] rest[n, b, c], in one loop over splats once it is compiled."""
-    bands_, coefficients = basis.unbind(), rest.flatten(1).unbind(1)
-    channels = [sum(map(torch.mul, bands_, coefficients[channel::3])) for channel in range(3)]
-    return torch.stack(channels, 1)
+    coefficients = rest.flatten(1).unbind(1)
+    return torch.stack([sum_of_products(basis.unbind(), coefficients[channel::3]) for channel in range(3)], 1)
+
+
+def sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
+    """left[0] right[0] + left[1] right[1] + ..."""
+    total = left[0] * right[0]
+    for one, other in zip(left[1:], right[1:], strict=True):
+        total = total + one * other
+    return total
 
 
 def contraction_slopes(
@@ -56,7 +63,7 @@ def contraction_slopes(
     """Gradients of `rest` and `basis` by that of their contraction."""
     channels, coefficients = gradient.unbind(1), rest.flatten(1).unbind(1)
     by_rest = torch.stack([band * channel for band in basis for channel in channels], 1)
-    by_basis = [sum(map(torch.mul, channels, coefficients[3 * band : 3 * band + 3])) for band in range(len(basis))]
+    by_basis = [sum_of_products(channels, coefficients[3 * band : 3 * band + 3]) for band in range(len(basis))]
     return by_rest.view(rest.shape), torch.stack(by_basis)
 
 
