@@ -66,7 +66,7 @@ def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor
     """How pictures differ from the truth, `factor` times as fine as training, by name; none where nothing lies within
     the borders or no frequency above those of training."""
     window = interior(truth.shape[1], factor), interior(truth.shape[2], factor)
-    exact = truth[:, *window].double()
+    exact = truth[:, *window]
     if min(exact.shape[1:]) < 2 or factor <= 1:
         return {}
     rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in exact.shape[1:])
@@ -76,7 +76,7 @@ def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor
     _, truth_high, truth_recoverable = powers(exact, bands)
     out = {}
     for name, image in images.items():
-        low, above, recoverable = powers(image[:, *window].double() - exact, bands)
+        low, above, recoverable = powers(image[:, *window].to(exact) - exact, bands)
         out[name] = Detail(
             low=low, high=above, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
         )
