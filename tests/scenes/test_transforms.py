@@ -274,6 +274,13 @@ def test_a_camera_far_off_all_others_is_refused_by_name(tmp_path: Path) -> None:
             assert len(views(load(options(tmp_path)))) == 3
 
 
+def test_half_of_a_video_may_stand_still(tmp_path: Path) -> None:
+    """Its centres jitter by a ten-thousandth; then it walks thirty units away."""
+    along = [1e-4 * number for number in range(6)] + [6.0 * number for number in range(1, 6)]
+    write(tmp_path, poses=[[[1, 0, 0, x], *POSES[0][1:]] for x in along])
+    assert len(views(load(options(tmp_path)))) == 11
+
+
 def test_most_cameras_may_stand_on_a_tripod(tmp_path: Path) -> None:
     """Turned about a corner far from the origin: rounding moves their centres, and the last one stands elsewhere."""
     poses = []

@@ -29,9 +29,9 @@ MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
 FARTHEST = 1e9
 """A camera at a larger coordinate is a mistake: single precision could not tell it from its neighbours."""
-STRAY = 1e4
-"""A camera farther from the middle of all, in median distances of them from it, is a mistake: what one of them sees is
-a speck to the others. A city from the street to the sky spans some 1e2."""
+STRAY, OTHERS = 1e4, 0.9
+"""A camera so many times as far from the middle of all as this share of them is a mistake: what one of them sees is a
+speck to the others. A city from the street to the sky spans some 1e2; of a video half may stand still."""
 SAME_PLACE = 1e-9  # of the coordinates: cameras that are no farther apart, as on a tripod, differ by rounding alone
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
 PRINCIPAL_POINTS = ("exact", "centred")
@@ -245,15 +245,15 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
 
 
 def refuse_stray(shots: Sequence[Shot]) -> None:
-    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as half of them."""
+    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as `OTHERS`."""
     centres = torch.stack([shot.whole.centre.double() for shot in shots])
     middle = centres.median(dim=0).values
-    distances = (centres - middle).norm(dim=1)
-    usual, farthest = float(distances.median()), int(distances.argmax())
-    if usual > SAME_PLACE * middle.abs().max() and distances[farthest] > STRAY * usual:
+    distances, order = (centres - middle).norm(dim=1).sort()
+    usual, farthest = float(distances[int(OTHERS * (len(shots) - 1))]), float(distances[-1])
+    if usual > SAME_PLACE * middle.abs().max() and farthest > STRAY * usual:
         raise InputError(
-            f"The camera of '{shots[farthest].photo}' is {distances[farthest] / usual:.2g} times as far from the middle"
-            f" of all cameras as half of them (more than {STRAY:g}): correct its pose, or remove it."
+            f"The camera of '{shots[int(order[-1])].photo}' is {farthest / usual:.2g} times as far from the middle of "
+            f"all cameras as {OTHERS:.0%} of them (more than {STRAY:g}): correct its pose, or remove it."
         )
 
 
