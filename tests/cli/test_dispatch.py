@@ -90,7 +90,6 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
     monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
     monkeypatch.setattr("gsx.core.rasterizer.compiled.takes", lambda settings, **rest: settings.path == "compiled")
     monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.compiles", lambda settings, device: False)
-    monkeypatch.setattr("gsx.experiments.runs.evaluate.add_depth", lambda *_: None)  # which is always drawn eagerly
 
     def evaluated(*overrides: str) -> tuple[str, set[str], str]:
         asked.clear()

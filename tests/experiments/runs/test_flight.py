@@ -2,14 +2,18 @@
 
 import itertools
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 import torch
+from raster_scenes import front_camera, random_splats
 
 from gsx.core.data.camera import look_at
 from gsx.core.errors import InputError, TooManyPairs
+from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.experiments.reports.pictures import colour_ramp
 from gsx.experiments.runs import evaluate as evaluation
+from gsx.experiments.runs import flight as drawing
 from gsx.experiments.runs.flight import FRAMES, LONGEST, depth_colours, flight
 
 CAMERA = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=640, height=480)
@@ -36,6 +40,15 @@ def test_a_window_at_the_border_stays_inside():
     for camera in flight(CAMERA, (1.0, 0.0), 4.0):
         low, high = camera.cx - CAMERA.cx / CAMERA.fx * camera.fx, camera.fx / CAMERA.fx * CAMERA.width
         assert -1 <= -low <= high - camera.width + 1
+
+
+def test_depth_is_that_of_the_rasterizer(monkeypatch: pytest.MonkeyPatch):
+    splats, camera, rules = random_splats(200, seed=3), front_camera(), RasterSettings(path="eager")
+    monkeypatch.setattr(drawing, "splats_for", lambda run, camera: splats)
+    depth, coverage = drawing.depth_and_coverage(SimpleNamespace(raster=rules), camera, 1 << 20)
+    drawn = rasterize(splats, camera, rules, depth=True)
+    torch.testing.assert_close(depth, drawn.depth, rtol=1e-5, atol=1e-5)
+    assert torch.equal(coverage, drawn.alpha)
 
 
 def test_depth_is_coloured_by_its_inverse():

@@ -29,15 +29,19 @@ ENOUGH = 1_000_000
 
 def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
     """Beside each view that is shown its depth, near bright, far dark, black where nothing is."""
-    rules = replace(run.raster, path="eager")  # a picture with depth would be compiled for by itself
     for number, entry in zip(sorted(pictures.shown), pictures.views, strict=True):
-        camera = run.scene.test[number].camera
-        splats = splats_for(run, camera)
-        drawn = rasterize_tiled(splats, camera, rules, background=run.background, depth=True, pixels=pixels)
-        assert drawn.depth is not None
-        picture, limits = depth_colours(drawn.depth, drawn.alpha)
+        picture, limits = depth_colours(*depth_and_coverage(run, run.scene.test[number].camera, pixels))
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
         entry["depth"] = limits
+
+
+def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """(blending-weighted sum of camera z, coverage): z is drawn in place of the three colours, for which loops are
+    compiled already."""
+    splats = splats_for(run, camera)
+    z = camera.to_camera(splats.means)[:, 2:].to(splats.colours)
+    drawn = rasterize_tiled(replace(splats, colours=z.repeat(1, 3)), camera, run.raster, pixels=pixels)
+    return drawn.image[0], drawn.alpha
 
 
 def depth_colours(
