@@ -215,9 +215,11 @@ def test_the_environment_of_the_user_is_respected_but_for_telemetry(monkeypatch:
 
 
 @pytest.mark.parametrize("uri", ["https://me:secret@host/x", "postgresql://me:secret@host/runs", "https://secret@host",
-                                  "http://host/x?token=secret", "sqlite:///x.db?Password=secret"])  # fmt: skip
+                                  "http://host/x?token=secret", "sqlite:///x.db?Password=secret",
+                                  "mssql+pyodbc:///?odbc_connect=UID%3Dme%3BPWD%3Dsecret"])  # fmt: skip
 def test_a_password_in_the_address_is_refused_and_not_repeated(uri: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds a password") as refused:
         tiny_settings(tmp_path / "run", "tracker=[mlflow]", f"tracker.mlflow.uri='{uri}'")
     assert "secret" not in str(refused.value)
-    assert tiny_settings(tmp_path / "run", "tracker=[mlflow]", "tracker.mlflow.uri='postgresql://me@host/x?sslmode=on'")
+    told = "tracker.mlflow.uri='postgresql://me@host/x?passfile=/home/me/.pgpass'"
+    assert tiny_settings(tmp_path / "run", "tracker=[mlflow]", told)

@@ -16,27 +16,14 @@ Sides = tuple[list[Path], list[Path]]
 
 
 def refuse_file_twice(names: Sequence[str], photos: Sequence[Path], place: Path) -> None:
-    """Raise InputError if two of the names that `place` gives lead to one file: by links, `a/../b`, or no suffix."""
-    known: dict[Hashable, str] = {}
+    """Raise InputError if two of the names that `place` gives are one path: `a/../b`, or a suffix left out."""
+    known: dict[str, str] = {}
     for name, photo in zip(names, photos, strict=True):
-        key = identity(photo)
-        if key in known:
-            both = f"'{name}' twice" if name == known[key] else f"'{known[key]}' and '{name}', which are one file"
+        path = os.path.abspath(photo)
+        if path in known:
+            both = f"'{name}' twice" if name == known[path] else f"'{known[path]}' and '{name}', which are one file"
             raise InputError(f"'{place}' has {both}, perhaps to train on and to test on: remove one.")
-        known[key] = name
-
-
-def identity(photo: Path) -> Hashable:
-    """The same for all names of a file; with its size and time, as some systems number files anew.
-
-    Raises:
-        InputError: the file cannot be looked at.
-    """
-    try:
-        status = photo.stat()
-    except OSError as problem:
-        raise _unreadable(photo, problem) from None
-    return status.st_dev, status.st_ino or photo.resolve(), status.st_size, status.st_mtime_ns
+        known[path] = name
 
 
 def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> None:

@@ -29,10 +29,10 @@ MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
 FARTHEST = 1e9
 """A camera at a larger coordinate is a mistake: single precision could not tell it from its neighbours."""
-STRAY, OTHERS = 1e4, 0.9
-"""A camera so many times as far from the middle of all as this share of them is a mistake: what one of them sees is a
-speck to the others. A city from the street to the sky spans some 1e2; of a video half may stand still."""
-SAME_PLACE = 1e-9  # of the coordinates: cameras that are no farther apart, as on a tripod, differ by rounding alone
+STRAY = 1e4
+"""A camera so many times as far from the middle of all as the next farthest is a mistake: what one of them sees is a
+speck to the others. A city from the street to the sky spans some 1e2."""
+SAME_PLACE = 1e-3  # units: cameras that are no farther apart, as on a tripod, say nothing of how large a scene is
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
 PRINCIPAL_POINTS = ("exact", "centred")
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
@@ -245,16 +245,15 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
 
 
 def refuse_stray(shots: Sequence[Shot]) -> None:
-    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as `OTHERS`."""
+    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as any other."""
     centres = torch.stack([shot.whole.centre.double() for shot in shots])
-    middle = centres.median(dim=0).values
-    distances, order = (centres - middle).norm(dim=1).sort()
-    usual, farthest = float(distances[int(OTHERS * (len(shots) - 1))]), float(distances[-1])
-    if usual > SAME_PLACE * middle.abs().max() and farthest > STRAY * usual:
-        raise InputError(
-            f"The camera of '{shots[int(order[-1])].photo}' is {farthest / usual:.2g} times as far from the middle of "
-            f"all cameras as {OTHERS:.0%} of them (more than {STRAY:g}): correct its pose, or remove it."
-        )
+    distances, order = (centres - centres.median(dim=0).values).norm(dim=1).sort()
+    if len(shots) < 3 or not distances[-1] > STRAY * distances[-2] > STRAY * SAME_PLACE:
+        return
+    raise InputError(
+        f"The camera of '{shots[int(order[-1])].photo}' is {distances[-1] / distances[-2]:.2g} times as far from the "
+        f"middle of all cameras as the next farthest (more than {STRAY:g}): correct its pose, or remove it."
+    )
 
 
 def reduction_of(options: SceneOptions) -> Reduction:

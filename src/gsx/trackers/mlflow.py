@@ -61,7 +61,9 @@ class MLflowOptions:
             )
 
 
-SECRET = re.compile("pass|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE)
+SECRET = re.compile(
+    "pass(?!file)|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE
+)
 """What names of secrets have in them."""
 
 
@@ -73,7 +75,8 @@ def holds_secret(uri: str) -> bool:
     except ValueError:
         return False
     user, at, _ = parts.netloc.rpartition("@")
-    named = any(SECRET.search(name) for name, _ in parse_qsl(parts.query, keep_blank_values=True))
+    given = parse_qsl(parts.query, keep_blank_values=True)
+    named = any(SECRET.search(name) or re.search("(pwd|password)=", value, re.IGNORECASE) for name, value in given)
     return named or (bool(at) and (":" in user or parts.scheme in ("http", "https")))
 
 

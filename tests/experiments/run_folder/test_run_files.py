@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tiny import OVERRIDES, words
+from synthetic_colmap import synthesize, write_scene
+from tiny import words
 
 from gsx.cli.dispatch import main
 from gsx.core.files import own_mark
-from gsx.experiments.run_folder.files import is_number, read_run, sound_line, state_of
+from gsx.experiments.run_folder.files import has_figures, is_number, read_run, sound_line, state_of
 
 OLD = Path(__file__).parents[2] / "old_run"
 QUICK = ("iterations=2", "training.log_every=1", "training.checkpoint_every=1", "rasterizer=eager")
@@ -133,18 +134,22 @@ def test_the_remedy_makes_again_what_a_finished_run_lacks(run: Path, change: Cha
 def test_a_composition_that_was_trained_is_completed_and_never_trained_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [*OVERRIDES, *QUICK, "reuse=true", f"output={tmp_path}"]
+    """Of a scene with a folder, whose stamp counts, too."""
+    write_scene(synthesize(), tmp_path / "yard")
+    scene = ["scene=colmap", f"scene.path={tmp_path / 'yard'}", "backbone=gs3d", "training.test_points=2"]
+    command = [*scene, *QUICK, "reuse=true", f"output={tmp_path / 'out'}"]
     assert main(command) == 0
-    (run,) = tmp_path.glob("demo/gs3d/*/")
+    (run,) = tmp_path.glob("out/yard/gs3d/*/")
     model = (run / f"{CHECKPOINT}.safetensors").read_bytes()
 
     def given_again() -> str:
         capsys.readouterr()
         assert main(command) == 0
-        assert list(tmp_path.glob("demo/gs3d/.*_set_aside_*")) == []
+        assert list(tmp_path.glob("out/yard/gs3d/.*_set_aside_*")) == []
         return capsys.readouterr().err
 
-    for change in (without("renders/test_000.truth.png"), cut("point_cloud.ply"), without("environment.json")):
+    picture = next((run / "renders").glob("*.truth.png"))
+    for change in (without(f"renders/{picture.name}"), cut("point_cloud.ply"), without("environment.json")):
         change(run)
         assert "going on with" in given_again()
         assert state_of(read_run(run)) == ("ok", "")
@@ -155,6 +160,10 @@ def test_a_composition_that_was_trained_is_completed_and_never_trained_again(
         assert "finished earlier" in given_again(), "its figures are whole, and nothing makes this again"
         assert contents(run) == before
     assert state_of(read_run(run))[0] == "corrupted"
+    shutil.rmtree(run / "checkpoints")
+    picture.unlink()
+    assert "finished earlier" in given_again(), "no checkpoint could draw it"
+    assert has_figures(read_run(run))
 
 
 # -- what is read --------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """A run that goes on knows what changed: it says so, keeps it, and refuses what would make another run of it."""
 
+import errno
 import json
 import logging
 import shutil
@@ -12,6 +13,7 @@ from tiny import tiny_run
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
+from gsx.core.files import read_json
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.runs.environment import camera_digest
 from gsx.experiments.runs.history import go_on
@@ -137,10 +139,26 @@ def test_without_what_it_began_with_a_run_says_so_and_goes_on(
     assert now["source"] == f"unknown+{began['source']}"
     assert now["scene"] == began["scene"]
     assert [(entry["step"], list(entry["changed"])) for entry in now["history"]] == [(1, ["environment.json"])]
-    assert content is None or (run / "environment.damaged").read_text() == content
+    assert content is None or (run / "environment.damaged_1").read_text() == content
     caplog.clear()
     resumed(run)
     assert warned(caplog) == [], "compared with what was written anew"
+
+
+def test_what_cannot_be_read_now_is_not_taken_for_damaged(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = (run / "environment.json").read_bytes()
+
+    def failing(path: Path) -> object:
+        if path.name == "environment.json":
+            raise OSError(errno.EIO, "Input/output error")
+        return read_json(path)
+
+    for module in ("run_folder.files", "runs.history"):
+        monkeypatch.setattr(f"gsx.experiments.{module}.read_json", failing)
+    with pytest.raises(OSError, match="Input/output error"):
+        resumed(run)
+    assert (run / "environment.json").read_bytes() == sound
+    assert list(run.glob("environment.damaged*")) == []
 
 
 def test_a_config_that_lags_behind_its_history_goes_on(run: Path) -> None:

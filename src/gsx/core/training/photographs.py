@@ -1,5 +1,6 @@
 """Photographs where a run computes: bytes on the device, as long as there is room, made into numbers there."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -26,6 +27,16 @@ class Photographs:
     room: int
     """Bytes that are left for more of them."""
     kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
+    views: Sequence[View] = ()
+    """Those that are trained on now."""
+
+    def see(self, views: Sequence[View]) -> None:
+        """From now on these are trained on; all others go."""
+        if views is self.views:
+            return
+        self.views, wanted = views, set(views)
+        for view in [view for view in self.kept if view not in wanted]:
+            self.room += self.kept.pop(view).nbytes
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """What `view.image()` is, on the device."""

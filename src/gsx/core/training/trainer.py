@@ -87,6 +87,7 @@ def backward(run: Run) -> Step:
     asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
     views, steps = run.resolution.views(number), []
+    run.photographs.see(views)
     for view, terms, colour in zip(picked, asked, colours, strict=True):
         run.refuse_if_stopping()
         with gradients_added(run.backbone.table):

@@ -107,8 +107,7 @@ class RunFiles:
     def unfinished(self) -> list[str]:
         """Those that a run makes again which goes on: results, and with a checkpoint whatever else is not `lost`."""
         kept = not any(name.startswith("checkpoints/") for name in self.lacking)
-        results = (*RESULTS, "renders/", "pseudo/")
-        return [name for name in self.lacking if name.startswith(results) or (kept and name not in self.lost)]
+        return [name for name in self.lacking if name in RESULTS or (kept and name not in self.lost)]
 
     @property
     def scene(self) -> str:
@@ -375,7 +374,7 @@ def has_figures(files: RunFiles) -> bool:
     if state_of(files)[0] == "ok":
         return True
     sound = files.status.get("state") == "ok" and "config.yaml" not in files.problems
-    return sound and judged(files) and set(files.lacking) <= set(files.lost)
+    return sound and judged(files) and not files.unfinished
 
 
 def reported(folder: Path) -> bool:

@@ -6,11 +6,12 @@ gone, it is written anew.
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
 from gsx.core.errors import InputError
-from gsx.core.files import remove_partial, write_json
+from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
 from gsx.core.training.run import Run
@@ -106,10 +107,16 @@ def options_told(run: Run, files: RunFiles, plugins: Plugins, other_source: bool
 
 
 def write_anew(run: Run, plugins: Plugins, problem: str) -> None:
-    """Tell and record that nobody knows what the run began with; what is there of a damaged file is kept beside it."""
+    """Tell and record that nobody knows what the run began with; what is there of a damaged file is kept beside it.
+
+    Raises:
+        OSError: the file is there, and cannot be read now.
+    """
     path = run.folder / FACTS
+    with suppress(FileNotFoundError, ValueError):
+        read_json(path)
     if path.exists():
-        path.replace(path.with_suffix(".damaged"))
+        path.replace(next(p for n in range(1, 1000) if not (p := path.with_suffix(f".damaged_{n}")).exists()))
     logger.warning(
         "%s, %s: whether the run goes on with the scene, options and versions that it began with is not known; that "
         "file is written anew",

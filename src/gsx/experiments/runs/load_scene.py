@@ -45,9 +45,9 @@ def count_notes(settings: Settings) -> list[str]:
     published = dataset.images.get(dataset.scene) if dataset else None
     if not (published and path):
         return []
-    found = file_count(Path(path).expanduser() / "images")
-    compared = "figures cannot be compared with published ones"
-    return [] if found == published else [f"images/ holds {found} files, published are {published}: {compared}."]
+    images = getattr(settings.scene.options, "images", "") or "images"
+    found, compared = file_count(Path(path).expanduser() / images), "figures cannot be compared with published ones"
+    return [] if found == published else [f"{images}/ holds {found} files, published are {published}: {compared}."]
 
 
 def with_more_points(scene: Scene, count: int, seed: int) -> Scene:

@@ -185,7 +185,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
         with ExitStack() as claim:
             if folder.is_dir():
                 claim.enter_context(claimed(folder))
-            run = gone_on_with(folder, files, settings)
+            run = gone_on_with(folder, files, settings, stamp)
             claims.push(claim.pop_all())
     except CheckpointError as error:
         set_aside(folder, str(error))
@@ -198,15 +198,16 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
     return folder, run
 
 
-def gone_on_with(folder: Path, files: RunFiles, settings: Settings) -> Run:
-    """The run of a folder that is named by its composition.
+def gone_on_with(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:
+    """The run of a folder that is named by its composition; where it does not tell its scene's stamp, its name does.
 
     Raises:
         CheckpointError: there is nothing in it to go on with.
     """
     if not checkpoint.sidecars(folder / "checkpoints"):
         raise CheckpointError(f"{folder} holds no checkpoint")
-    if composition_key(files.config, trained_on(files), settings.idle) != folder.name:
+    scene = trained_on(files) if files.environment else stamp
+    if composition_key(files.config, scene, settings.idle) != folder.name:
         raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
     return restored(settings, folder, training=True)
 
