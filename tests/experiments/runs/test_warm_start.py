@@ -1,6 +1,7 @@
 """Branching from a common beginning: the same bits as from scratch, and only what is common."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,25 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
         assert [line["step"] for line in lines(tmp_path / name)] == [
             line["step"] for line in lines(tmp_path / f"{name}_scratch")
         ]
+
+
+def test_a_branch_that_is_killed_while_it_begins_leaves_a_whole_checkpoint_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files appear whole, and last the one without which the others are no checkpoint."""
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
+    appeared: list[str] = []
+    replace = os.replace
+
+    def noted(source: Path, place: Path) -> None:
+        if Path(place).is_relative_to(tmp_path / "second"):
+            appeared.append(Path(place).name)
+        replace(source, place)
+
+    monkeypatch.setattr(os, "replace", noted)
+    tiny_run(tmp_path / "second", (*RUN, "init=warm_start"), stop_after=11)
+    begun = appeared[: appeared.index("branch.json")]
+    assert begun[-3:] == ["step_0000010.safetensors", "metrics.jsonl", "step_0000010.json"]
 
 
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:

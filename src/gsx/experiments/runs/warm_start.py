@@ -7,7 +7,6 @@ augmenters, has left behind, and leaves states for later ones. The result is bit
 import hashlib
 import json
 import logging
-import shutil
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -26,7 +25,7 @@ from gsx.core.cache import (
 from gsx.core.data.scene import FromFile
 from gsx.core.device import machine_stamp
 from gsx.core.errors import CheckpointError, InputError
-from gsx.core.files import read_json, write_json
+from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run, Step
@@ -100,11 +99,10 @@ def branch(run: Run, sidecar: Path) -> None:
     """Start from a kept state: its checkpoint and its lines of metrics.jsonl become the run's own."""
     own = run.folder / "checkpoints"
     own.mkdir(parents=True, exist_ok=True)
-    for suffix in (".safetensors", ".json"):  # the sidecar last: without it a checkpoint does not exist
-        shutil.copyfile(sidecar.with_suffix(suffix), own / sidecar.with_suffix(suffix).name)
-    (run.folder / "metrics.jsonl").write_text(
-        "".join(json.dumps(line) + "\n" for line in read_json(lines_at(sidecar))["lines"])
-    )
+    tensors, lines = sidecar.with_suffix(".safetensors"), read_json(lines_at(sidecar))["lines"]
+    replace_file(own / tensors.name, tensors.read_bytes())
+    replace_text(run.folder / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+    replace_file(own / sidecar.name, sidecar.read_bytes())  # last: without it a checkpoint does not exist
     checkpoint.restore(run, training=True)
     write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
     logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
