@@ -11,6 +11,7 @@ from typing import Any
 from tiny import OVERRIDES, tiny_run
 
 from faults.children import in_child, preload, run_in_child
+from gsx.cli.dispatch import main
 from gsx.core.cache import IN_USE, released
 
 EVENT = [f"augmenter.upscale.timing.{key}=10000" for key in ("start", "every", "span")]
@@ -58,8 +59,8 @@ def stopped() -> None:
 
 
 def finished() -> None:
-    """A run that came to its end."""
-    tiny_run(Path("run"), STEPS)
+    """A run that came to its end, with all that the command line leaves."""
+    assert main([*OVERRIDES, *STEPS, "folder=run"]) == 0
 
 
 def model(place: Path) -> str:
