@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.ranges import Range
 
 RESUME_FLAGS = ("--trust", "--changed")
 """Of gsx resume."""
@@ -70,6 +71,12 @@ def different_numbers(word: str) -> list[int]:
     if not all(part.isdecimal() for part in parts) or len(set(parts)) < len(parts):
         raise argparse.ArgumentTypeError(f"'{word}' is no list of different whole numbers: give one, for example 0,1,2")
     return [int(part) for part in parts]
+
+
+def refuse_beyond(flag: str, value: float, bounds: Range) -> None:
+    """Raise InputError for a number of the command line that is outside of its range."""
+    if value not in bounds:
+        raise InputError(f"{flag} is {value:,}: give a number {bounds}")
 
 
 def new_folder(folder: Path) -> Path:

@@ -4,8 +4,7 @@ import sys
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, positive, whole
-from gsx.cli.runs import refuse_beyond
+from gsx.cli.arguments import Parser, positive, refuse_beyond, whole
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, positive, run_arguments, whole
+from gsx.cli.arguments import Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
@@ -67,12 +67,6 @@ def verb_render(arguments: list[str]) -> int:
         raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
     sys.stdout.write(f"{rendered(given)}\n")
     return 0
-
-
-def refuse_beyond(flag: str, value: float, bounds: Range) -> None:
-    """Raise InputError for a number of the command line that is outside of its range."""
-    if value not in bounds:
-        raise InputError(f"{flag} is {value:,}: give a number {bounds}")
 
 
 def rendered(given: argparse.Namespace) -> Path:

@@ -89,10 +89,7 @@ def elements_of(content: bytes) -> dict[str, np.ndarray]:
     Raises:
         InputError: it is no binary PLY of scalar properties, or ends early.
     """
-    body = content.find(b"\n", content.find(b"end_header")) + 1
-    lines = [line.split() for line in content[:body].decode("latin-1").splitlines()]
-    if not content.startswith(b"ply") or not body or ["format", "binary_little_endian", "1.0"] not in lines:
-        raise InputError("it is no binary PLY with a complete header: export it anew")
+    body, lines = _binary_header(content)
     found: dict[str, np.ndarray] = {}
     for name, count, kinds in _elements(lines):
         if len(content) - body < count * kinds.itemsize:
@@ -100,6 +97,26 @@ def elements_of(content: bytes) -> dict[str, np.ndarray]:
         found[name] = np.frombuffer(content, kinds, count, body)
         body += count * kinds.itemsize
     return found
+
+
+def length_of(head: bytes) -> int:
+    """Bytes of the binary file that begins so, by its header.
+
+    Raises:
+        InputError: it has no complete header of a binary PLY of scalar properties.
+    """
+    body, lines = _binary_header(head)
+    return body + sum(count * kinds.itemsize for _, count, kinds in _elements(lines))
+
+
+def _binary_header(content: bytes) -> tuple[int, list[list[str]]]:
+    """Length of the header, and the words of its lines."""
+    body = content.find(b"\n", content.find(b"end_header")) + 1
+    lines = [line.split() for line in content[:body].decode("latin-1").splitlines()]
+    whole = content.startswith(b"ply") and ["end_header"] in lines
+    if not whole or ["format", "binary_little_endian", "1.0"] not in lines:
+        raise InputError("it has no complete header of a binary PLY: export it anew")
+    return body, lines
 
 
 def _elements(lines: list[list[str]]) -> list[tuple[str, int, np.dtype]]:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from gsx.core.errors import ConfigError, InputError, first_line
-from gsx.core.files import read_json, write_json
+from gsx.core.files import read_json, replace_file, write_json
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.suffixes import STANDARD
 from gsx.core.plugins import Plugins
@@ -131,7 +131,7 @@ def begin(run: Run, settings: Settings, target: Path, to: Path, degree: int, plu
     write_config(to / "config.yaml", config)
     for name in ("environment.json", "metrics.jsonl"):
         if (target / name).is_file():
-            shutil.copyfile(target / name, to / name)
+            replace_file(to / name, (target / name).read_bytes())
     checkpoint.save(run)
     again, settings = open_run(to, plugins)
     again.raster = run.raster

@@ -66,7 +66,7 @@ class RunFiles:
         verb = "eval" if only_results and 0 < self.iterations <= self.step else "resume"
         return f"gsx {verb} {self.folder}"
 
-    @property
+    @cached_property
     def begun(self) -> tuple[str, ...]:
         """Files that its beginning leaves."""
         made = read_mapping(self.folder, COMPACT, {}, lambda content: isinstance(content.get("from"), str))

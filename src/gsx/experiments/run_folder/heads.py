@@ -3,8 +3,9 @@
 import json
 from pathlib import Path
 
+from gsx.core.errors import InputError
 from gsx.core.files import read_json
-from gsx.core.gaussians.ply import TYPES
+from gsx.core.gaussians.ply import length_of
 
 MOST_HEADER = 1 << 16
 """Bytes within which the header of a splat file ends."""
@@ -14,29 +15,11 @@ def splats_problem(path: Path) -> str:
     """What is wrong with the splat file of a run, as far as its header tells; empty: nothing."""
     try:
         with path.open("rb") as stream:
-            length = length_of_ply(stream.read(MOST_HEADER))
+            length = length_of(stream.read(MOST_HEADER))
         size = path.stat().st_size
-    except (OSError, ValueError, LookupError) as error:
-        return f"{path.name} cannot be read ({error or type(error).__name__})"
+    except (OSError, InputError) as error:
+        return f"{path.name} cannot be read ({error})"
     return "" if size == length else f"{path.name} has {size:,} bytes, its header tells {length:,}"
-
-
-def length_of_ply(head: bytes) -> int:
-    """Bytes of a binary PLY of scalars that begins so.
-
-    Raises:
-        ValueError, LookupError: it has no such header.
-    """
-    header, end, _ = head.partition(b"end_header\n")
-    if not (header.startswith(b"ply\nformat binary_little_endian") and end):
-        raise ValueError("no complete header of a binary PLY")
-    count, length = 0, len(header) + len(end)
-    for words in map(str.split, header.decode("latin-1").splitlines()):
-        if words[:1] == ["element"]:
-            count = int(words[2])
-        elif words[:1] == ["property"]:
-            length += count * int(TYPES[words[1]][1:])
-    return length
 
 
 def newest_checkpoint(folder: Path) -> int:
