@@ -94,9 +94,12 @@ class PseudoDetails:
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event = {}, 0
+            run.resolution.closer.pop(self.context.name, None)
             return None
         if event != self.event:
-            self.views, self.event = by_parent(self.of_event(run, event, view)), event
+            made = self.of_event(run, event, view)
+            self.views, self.event = by_parent(made), event
+            run.resolution.closer[self.context.name] = made
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
         return self.weighted(run, self.views.get(view, []), place, inside)

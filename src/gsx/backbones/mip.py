@@ -20,10 +20,13 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.schedule import Schedule
 
 FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")
+ENOUGH_VIEWS = 9
+"""So many views of one density allow what one allows: below them noise and wrong poses take what they add."""
 LEAST_DEPTH = 1e-3
 """Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
 
@@ -48,6 +51,11 @@ class MipOptions:
     """What the finest camera is of those that see a primitive. `release`: one of the largest focal length of all, at
     the least depth of any. `paper`: the one with the largest quotient of its own focal length and depth, which is the
     same where all focal lengths are."""
+
+    views: Annotated[float, Range(1, 4)] = 1.0
+    """The most by which several views that sample a place alike narrow its filter."""
+    pseudo: bool = False
+    """Pseudo views narrow the filters of what they see, by as much as their pixels are trusted."""
 
     def __post_init__(self) -> None:
         if self.rate not in RATES:
@@ -149,15 +157,26 @@ class MipFilter:
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
-        table.columns["filter"] = filter_sizes(
-            means.detach(), self.context.resolution.rendered_cameras(step + 1), self.options
-        )
+        points, options, resolution = means.detach(), self.options, self.context.resolution
+        cameras = resolution.rendered_cameras(step + 1)
+        sizes = filter_sizes(points, cameras, options)
+        if options.views > 1:
+            sizes = sizes / several_views(points, cameras, sizes, options)
+        if options.pseudo:
+            earned = table.columns.get("earned")
+            earned = torch.full_like(sizes, torch.inf) if earned is None else earned
+            for view in resolution.closer_after(step):
+                earned = earned.minimum(earned_size(points, view, sizes, options))
+            table.columns["earned"] = earned
+            sizes = sizes.minimum(earned)
+        table.columns["filter"] = sizes
 
     def due(self, step: int) -> bool:
         """Every interval between the end of density control and the freezing of the filter (Mip-Splatting), and where
         renders become finer."""
         options, schedule = self.options, self.schedule
-        if self.context.resolution.changes_after(step):
+        resolution = self.context.resolution
+        if resolution.changes_after(step) or (options.pseudo and bool(resolution.closer_after(step))):
             return True
         inside = schedule.step(self.settled) < step < schedule.step(options.stop)
         return inside and step % schedule.interval(options.every) == 0
@@ -240,3 +259,34 @@ def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tenso
     log_opacities = logsigmoid(table["opacity_logits"]) + (scales / wider).clamp_min(LEAST_SHARE).log().sum(1)
     table["log_scales"].copy_(wider.log())
     table["opacity_logits"].copy_(logit_of_log(log_opacities))
+
+
+@torch.no_grad()
+def several_views(
+    points: Float[Tensor, "N 3"], cameras: Sequence[Camera], sizes: Float[Tensor, "N"], options: MipOptions
+) -> Float[Tensor, "N"]:
+    """How many times as finely views sample each point together as the finest of them alone, from 1 to the most: a
+    third of the square root of their number, each counted by its density over the finest one's, squared."""
+    views, deviation = torch.zeros_like(sizes), options.variance**0.5
+    for camera in cameras:
+        depth, seen = seen_depths(points, camera, options)
+        views += seen * (sizes / deviation * camera.fx / depth).square().clamp_max(1)
+    return (views.sqrt() / ENOUGH_VIEWS**0.5).clamp(1, options.views)
+
+
+@torch.no_grad()
+def earned_size(
+    points: Float[Tensor, "N 3"], view: PseudoView, sizes: Float[Tensor, "N"], options: MipOptions
+) -> Float[Tensor, "N"]:
+    """Filter of what a pseudo view sees: as its own density allows where its pixels count whole, `sizes` where they do
+    not count, between them by their logarithms; infinite where it sees nothing."""
+    camera = view.camera
+    places, depth = camera.project(points)
+    inside = (places >= 0) & (places < places.new_tensor(camera.size))
+    seen = inside.all(1) & (depth > options.near)
+    own = depth.clamp_min(LEAST_DEPTH) / camera.fx * options.variance**0.5
+    trust = torch.ones_like(sizes)
+    if view.pixel_weight is not None:
+        column, row = (places[:, k].long().clamp(0, side - 1) for k, side in enumerate(camera.size))
+        trust = view.pixel_weight.to(sizes)[row, column] / 255
+    return torch.where(seen, sizes * (own / sizes).clamp_max(1).pow(trust), torch.inf)

@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.shapes import Bool, UInt8
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
 
 
@@ -77,6 +78,8 @@ class Resolution:
     """Last step before that."""
     coarse_views: dict[int, Sequence[View]] = field(default_factory=dict)
     """Those that were asked for, by how many times as coarse they are."""
+    closer: dict[str, Sequence[PseudoView]] = field(default_factory=dict)
+    """Pseudo views that are trained on at the moment, by augmenter."""
 
     def coarse_at(self, step: int) -> int:
         """How many times as coarse as the photographs the pictures of a step are."""
@@ -112,3 +115,7 @@ class Resolution:
         """Whether the next step renders at another resolution."""
         finer = self.supersample_at(step) != self.supersample_at(step + 1)
         return step > 0 and (finer or self.coarse_at(step) != self.coarse_at(step + 1))
+
+    def closer_after(self, step: int) -> list[PseudoView]:
+        """Pseudo views that were made for this step."""
+        return [view for views in self.closer.values() for view in views if view.provenance["event"] == step - 1]

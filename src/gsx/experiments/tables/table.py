@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,10 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "LPIPS": lambda e: e.get("lpips"),
     "kGS": lambda e: thousandth(e.get("visible_primitives")),
     "MB": lambda e: e.get("megabytes"),
+    "s": lambda e: e.get("train_seconds"),
 }
-"""By metric, from an evaluation or one of its groups; Mem is the size of the model file, as the paper has it."""
+"""By metric, from an evaluation or one of its groups; Mem is the size of the model file, as the paper has it; s: of
+training."""
 PLACES = ("model", "revision", "variant", "dtype", "tiling")
 """Keys of regenerators that say where a model comes from and how it fits into memory."""
 SHOWN_KEYS = 12
@@ -66,11 +68,15 @@ class Figure:
     difference: float | None
     gain: float | None = None
     """Over the baseline's row."""
+    gain_spread: float | None = None
+    """Half of the range of the gain, each seed against the same seed."""
     paper_gain: float | None = None
     problem: str = ""
     """Why there is no figure."""
     remarks: tuple[str, ...] = ()
     """What a reader must know of the runs behind it."""
+    by_seed: tuple[float, ...] = ()
+    """Means over the scenes, seed by seed."""
 
     @property
     def scenes(self) -> int:
@@ -158,7 +164,7 @@ def table_of(
     zoomed += [
         name for name in detailed if any(zoom_figure(run.evaluation, name) is not None for run in files.values())
     ]
-    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS"]), *zoomed]
+    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS", "s"]), *zoomed]
     figures = [
         figure(row, scope, metric, [c for c in cells if c.row == row], files, published, lacking)
         for scope in scopes
@@ -215,6 +221,7 @@ def figure(
         difference=ours - paper if complete and ours is not None and paper is not None else None,
         problem="" if complete else problem_of(inside, files, lacking, metric),
         remarks=tuple(dict.fromkeys(told for cell in inside for told in remarks_on(cell, files))),
+        by_seed=tuple(by_seed),
     )
 
 
@@ -271,8 +278,15 @@ def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
         same = b is not None and f.whole == b.whole
         ours = gain(f, f.ours, b.ours) if b and same else None
         theirs = gain(f, f.paper, b.paper) if b else None
-        out.append(Figure(**(vars(f) | {"gain": ours, "paper_gain": theirs})))
+        varied = paired_spread(f, b) if b and ours is not None else None
+        out.append(replace(f, gain=ours, gain_spread=varied, paper_gain=theirs))
     return out
+
+
+def paired_spread(figure: Figure, base: Figure) -> float | None:
+    """Half of the range of a gain over the seeds; None with a single one."""
+    gains = [own - other for own, other in zip(figure.by_seed, base.by_seed, strict=True)]
+    return spread(gains) if len(gains) > 1 else None
 
 
 def seconds_of(files: RunFiles) -> float:

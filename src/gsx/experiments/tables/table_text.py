@@ -6,10 +6,10 @@ from gsx.core.files import csv_text
 from gsx.experiments.tables.published import METRICS
 from gsx.experiments.tables.table import Figure, Scope, Table, rows_of
 
-DIGITS = {"detail": 3, "PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1}
+DIGITS = {"detail": 3, "PSNR": 2, "SSIM": 3, "LPIPS": 3, "kGS": 0, "MB": 1, "s": 0}
 FIELDS = (
     "row", "scope", "scenes", "of_scenes", "seeds", "metric", "ours", "spread", "paper", "difference", "gain",
-    "paper_gain", "problem", "remarks",
+    "gain_spread", "paper_gain", "problem", "remarks",
 )  # fmt: skip
 
 
@@ -32,6 +32,12 @@ def ours(figure: Figure) -> str:
         text += f" ± {number(figure.spread, figure.metric)}"
     text += " *" if figure.remarks else ""
     return text if figure.scenes == figure.of_scenes else f"({text}: {figure.scenes} of {figure.of_scenes})"
+
+
+def gained(figure: Figure) -> str:
+    """The gain over the baseline, ± its own spread."""
+    varied = number(figure.gain_spread, figure.metric)
+    return number(figure.gain, figure.metric, sign=True) + (f" ± {varied}" if varied else "")
 
 
 def headings(table: Table, scope: Scope) -> list[tuple[str, str]]:
@@ -68,7 +74,7 @@ def cells(table: Table, scope: Scope) -> list[list[str]]:
             line.append(ours(f) if what == "ours" else values[what])
         if lead:
             f = table.at(row, scope.title, lead)
-            line += [number(f.gain, lead, sign=True), number(f.paper_gain, lead, sign=True)]
+            line += [gained(f), number(f.paper_gain, lead, sign=True)]
         rows.append(line)
     return [[*head, *gains], *rows]
 
