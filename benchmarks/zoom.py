@@ -5,11 +5,11 @@
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and drawn
 by every rule for zoomed cameras. `compositions`: each is trained by mip_splatting and by its preset for zooming in.
-`parts`: by parts of the preset. `levels`: by Octree-GS with its preset for zooming in. `pictures`: by
-the preset with pseudo details, enlarged or true, in half of the run. `afar`: what compositions draw from four times as
-far as photographs were taken, by each way of looking. `truth`: `gsx +experiment=zoom_truth`, by --share of its steps,
-and its row `zoom` by a quarter more of them. Finished runs below --runs
-are not trained again. Some hours on two cores.
+`parts`: by parts of the preset. `levels`: by Octree-GS with its preset for zooming in. `pictures`: by the preset with
+pseudo details, enlarged or true, in half of the run; `trusted`: by such that narrow the 3D filter. `afar`: what
+compositions draw from four times as far as photographs were taken, by each way of looking. `truth`:
+`gsx +experiment=zoom_truth` by --share of its steps, and its row `zoom` by a quarter more of them. Finished runs below
+--runs are not trained again. Some hours on two cores.
 """
 
 import argparse
@@ -63,22 +63,33 @@ PARTS = {
 }
 """Finer pixels in the second half of the steps."""
 LEVELS = {"preset=octree_zoom": ("backbone=octree_scaffold", "preset=octree_zoom")}
-STRONG = (
-    *(*EARLY, "augmenter=upscale", "augmenter.upscale.timing.start=20000", "augmenter.upscale.scales=[2]"),
-    *("augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
-)
-"""Pseudo views twice as fine count for half of the run, by absolute values; the rest is the augmenter's default."""
+
+
+def strong(scale: int) -> tuple[str, ...]:
+    """Pseudo views so many times as fine count for half of the run, by absolute values; the rest is the augmenter's
+    default."""
+    return (
+        *(*EARLY, "augmenter=upscale", "augmenter.upscale.timing.start=20000", f"augmenter.upscale.scales=[{scale}]"),
+        *("augmenter.upscale.loss=l1", "augmenter.upscale.gain=1"),
+    )
+
+
 LANCZOS, ORACLE = (("regenerator/upscale=lanczos",), ("regenerator/upscale=oracle",))
-REPLACING = (*STRONG, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,0.6]")
+REPLACING = ("augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,0.6]")
 """0.6 of the photographs' loss."""
-ADDED = (*STRONG, "augmenter.upscale.mode=direct")
+ADDED = ("augmenter.upscale.mode=direct",)
 """To the photographs' loss, at weight 1."""
 PICTURES = {
-    "lanczos replacing 0.6": (*REPLACING, *LANCZOS),
-    "oracle replacing 0.6": (*REPLACING, *ORACLE),
-    "lanczos added": (*ADDED, *LANCZOS),
-    "oracle added": (*ADDED, *ORACLE),
+    "lanczos replacing 0.6": (*strong(2), *REPLACING, *LANCZOS),
+    "oracle replacing 0.6": (*strong(2), *REPLACING, *ORACLE),
+    "lanczos added": (*strong(2), *ADDED, *LANCZOS),
+    "oracle added": (*strong(2), *ADDED, *ORACLE),
 }
+TRUSTED = {
+    "lanczos x4, filter narrowed": (*strong(4), *REPLACING, *LANCZOS, "backbone.mip.pseudo=true"),
+    "oracle x4, filter narrowed": (*strong(4), *REPLACING, *ORACLE, "backbone.mip.pseudo=true"),
+}
+"""Pseudo views four times as fine, which narrow the 3D filter of what they see."""
 WAYS = {
     "samples of its pixels": ("eval.supersample=1",),
     "four times as fine, reduced": ("eval.supersample=4",),
@@ -255,6 +266,11 @@ def pictures(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Pseudo details on a composition for zooming in", *compared(PICTURES, scenes, given)
 
 
+def trusted(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """With pseudo details that narrow the 3D filter, enlarged by a filter or true."""
+    return "Pseudo details that narrow the 3D filter", *compared(TRUSTED, scenes, given)
+
+
 def compared(
     named: Mapping[str, tuple[str, ...]], scenes: Sequence[str], given: argparse.Namespace
 ) -> tuple[list[list[str]], list[dict[str, Any]], str]:
@@ -395,6 +411,7 @@ WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
     "parts": parts,
     "levels": levels,
     "pictures": pictures,
+    "trusted": trusted,
     "afar": afar,
     "truth": truth,
 }

@@ -18,10 +18,11 @@ from torch.nn.functional import logsigmoid
 from gsx.backbones import mip
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import candidates
-from gsx.backbones.mip import MipOptions, filter_sizes
+from gsx.backbones.mip import MATCHED, MipOptions, earned_size, filter_sizes, several_views
 from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.ply import read_ply
@@ -33,6 +34,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled
 from gsx.core.training.density import mean_absolute, mean_gradient, zero_statistics
 from gsx.core.training.parameter_table import gradients, restored_table, table_tensors
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.build import build
@@ -205,6 +207,48 @@ def test_where_nothing_is_seen_the_error_says_what_to_do() -> None:
 
 def test_no_points_have_no_sizes() -> None:
     assert filter_sizes(torch.zeros(0, 3), [axis_camera()], OPTIONS).shape == (0,)
+
+
+# -- ours: several views, pseudo views ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("distances", "most", "factor"),
+    [
+        ([2.0] * 9, 4.0, 1.0),
+        ([2.0] * 18, 4.0, 2**0.5),
+        ([2.0] * 18, 1.4, 1.4),
+        ([2.0] + [4.0] * 8, 4.0, 1.0),  # 1 + 8 / 4 views: fewer than nine narrow nothing
+        ([2.0] * 9 + [4.0] * 108, 4.0, 2.0),
+    ],
+)
+def test_views_narrow_the_filter_by_a_third_of_the_root_of_their_number(
+    distances: list[float], most: float, factor: float
+) -> None:
+    cameras = [look_at([0, -d, 0], [0, 0, 0], fov_x=1.0, width=100, height=100) for d in distances]
+    points, options = torch.tensor([[0.0, 0, 0], [0, -900, 0]]), replace(OPTIONS, views=most)
+    found = several_views(points, cameras, filter_sizes(points, cameras, options), options)
+    assert found.tolist() == pytest.approx([factor, 1.0])  # what no camera sees stays as it is
+
+
+def test_pseudo_views_narrow_what_they_see_by_as_much_as_their_pixels_count() -> None:
+    photograph = look_at([0, -4, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
+    window = photograph.zoom(4).crop(150, 150, 100, 100)
+    points = torch.tensor([[0.0, 0, 0], [1.5, 0, 0], [0, -900, 0]])
+    sizes = filter_sizes(points, [photograph], OPTIONS)
+    for weight, exponent in ((None, 1.0), (255, 1.0), (0, 0.0), (102, 0.4)):
+        pixels = None if weight is None else torch.full((100, 100), weight, dtype=torch.uint8)
+        target = torch.zeros(3, 100, 100, dtype=torch.uint8)
+        view = PseudoView(camera=window, target=target, parent=0, pixel_weight=pixels)
+        found = earned_size(points, view, sizes, OPTIONS)
+        assert found.tolist() == pytest.approx([float(sizes[0]) / 4**exponent, torch.inf, torch.inf])
+
+
+def test_a_coarser_pseudo_view_widens_nothing() -> None:
+    photograph = look_at([0, -4, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
+    view = PseudoView(camera=photograph.zoom(0.5), target=torch.zeros(3, 50, 50, dtype=torch.uint8), parent=0)
+    sizes = filter_sizes(torch.zeros(1, 3), [photograph], OPTIONS)
+    assert torch.equal(earned_size(torch.zeros(1, 3), view, sizes, OPTIONS), sizes)
 
 
 # -- how the filter enters (10.3) --------------------------------------------------------------------------------------
@@ -476,6 +520,33 @@ def test_the_run_is_drawn_with_the_2d_filter(tmp_path: Path) -> None:
     assert built(tmp_path, "backbone=mip_splatting", "backbone.mip.kernel=0.3").raster.dilation == 0.3
 
 
+@pytest.mark.parametrize("resize_filter", sorted(MATCHED))
+def test_a_matched_kernel_passes_what_the_filter_of_the_photographs_passes(resize_filter: str) -> None:
+    """Cosines of f cycles per px of a picture 16 times as fine, reduced by the filter, against exp(-2 pi^2 V f^2)."""
+    factor, frequencies = 16, [0.125, 0.25, 0.375]
+    place = (torch.arange(64 * factor, dtype=torch.float64) + 0.5) / factor
+    passed = []
+    for f in frequencies:
+        fine = torch.cos(2 * math.pi * f * (place - 32)).expand(1, factor, -1)
+        low = Reduction(filter=resize_filter).formed(fine, factor)[0, 0, 8:-8]
+        wave = torch.exp(-2j * math.pi * f * (torch.arange(64)[8:-8] + 0.5 - 32))
+        passed.append(2 * float((low * wave).real.mean()))
+
+    def off(variance: float) -> float:
+        gaussian = [math.exp(-2 * math.pi**2 * variance * f**2) for f in frequencies]
+        return max(abs(own / other - 1) for own, other in zip(passed, gaussian, strict=True))
+
+    assert off(MATCHED[resize_filter]) < 0.08
+    assert off(0.3) > 0.25  # as 3D-GS dilates
+    assert resize_filter == "bicubic" or off(MATCHED["area" if resize_filter == "lanczos" else "lanczos"]) > 0.09
+
+
+def test_the_kernel_is_matched_where_asked_for(tmp_path: Path) -> None:
+    matched = built(tmp_path, "backbone=mip_splatting", "backbone.mip.kernel=0")
+    assert matched.scene.reduction.filter == "area"
+    assert matched.raster.dilation == pytest.approx(1 / 12)
+
+
 @pytest.mark.parametrize("backbone", ["gs3d", "scaffold"])
 @pytest.mark.parametrize("rule", ["magnified", "resampled"])
 def test_rules_for_zoomed_cameras_know_the_focal_length_of_training(tmp_path: Path, backbone: str, rule: str) -> None:
@@ -516,7 +587,7 @@ def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbo
     ("override", "message"),
     [
         ("backbone.filter=mop", r"backbone\.filter is 'mop'; choose one of none, mip, magnified, resampled"),
-        ("backbone.mip.kernel=0", r"backbone\.mip\.kernel is 0\.0; give a number from 1e-06"),
+        ("backbone.mip.kernel=-1", r"backbone\.mip\.kernel is -1\.0; give a number from 0"),
         ("backbone.mip.variance=-1", r"backbone\.mip\.variance is -1\.0; give a number from 1e-06"),
         ("backbone.mip.rate=best", r"backbone\.mip\.rate is 'best'; choose release or paper"),
     ],
@@ -549,6 +620,26 @@ def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path, stop
     assert whole.keys() == resumed.keys()
     assert whole.keys() >= {"columns.filter", "statistics.absolute"}
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+TRUSTED = ("backbone=mip_splatting", *DENSE, "augmenter=upscale", "regenerator/upscale=lanczos",
+           "augmenter.upscale.timing.start=10000", "augmenter.upscale.timing.every=4000",
+           "augmenter.upscale.scales=[4]", "augmenter.upscale.project=exact", "backbone.mip.pseudo=true",
+           "backbone.mip.views=1.4")  # fmt: skip
+
+
+def test_what_pseudo_views_earned_stays_and_survives_an_interruption(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "whole", TRUSTED)
+    tiny_run(tmp_path / "run", TRUSTED, stop_after=13)
+    run, composed = open_run(tmp_path / "run", plugins(), (), training=True)
+    execute(run, composed, plugins())
+    whole, resumed = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "run")
+    assert whole.keys() == resumed.keys()
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+    sizes = filter_sizes(whole["parameters.means"], [view.camera for view in run.scene.train], OPTIONS)
+    narrowed = sizes / whole["columns.filter"]
+    assert narrowed.max() > 3  # four times as fine, where windows saw it
+    assert (narrowed > 1.5).float().mean() > 0.3
 
 
 def test_the_exported_file_holds_what_is_drawn(finished: Path) -> None:

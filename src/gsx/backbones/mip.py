@@ -25,6 +25,9 @@ from gsx.core.training.schedule import Schedule
 
 FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")
+MATCHED = {"area": 1 / 12, "bicubic": 0.1, "lanczos": 0.05}
+"""Variance of the Gaussian whose frequency response is that of a filter, up to four fifths of the Nyquist frequency of the
+pictures that it makes, px^2: a box's own variance; a negative lobe makes it less."""
 ENOUGH_VIEWS = 9
 """So many views of one density allow what one allows: below them noise and wrong poses take what they add."""
 LEAST_DEPTH = 1e-3
@@ -37,8 +40,8 @@ class MipOptions:
 
     variance: Annotated[float, Range(1e-6, 1000)]
     """Of the 3D filter, px^2 at the finest camera."""
-    kernel: Annotated[float, Range(1e-6, 1000)]
-    """Variance of the 2D filter, px^2 at every render resolution."""
+    kernel: Annotated[float, Range(0, 1000)]
+    """Variance of the 2D filter, px^2 at every render resolution; 0: by the filter that reduced the photographs."""
     margin: Annotated[float, Range(0, 100)]
     """Fraction of the raster beside it in which a camera still counts as seeing a point."""
     near: Annotated[float, Range(0, 1e6)]
@@ -153,7 +156,8 @@ class MipFilter:
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """Dilation by the kernel, with compensated opacities."""
-        return replace(raster, dilation=self.options.kernel, compensate=True)
+        kernel = self.options.kernel or MATCHED[self.context.scene.reduction.filter]
+        return replace(raster, dilation=kernel, compensate=True)
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""

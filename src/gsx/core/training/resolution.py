@@ -118,4 +118,4 @@ class Resolution:
 
     def closer_after(self, step: int) -> list[PseudoView]:
         """Pseudo views that were made for this step."""
-        return [view for views in self.closer.values() for view in views if view.provenance["event"] == step - 1]
+        return [view for views in self.closer.values() for view in views if view.provenance.get("event") == step - 1]
