@@ -26,8 +26,8 @@ from gsx.core.training.schedule import Schedule
 FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")
 MATCHED = {"area": 1 / 12, "bicubic": 0.1, "lanczos": 0.05}
-"""Variance of the Gaussian whose frequency response is that of a filter, up to four fifths of the Nyquist frequency of the
-pictures that it makes, px^2: a box's own variance; a negative lobe makes it less."""
+"""Variance of the Gaussian whose frequency response is near a filter's up to three quarters of the Nyquist frequency of
+the pictures that it makes, px^2 (a box's is its own)."""
 ENOUGH_VIEWS = 9
 """So many views of one density allow what one allows: below them noise and wrong poses take what they add."""
 LEAST_DEPTH = 1e-3
