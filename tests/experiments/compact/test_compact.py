@@ -19,7 +19,8 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.compact.compact import compact
+from gsx.experiments.compact import compact as compacting
+from gsx.experiments.compact.compact import File, compact
 from gsx.experiments.compact.shrink import (
     Shrinking,
     ShrinkOptions,
@@ -164,6 +165,56 @@ def test_the_smallest_within_the_budget_is_found(folder: Path, monkeypatch: pyte
     best = shrinking.smallest()
     assert [made.removed for made in shrinking.tried[:5]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
     assert (best.removed, best.degree) == (0.59375, 2)  # a drop of 0.297; degree 1 adds 0.01
+
+
+@pytest.mark.parametrize(
+    ("lost", "taken"),
+    [
+        (0.005, 0.5),  # the smallest model's quantised file keeps the promise: 0.09 and 0.005 dB
+        (0.05, 0.25),  # the other model leaves room for it
+        (0.2, 0.5),  # none does
+    ],
+)
+def test_a_model_that_leaves_room_for_a_quantised_file_is_taken_if_its_file_is_smaller(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, lost: float, taken: float
+) -> None:
+    run = opened(folder)
+    rows = len(run.backbone.table)
+    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
+    tries = [
+        Try(removed=share, degree=2, primitives=round((1 - share) * rows), megabytes=1.0, psnr={"1": 30.0}, drop=drop)
+        for share, drop in ((0.5, 0.09), (0.25, 0.03), (0.75, 0.4))
+    ]
+    shrinking.tried += tries
+    shrinking.take(tries[0])
+
+    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...]) -> dict[str, File]:
+        count = len(run.backbone.table)
+        return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, lost), ".sog": File(40 * count, 1.0)}
+
+    monkeypatch.setattr(compacting, "written", sizes)
+    found = compacting.for_smallest_file(run, shrinking, tries[0])
+    assert found.removed == taken
+    assert len(run.backbone.table) == pytest.approx((1 - taken) * rows, abs=1)
+
+
+def test_a_file_that_loses_more_than_it_was_expected_to_is_not_taken(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = opened(folder)
+    rows = len(run.backbone.table)
+    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
+    best = Try(removed=0.5, degree=2, primitives=rows // 2, megabytes=1.0, psnr={"1": 30.0}, drop=0.09)
+    shrinking.tried.append(best)
+    shrinking.take(best)
+
+    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...]) -> dict[str, File]:
+        count = len(run.backbone.table)
+        return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, 0.05 if count < rows else 0.3)}
+
+    monkeypatch.setattr(compacting, "written", sizes)
+    assert compacting.for_smallest_file(run, shrinking, best) == best
+    assert len(run.backbone.table) == rows // 2
 
 
 def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -17,7 +19,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
-from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, figures, shorten_colours, told
+from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, Try, figures, shorten_colours, told
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
@@ -63,6 +65,7 @@ def compact(
         if best not in shrinking.tried:
             logger.warning("nothing could go within %.3g dB: the new folder holds the model as it was", max_drop)
         shrinking.take(best)
+        best = for_smallest_file(run, shrinking, best)
         found: dict[str, Any] = {
             "from": str(target.resolve()),
             "max_drop_db": max_drop,
@@ -141,24 +144,67 @@ def begin(run: Run, settings: Settings, target: Path, to: Path, degree: int, plu
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
+def for_smallest_file(run: Run, shrinking: Shrinking, best: Try) -> Try:
+    """The try that the run now is: where no quantised file of the smallest model keeps the promise, one that leaves
+    room for what such a file loses, if its file is smaller than the smallest model's standard one."""
+    if own_columns(run) is not None:
+        return best
+    with TemporaryDirectory() as scratch:
+        files = written(run, shrinking, Path(scratch), (STANDARD, *FORMATS))
+        most, options = files.pop(STANDARD).bytes, shrinking.options
+        if any(best.drop + file.lost <= options.max_drop for file in files.values()):
+            return best
+        sizes = [
+            (file.bytes / best.primitives * made.primitives, suffix, made)
+            for suffix, file in files.items()
+            for made in shrinking.within(file.lost)[:1]
+        ]
+        expected = sorted((one for one in sizes if one[0] < most), key=lambda one: one[0])
+        for _, suffix, made in expected:
+            logger.info("%d primitives instead, so that %s keeps the promise", made.primitives, suffix)
+            shrinking.take(made)
+            file = written(run, shrinking, Path(scratch), (suffix,)).get(suffix)
+            if file is not None and made.drop + file.lost <= options.max_drop and file.bytes < most:
+                return made
+        if expected:
+            shrinking.take(best)
+    return best
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of the model as it is."""
+
+    bytes: int
+    lost: float
+    """The most that it loses of the model at any zoom, in the views that judge, dB."""
+
+
+def written(run: Run, shrinking: Shrinking, folder: Path, suffixes: Sequence[str]) -> dict[str, File]:
+    """Files of the model in a folder, by suffix; without those that cannot be written."""
+    out, own = dict[str, File](), figures(run, shrinking.judging, [float(zoom) for zoom in shrinking.before])
+    for suffix in suffixes:
+        path = folder / f"point_cloud{suffix}"
+        try:
+            export(run, path)
+            read = figures(run, shrinking.judging, [float(zoom) for zoom in own], read_gaussians(path))
+            out[suffix] = File(path.stat().st_size, max(own[zoom] - read[zoom] for zoom in own))
+        except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
+            path.unlink(missing_ok=True)
+            logger.info("no %s: %s", suffix, first_line(error))
+    return out
+
+
 def formats(run: Run, shrinking: Shrinking, lost: float, max_drop: float) -> dict[str, dict[str, Any]]:
     """Bytes and drop of every file of the model, by suffix: what the model has `lost` in views that judged it, and what
     the file loses of it now. Of the quantised ones only the smallest within the budget is left. None for models without
     a standard form."""
     if own_columns(run) is not None:
         return {}
-    zooms, out = [float(zoom) for zoom in shrinking.before], dict[str, dict[str, Any]]()
-    own = figures(run, shrinking.judging, zooms)
-    for suffix in (STANDARD, *FORMATS):
-        path = run.folder / f"point_cloud{suffix}"
-        try:
-            export(run, path)
-            read = figures(run, shrinking.judging, zooms, read_gaussians(path))
-            drop = lost + max(own[zoom] - read[zoom] for zoom in own)
-            out[suffix] = {"bytes": path.stat().st_size, "drop": drop}
-        except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
-            path.unlink(missing_ok=True)
-            logger.info("no %s: %s", suffix, first_line(error))
+    files = written(run, shrinking, run.folder, (STANDARD, *FORMATS))
+    out: dict[str, dict[str, Any]] = {
+        suffix: {"bytes": file.bytes, "drop": lost + file.lost} for suffix, file in files.items()
+    }
     within = [suffix for suffix, facts in out.items() if facts["drop"] <= max_drop]
     smallest = min(within or [STANDARD], key=lambda suffix: out[suffix]["bytes"])
     for suffix in out:

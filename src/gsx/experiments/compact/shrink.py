@@ -217,6 +217,14 @@ class Shrinking:
             best = made
         return best
 
+    def within(self, lost: float) -> list[Try]:
+        """The model as it was, and tries that leave room in the budget for so many dB that a file loses, smallest
+        first."""
+        whole = Try(removed=0.0, degree=degree_of_run(self.run), primitives=len(self.worth), megabytes=math.inf,
+                    psnr=self.before, drop=0.0)  # fmt: skip
+        fitting = [made for made in [whole, *self.tried] if made.drop + lost <= self.options.max_drop]
+        return sorted(fitting, key=lambda made: (made.primitives, made.megabytes))
+
     def take(self, best: Try) -> None:
         """Make the run what a try was, learnt from all training views."""
         run = self.run
