@@ -52,7 +52,8 @@ ZOOMS = ("1", "2", "4")
 MIP = ("backbone=mip_splatting",)
 ZOOM = (*MIP, "preset=zoom", "backbone.capacity=published")
 """Growth has tables of its own (benchmarks/capacity.py)."""
-EARLY = (*ZOOM, "training.supersample_from=0.5")
+EARLY = (*ZOOM, "training.supersample_from=0.5", "backbone.mip.views=1")
+"""As it was when its parts and pseudo details were measured: finer pixels for longer, one view for the filter."""
 COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 PARTS = {
@@ -119,6 +120,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--share", type=float, default=1.0, help="of the steps of truth, 1: as many as the other tables"
     )
+    parser.add_argument("--rows", default="", help="of truth, by commas; none given: all")
     parser.add_argument("--label", default="", help="of tables over other scenes or seeds: added to their names")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--runs", type=Path, default=Path("outputs/zoom"), help="where the runs are kept")
@@ -327,8 +329,9 @@ def afar(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Looking from afar", [*columns, ["psnr", "x1/4"]], rows, note
 
 
-MORE = 1.25
-"""By how many more steps `zoom` is trained once again: what its arms with pseudo details take in time."""
+MORE, MORE_STEPS = 1.25, "zoom, a quarter more steps"
+"""By how many more steps `zoom` is trained once again, which is what its arms with pseudo details take in time, and the
+name of that row."""
 TRUTH_FIGURES = {"PSNR": "x1", "PSNR x2": "x2", "PSNR x4": "x4", "detail x2": "detail2", "detail x4": "detail4"}
 """Metrics of the experiment's table: keys of ours."""
 
@@ -355,7 +358,8 @@ def truth(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 def experiment(scenes: Sequence[str], given: argparse.Namespace) -> list[dict[str, str]]:
     """Lines of the table of the experiment over some scenes, and of its row `zoom` by more steps."""
     lines = []
-    for share, more in ((given.share, []), (MORE * given.share, ["experiment.only=[zoom]"])):
+    chosen = [f"experiment.only=[{given.rows}]"] if given.rows else []
+    for share, more in ((given.share, chosen), (MORE * given.share, ["experiment.only=[zoom]"])):
         output = given.runs / "truth" / f"{share:g}"
         words = ["+experiment=zoom_truth", f"output={output}", f"budget.share={share:g}", *more]
         words += [f"experiment.seeds={list(given.seeds)}".replace(" ", ""), f"experiment.scenes=[{','.join(scenes)}]"]
@@ -365,10 +369,9 @@ def experiment(scenes: Sequence[str], given: argparse.Namespace) -> list[dict[st
         gsx(words, {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}, log)
         path = Path(log.read_text().splitlines()[-1]).with_suffix(".csv")
         with path.open() as file:
-            found = list(csv.DictReader(file))
-        lines += (
-            [line | {"row": "zoom, a quarter more steps"} for line in found if line["row"] == "zoom"] if more else found
-        )
+            found = [line for line in csv.DictReader(file) if int(line["seeds"])]  # other datasets have none
+        name = MORE_STEPS if share != given.share else ""
+        lines += [line | {"row": name or line["row"]} for line in found]
     return lines
 
 

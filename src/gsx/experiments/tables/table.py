@@ -112,6 +112,7 @@ def scopes_of(datasets: dict[str, Any], scenes: Sequence[str], published: Publis
     own = [
         Scope(title=dataset["title"], dataset=name, scenes=chosen_scenes(dataset, scenes))
         for name, dataset in datasets.items()
+        if chosen_scenes(dataset, scenes)
     ]
     known = [scope for title in (published.scopes if published else []) if (scope := matching(title, datasets, scenes))]
     if published and not known:
