@@ -54,12 +54,11 @@ def add_augmenters(registry: Registry) -> None:
 def add_regenerators(registry: Registry) -> None:
     """Filters, what the scene itself teaches, and functions."""
     from gsx.regenerators.called import Called, CalledOptions
-    from gsx.regenerators.classical import Internal, Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
 
     registry.add("regenerator", "lanczos", Resampled, PlainOptions)
-    registry.add("regenerator", "internal", Internal, PlainOptions)
     registry.add("regenerator", "oracle", Oracle, PlainOptions)
     registry.add("regenerator", "identity", Unchanged, PlainOptions)
     registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)

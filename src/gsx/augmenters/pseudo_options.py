@@ -18,12 +18,7 @@ REDUCTIONS = ("all", "per_scale")
 FROZEN = ("none", "half", "active")
 SEEDS = ("fixed", "per_view")
 PROJECTIONS = ("none", "exact")
-WEIGHT_MAPS: dict[str, WeightMap | None] = {
-    "none": None,
-    "splatsure": splatsure,
-    "finer": sampled_better,
-    "multiview": None,
-}
+WEIGHT_MAPS: dict[str, WeightMap | None] = {"none": None, "splatsure": splatsure, "finer": sampled_better}
 CHOICES = {
     "window": WINDOWS,
     "noise": NOISES,

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
-from gsx.augmenters.multiview import agreement_of_neighbours
 from gsx.augmenters.pixel_weights import agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
@@ -159,14 +158,7 @@ class Redrawer:
         """How much each pixel of a window of the result counts; None where all count whole."""
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
-        if options.weight_map == "multiview":
-            given = spec.inside.cut(request.image)
-            coarse = spec.inside.of(spec.seen)
-            trust = agreement_of_neighbours(
-                partial(splats_for, run), coarse, given, run.scene.train, spec.parent, run.raster
-            )
-            pixel_weight = pixel_weight * as_blocks(trust[None].cpu(), spec.scale)[0]
-        elif weights is not None:
+        if weights is not None:
             photographs = [view.camera for view in run.scene.train]
             drawn = partial(splats_for, run)
             pixel_weight = pixel_weight * weights(drawn, spec.camera, photographs, spec.parent, run.raster).cpu()

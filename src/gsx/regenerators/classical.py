@@ -41,22 +41,6 @@ def enlarged(request: Request) -> Float[Tensor, "3 H W"]:
     return resize(to_uint8(request.image), width, height, "lanczos").float() / 255
 
 
-class Internal:
-    """The model's own finer render of what it is asked for (IE-SRGS' internal targets, Mipmap-GS)."""
-
-    def __init__(self, options: PlainOptions) -> None:
-        self.options = options
-
-    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Take the model as it is now."""
-        self.render = context.render
-        return {}
-
-    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each camera, `scale` times as fine."""
-        return [self.render(request.camera.resize(*request.result_size[::-1])) for request in requests]
-
-
 class Unchanged:
     """Gives back what it is given: the baseline of a restorer."""
 
