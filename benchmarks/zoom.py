@@ -5,11 +5,11 @@
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and drawn
 by every rule for zoomed cameras. `compositions`: each is trained by mip_splatting and by its preset for zooming in.
-`parts`: by parts of the preset. `levels`: by Octree-GS with its preset for zooming in. `pictures`: by the preset with
-pseudo details, enlarged or true, in half of the run; `trusted`: by such that narrow the 3D filter. `afar`: what
-compositions draw from four times as far as photographs were taken, by each way of looking. `truth`:
-`gsx +experiment=zoom_truth` by --share of its steps, and its row `zoom` by a quarter more of them. Finished runs below
---runs are not trained again. Some hours on two cores.
+`views`: by the preset with `backbone.mip.views=2`. `parts`: by parts of the preset. `levels`: by Octree-GS with its
+preset for zooming in. `pictures`: by the preset with pseudo details, enlarged or true, in half of the run; `trusted`:
+by such that narrow the 3D filter. `afar`: what compositions draw from four times as far as photographs were taken, by
+each way of looking. `truth`: `gsx +experiment=zoom_truth` by --share of its steps, and its row `zoom` by a quarter more
+of them. Finished runs below --runs are not trained again. Some hours on two cores.
 """
 
 import argparse
@@ -52,10 +52,11 @@ ZOOMS = ("1", "2", "4")
 MIP = ("backbone=mip_splatting",)
 ZOOM = (*MIP, "preset=zoom", "backbone.capacity=published")
 """Growth has tables of its own (benchmarks/capacity.py)."""
-EARLY = (*ZOOM, "training.supersample_from=0.5", "backbone.mip.views=1")
-"""As it was when its parts and pseudo details were measured: finer pixels for longer, one view for the filter."""
+EARLY = (*ZOOM, "training.supersample_from=0.5")
 COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
+VIEWS = {"mip_splatting": MIP, "preset=zoom, views=2": (*ZOOM, "backbone.mip.views=2")}
+"""With a narrower 3D filter where many views sample a place."""
 PARTS = {
     "mip_splatting": MIP,
     "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
@@ -253,6 +254,11 @@ def compositions(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Compositions for zooming in", *compared(COMPOSITIONS, scenes, given)
 
 
+def views(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """The preset with a 3D filter that knows several views."""
+    return "Several views in the 3D filter", *compared(VIEWS, scenes, given)
+
+
 def parts(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """What each part of the preset does."""
     return "Parts of preset=zoom", *compared(PARTS, scenes, given)
@@ -299,7 +305,7 @@ def compared(
     columns += [["primitives", "primitives"], ["times", f"training time / {base}"]]
     note = (
         "PSNR on held-out views and explained detail above the training Nyquist frequency, means over seeds ± half "
-        "their range; differences seed by seed. The same steps, two runs at a time; times are the least over seeds."
+        f"their range; differences seed by seed. The same steps; runs at a time: {given.jobs}, times are the least."
     )
     return columns, rows, note
 
@@ -411,6 +417,7 @@ def over_seeds(
 WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
     "rules": rules,
     "compositions": compositions,
+    "views": views,
     "parts": parts,
     "levels": levels,
     "pictures": pictures,

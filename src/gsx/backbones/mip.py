@@ -54,7 +54,6 @@ class MipOptions:
     """What the finest camera is of those that see a primitive. `release`: one of the largest focal length of all, at
     the least depth of any. `paper`: the one with the largest quotient of its own focal length and depth, which is the
     same where all focal lengths are."""
-
     views: Annotated[float, Range(1, 4)] = 1.0
     """The most by which several views that sample a place alike narrow its filter."""
     pseudo: bool = False
@@ -167,12 +166,8 @@ class MipFilter:
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)
         if options.pseudo:
-            earned = table.columns.get("earned")
-            earned = torch.full_like(sizes, torch.inf) if earned is None else earned
-            for view in resolution.closer_after(step):
-                earned = earned.minimum(earned_size(points, view, sizes, options))
-            table.columns["earned"] = earned
-            sizes = sizes.minimum(earned)
+            earn(table, points, resolution.closer_after(step), sizes, options)
+            sizes = sizes.minimum(table["earned"])
         table.columns["filter"] = sizes
 
     def due(self, step: int) -> bool:
@@ -276,6 +271,20 @@ def several_views(
         depth, seen = seen_depths(points, camera, options)
         views += seen * (sizes / deviation * camera.fx / depth).square().clamp_max(1)
     return (views.sqrt() / ENOUGH_VIEWS**0.5).clamp(1, options.views)
+
+
+def earn(
+    table: ParameterTable,
+    points: Float[Tensor, "N 3"],
+    views: Sequence[PseudoView],
+    sizes: Float[Tensor, "N"],
+    options: MipOptions,
+) -> None:
+    """Bring the column `earned` to the smallest size that pseudo views have allowed so far; infinite where none has."""
+    earned = table.columns.get("earned", torch.full_like(sizes, torch.inf))
+    for view in views:
+        earned = earned.minimum(earned_size(points, view, sizes, options))
+    table.columns["earned"] = earned
 
 
 @torch.no_grad()

@@ -243,7 +243,7 @@ def test_every_row_of_overrides_composes(tmp_path: Path) -> None:
     words = ["+experiment=zoom_truth", "dataset=demo", f"output={tmp_path}", "experiment.dry=true", "budget=smoke"]
     commands, code = run_table([*words, "experiment.seeds=[0]"], plugins(), lambda config: None)
     assert code == 0
-    assert len(set(commands.splitlines())) == 19
+    assert len(set(commands.splitlines())) == 20
 
 
 def test_a_changed_experiment_is_another_table_and_says_so(tmp_path: Path) -> None:
