@@ -345,12 +345,12 @@ TRUTH_FIGURES = {"PSNR": "x1", "PSNR x2": "x2", "PSNR x4": "x4", "detail x2": "d
 def truth(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """The experiment: every row against the same seed of Mip-Splatting and of `zoom`."""
     with ThreadPoolExecutor(given.jobs) as pool:
-        for task in [pool.submit(experiment, [scene], given) for scene in scenes]:
-            task.result()
-    rows = []
-    for scene in scenes:
-        figures = experiment([scene], given)
-        rows += [truth_row(scene, name, of_row) for name, of_row in by_row(figures).items()]
+        found = list(pool.map(lambda scene: by_row(experiment(scene, given)), scenes))
+    rows = [
+        truth_row(scene, name, lines)
+        for scene, figures in zip(scenes, found, strict=True)
+        for name, lines in figures.items()
+    ]
     columns = [["scene", "scene"], ["name", "row"], ["seeds", "seeds"]]
     columns += [[key, key] for key in ("x1", "x2", "x4", "detail2", "detail4")]
     columns += [[f"more{key}", f"{key} - Mip-Splatting"] for key in ("x1", "x2", "x4", "detail4")]
@@ -361,16 +361,16 @@ def truth(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "What helps when looking closer", [*columns, ["s", "s"]], rows, note
 
 
-def experiment(scenes: Sequence[str], given: argparse.Namespace) -> list[dict[str, str]]:
-    """Lines of the table of the experiment over some scenes, and of its row `zoom` by more steps."""
+def experiment(scene: str, given: argparse.Namespace) -> list[dict[str, str]]:
+    """Lines of the table of the experiment over a scene, and of its row `zoom` by more steps."""
     lines = []
     chosen = [f"experiment.only=[{given.rows}]"] if given.rows else []
     for share, more in ((given.share, chosen), (MORE * given.share, ["experiment.only=[zoom]"])):
         output = given.runs / "truth" / f"{share:g}"
         words = ["+experiment=zoom_truth", f"output={output}", f"budget.share={share:g}", *more]
-        words += [f"experiment.seeds={list(given.seeds)}".replace(" ", ""), f"experiment.scenes=[{','.join(scenes)}]"]
+        words += [f"experiment.seeds={list(given.seeds)}".replace(" ", ""), f"experiment.scenes=[{scene}]"]
         words += [f"data_root={given.scenes}"] if given.scenes else []
-        log = given.runs / f"truth_{share:g}_{'_'.join(scenes)}.log"
+        log = given.runs / f"truth_{share:g}_{scene}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         gsx(words, {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}, log)
         path = Path(log.read_text().splitlines()[-1]).with_suffix(".csv")

@@ -187,9 +187,7 @@ class GS3D:
         if done or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)
-            resolution = self.context.resolution
-            closer = self.options.mip.pseudo and bool(resolution.closer_after(step))
-            if before is not None and (resolution.changes_after(step) or closer):  # the picture goes on as it was
+            if before is not None and self.filter.narrows(step):  # the picture goes on as it was
                 absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)

@@ -85,6 +85,10 @@ class Filter(Protocol):
         """Whether to do so at a step without a density event."""
         ...
 
+    def narrows(self, step: int) -> bool:
+        """Whether sizes after a step are smaller for what is seen more finely: the picture is to go on as it was."""
+        ...
+
     def smoothed(
         self,
         scales: Float[Tensor, "M 3"],
@@ -109,6 +113,10 @@ class NoFilter:
         """There is no column."""
 
     def due(self, step: int) -> bool:
+        """Never."""
+        return False
+
+    def narrows(self, step: int) -> bool:
         """Never."""
         return False
 
@@ -174,11 +182,15 @@ class MipFilter:
         """Every interval between the end of density control and the freezing of the filter (Mip-Splatting), and where
         renders become finer."""
         options, schedule = self.options, self.schedule
-        resolution = self.context.resolution
-        if resolution.changes_after(step) or (options.pseudo and bool(resolution.closer_after(step))):
+        if self.narrows(step):
             return True
         inside = schedule.step(self.settled) < step < schedule.step(options.stop)
         return inside and step % schedule.interval(options.every) == 0
+
+    def narrows(self, step: int) -> bool:
+        """Where renders become finer, and where pseudo views that count for it were made."""
+        resolution = self.context.resolution
+        return resolution.changes_after(step) or (self.options.pseudo and bool(resolution.closer_after(step)))
 
     def smoothed(
         self,
