@@ -1,8 +1,9 @@
 """What every loader of photographs can be told; the values and their sources are in conf/scene/*.yaml."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
+from gsx.core.data.disturbed import Disturbance
 from gsx.core.options import without_effect
 from gsx.core.ranges import Gigabytes, Range, Share, Steps
 
@@ -35,6 +36,8 @@ class SceneOptions:
     0.2, least distances, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
+    disturb: Disturbance = field(default_factory=Disturbance)
+    """What training photographs are made to suffer, for research; nothing unless asked for."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)

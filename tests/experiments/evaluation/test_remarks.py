@@ -14,6 +14,7 @@ LINES = [
     {"step": 10},
     {"step": 20, "withheld": 3},
     {"step": 21, "pseudo": {"up": {"event": 20, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {}}}},
+    {"step": 25, "exposure_spread": 0.1854, "exposures": 40, "exposure_seconds": 0.5},
     {"step": 30, "withheld": 5},
     {"step": 41, "pseudo": {
         "up": {"event": 40, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {"agreement": {"2": 2}}},
@@ -31,6 +32,7 @@ def test_a_whole_run_is_summed_up_by_hand() -> None:
         "warned": {"agreement": {"1": 0.0, "2": 0.25}},
     }
     assert found["pseudo"]["boot"] == {"asked": {"1": 8}, "dropped": {"1": 0.0}, "warned": {}}
+    assert found["exposures"] == {"step": 25, "spread": 0.1854, "learnt": 40, "seconds": 0.5}
     assert gathered(LINES[:1]) == {}
 
 
@@ -40,7 +42,10 @@ def test_in_words() -> None:
         "up lost 25.0% of its x2 pictures",
         "25.0% of up's x2 pictures disagree with their input",
         "renders leave out 2.5 splats a view, whose values cannot be drawn",
+        "exposures of photographs are spread by 18.5%, each has its own from step 25 on: the model has that of the "
+        "mean photograph; eval.colours=fitted looks past that",
     ]
+    assert remarks_of({"exposures": {"step": 25, "spread": 0.001, "learnt": 0}}) == []
     assert remarks_of({"psnr": 30.0, "left_out": 0.0}) == []
 
 

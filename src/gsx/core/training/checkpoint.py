@@ -21,7 +21,7 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 SCHEMA = 1
-GENERATOR = "run.generator"
+GENERATOR, EXPOSURE = "run.generator", "exposure."
 LONGEST = 1e12
 """Seconds that no training takes."""
 
@@ -44,6 +44,7 @@ def write(run: Run, folder: Path) -> Path:
     tensors = {
         name: value.detach().cpu().contiguous().clone() for name, value in table_tensors(run.backbone.table).items()
     }
+    tensors |= {EXPOSURE + name: value.cpu().contiguous().clone() for name, value in run.exposures.tensors().items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
     path = folder / f"step_{run.step:07d}.safetensors"
@@ -179,6 +180,8 @@ def restore(run: Run, training: bool = False) -> None:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
+    of_exposures = [name for name in tensors if name.startswith(EXPOSURE)]
+    run.exposures.restore({name.removeprefix(EXPOSURE): tensors.pop(name) for name in of_exposures})
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

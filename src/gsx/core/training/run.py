@@ -20,6 +20,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
+from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
@@ -47,6 +48,7 @@ class TrainingOptions:
     """Photographs are seen so many times as coarse at first: a power of two (`training.resolution`); published: 1."""
     coarse_until: Share = 0.0
     """Share of the steps after which they are seen as they are."""
+    exposure: ExposureOptions = field(default_factory=ExposureOptions)
 
     def __post_init__(self) -> None:
         if self.supersample_from == 1:
@@ -168,9 +170,12 @@ class Run:
     photograph_bytes: int = 0
     """How many bytes photographs may take on the device (`core.training.photographs`)."""
     photographs: Photographs = field(init=False)
+    exposures: Exposures = field(init=False)
 
     def __post_init__(self) -> None:
         self.photographs = Photographs(self.device, self.photograph_bytes)
+        names = [view.name for view in self.scene.train]
+        self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
 
     @property
     def complete(self) -> bool:

@@ -22,6 +22,7 @@ from gsx.core.training.backbone import Drawn, Observation, Validating, remove_no
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
+from gsx.core.training.render import render
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -43,8 +44,10 @@ def train(run: Run, plugins: Plugins) -> None:
 
 def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
+    told = judge_exposures(run) if run.exposures.due(run.step + 1) else {}
     with taken_or_not(run):
         step = backward(run)
+        step.changes.update(told)
         reason = veto(run, step, plugins)
     run.changing = True
     if reason:
@@ -54,8 +57,22 @@ def train_step(run: Run, plugins: Plugins) -> Step:
             run.backbone.accumulate(seen)
         step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.update(step.number)
+        run.exposures.update(step.number)
     run.step, run.changing = step.number, False
     return step if not reason else replace(step, skipped=reason)
+
+
+def judge_exposures(run: Run) -> dict[str, float]:
+    """Whether training photographs have exposures of their own, from what the model shows in their places; for the
+    line of the step."""
+    pairs = ((render(run, view.camera).image, view.image().to(run.device), view.counted()) for view in run.scene.train)
+    begun = time.perf_counter()
+    spread = run.exposures.judge(pairs)
+    learnt = run.exposures.matrices is not None
+    verdict = "each has its own from here on" if learnt else "they are taken for equal"
+    logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
+    seconds = round(time.perf_counter() - begun, 3)
+    return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
 
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:
@@ -87,6 +104,7 @@ def backward(run: Run) -> Step:
     asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
     views, steps = run.resolution.views(number), []
+    run.exposures.forget()
     run.photographs.see(views)
     for view, terms, colour in zip(picked, asked, colours, strict=True):
         run.refuse_if_stopping()
@@ -113,7 +131,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    loss = photometric(blacked(rendering.image, counted), target, run.training.ssim_weight, compiled)
+    shown = run.exposures.applied(rendering.image, view.name)
+    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra
@@ -132,7 +151,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         view=view,
         target=target,
         # the picture alone: steps of a batch do not hold on to what made theirs
-        rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
+        rendering=replace(rendering, image=shown.detach(), alpha=rendering.alpha.detach()),
         counted=counted,
         loss=loss.detach() + sum(parts.values()),
         terms=named,

@@ -25,6 +25,7 @@ from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.exposure import best_matrix, transformed
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -33,6 +34,7 @@ from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
 
+COLOURS = ("rendered", "fitted")
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
 
@@ -48,12 +50,17 @@ class EvalOptions:
     lpips: LpipsOptions
     supersample: Annotated[int, Range(0, 16)] = 0
     """Renders are so many times as fine as each picture and are reduced; 0: as the run was trained."""
+    colours: str = "rendered"
+    """rendered: as the model shows them; fitted: by one matrix of colours a view, which its left half is fitted by and
+    its right half judged."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
+        if self.colours not in COLOURS:
+            raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
 
@@ -86,6 +93,8 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
     }
     if "masks" in protocol["scene"]:
         protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
+    if options.colours == "fitted":
+        protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
     text = json.dumps(protocol, sort_keys=True, default=str)
     # which zooms were looked at changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
@@ -120,7 +129,7 @@ class Zoomed:
     photograph: Float[Tensor, "3 H W"]
     """The truth at the training resolution, enlarged: the most that can be had without new detail."""
     counted: Bool[Tensor, "H W"] | None = None
-    """Which pixels count, None: all; the others are black in every picture."""
+    """Which pixels count, None: all; those that masks leave out are black in every picture."""
 
 
 @runtime_checkable
@@ -148,6 +157,14 @@ def silent(amount: float, part: str) -> None:
     """Tells nobody."""
 
 
+def half(view: View, right: bool) -> Bool[Tensor, "H W"]:
+    """Which pixels of one half of a view count."""
+    counted, middle = view.counted(), view.camera.width // 2
+    out = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
+    out[:, slice(middle) if right else slice(middle, None)] = False
+    return out
+
+
 class Evaluator:
     """Measures one run by one protocol; each view is rendered once at each zoom."""
 
@@ -158,10 +175,24 @@ class Evaluator:
         """Seconds of each render at the training resolution."""
         self.kept: dict[View, Tensor] = {}
         """Those renders, as bytes where they are quantised."""
+        self.matrices: dict[str, Float[Tensor, "3 4"]] = {}
+        """Of colours, by name of the view, where they are fitted."""
 
     def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """The picture as metrics see it."""
         return quantise(image) if self.options.quantise else image
+
+    def fitted(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """A render of a view, at the training resolution first, in the colours that are judged."""
+        if self.options.colours == "rendered":
+            return image
+        if view.name not in self.matrices:
+            self.matrices[view.name] = best_matrix(image, view.image().to(image.device), half(view, right=False))
+        return transformed(image, self.matrices[view.name]).clamp(0, 1)
+
+    def judged(self, view: View) -> Bool[Tensor, "H W"] | None:
+        """Which pixels of a view count; None: all."""
+        return view.counted() if self.options.colours == "rendered" else half(view, right=True)
 
     def rendered(self, view: View, factor: float = 1) -> TiledRendering:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
@@ -176,18 +207,22 @@ class Evaluator:
         begun = time.perf_counter()
         tiled = self.rendered(view)
         self.times.append(time.perf_counter() - begun)
-        whole, counted = self.measured(tiled.image), view.counted()
+        whole, counted = self.measured(self.fitted(view, tiled.image)), self.judged(view)
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
-        image, truth = blacked(whole, counted), blacked(view.image(), counted)
+        image, truth = (blacked(picture, view.counted()) for picture in (whole, view.image()))
         return {
             "name": view.name,
             "group": view.group,
             "psnr": psnr(image, truth, counted),
             "ssim": ssim(image, truth, self.options.ssim, counted),
-            "lpips": None if self.lpips is None else self.lpips.distance(image, truth),
+            "lpips": None if self.lpips is None else self.lpips.distance(self.seen(image), self.seen(truth)),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
+
+    def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
+        """The part of a picture that is judged, for metrics that know no mask."""
+        return image if self.options.colours == "rendered" else image[..., image.shape[2] // 2 :]
 
     def whole(self, view: View) -> Float[Tensor, "3 H W"]:
         """The render of a view that was measured."""
@@ -199,7 +234,7 @@ class Evaluator:
         finer = view.zoom(factor)
         if finer is None:
             return None
-        whole, image = self.whole(view), self.rendered(finer, factor).image
+        whole, image = self.whole(view), self.fitted(view, self.rendered(finer, factor).image)
         counted = finer.counted()
         enlarged, photograph = (bicubic(picture, *finer.camera.size) for picture in (whole, view.image()))
         return Zoomed(
@@ -209,7 +244,7 @@ class Evaluator:
             render=blacked(self.measured(image), counted),
             enlarged=blacked(self.measured(enlarged), counted),
             photograph=blacked(self.measured(photograph), counted),
-            counted=counted,
+            counted=self.judged(finer),
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:

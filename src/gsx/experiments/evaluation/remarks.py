@@ -47,7 +47,8 @@ class CapNotice:
 
 
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, and pictures of `pseudo` views.
+    """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, pictures of `pseudo` views, and
+    exposures of photographs.
 
     Only what there is.
     """
@@ -56,7 +57,19 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     cap = {"step": held[0]["step"], "primitives": sum(line["withheld"] for line in held)} if held else {}
     told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
     pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
-    return ({"withheld": cap} if cap else {}) | ({"pseudo": pseudo} if pseudo else {})
+    judged = [line for line in lines if "exposure_spread" in line][-1:]
+    exposures = (
+        {
+            "step": judged[0]["step"],
+            "spread": judged[0]["exposure_spread"],
+            "learnt": judged[0]["exposures"],
+            "seconds": judged[0]["exposure_seconds"],
+        }
+        if judged
+        else {}
+    )
+    found = {"withheld": cap, "pseudo": pseudo, "exposures": exposures}
+    return {key: value for key, value in found.items() if value}
 
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -80,7 +93,8 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
-    return [*cap_remarks(evaluation), *pseudo_remarks(evaluation), *left_out_remarks(evaluation)]
+    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks)
+    return [remark for kind in kinds for remark in kind(evaluation)]
 
 
 def cap_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
@@ -100,6 +114,16 @@ def pseudo_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
             for scale, share in by_scale.items():
                 if share > 0:
                     yield f"{share:.1%} of {name}'s x{scale} pictures {CHECKS.get(check, check)}"
+
+
+def exposure_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Exposures that were learnt: the model has none of theirs."""
+    found = evaluation.get("exposures") or {}
+    if found.get("learnt"):
+        yield (
+            f"exposures of photographs are spread by {found['spread']:.1%}, each has its own from step "
+            f"{found['step']:,} on: the model has that of the mean photograph; eval.colours=fitted looks past that"
+        )
 
 
 def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:

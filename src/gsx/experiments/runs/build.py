@@ -23,7 +23,7 @@ from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.photographs import room_for_photographs
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.resolution import Resolution
-from gsx.core.training.run import Run, Sampler
+from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
@@ -70,6 +70,15 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
+def refuse_shared_exposures(training: TrainingOptions, ranks: Ranks) -> None:
+    """Raise ConfigError where processes would have to learn exposures together."""
+    if ranks.size > 1 and training.exposure.when != "never":
+        raise ConfigError(
+            f"training.exposure.when is '{training.exposure.when}', which is for one process, and {ranks.size} train "
+            "together: set it to never, or start gsx without torchrun"
+        )
+
+
 ALONE = Ranks()
 
 
@@ -110,6 +119,7 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
+        refuse_shared_exposures(settings.training, ranks)
     prepare_process(device, training)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)

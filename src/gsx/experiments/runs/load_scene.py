@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from gsx.core.data.camera import offsets_from
+from gsx.core.data.disturbed import Disturbable, disturbed
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
@@ -36,7 +37,9 @@ def load_scene(settings: Settings) -> Scene:
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
             "elsewhere, which gives no depth and no scale: use photos from different places"
         )
-    return with_more_points(scene, options.fill, settings.general.seed) if isinstance(options, Fillable) else scene
+    if isinstance(options, Fillable):
+        scene = with_more_points(scene, options.fill, settings.general.seed)
+    return disturbed(scene, options.disturb) if isinstance(options, Disturbable) else scene
 
 
 def count_notes(settings: Settings) -> list[str]:

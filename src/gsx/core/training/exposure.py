@@ -1,0 +1,181 @@
+"""Exposure and white balance of each photograph, learnt beside the model where photographs differ in them.
+
+A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers per training photograph, learnt by Adam
+(3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
+photographs and renders say instead of at the identity; and their mean stays the identity, so that the model has the
+exposure of the mean photograph.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from gsx.core.ranges import Range, Rate, Share
+from gsx.core.shapes import Bool, Float
+
+WHEN = ("never", "auto", "always")
+DARK, LIGHT = 0.05, 0.95
+"""Display values that tell a gain: below them noise does, above them they may be saturated."""
+FEWEST = 64
+"""Pixels of a channel that tell a gain."""
+LUMINANCE = (0.299, 0.587, 0.114)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExposureOptions:
+    """Options; values in conf/config.yaml."""
+
+    when: str = "never"
+    """auto: where photographs differ."""
+    start: Share = 0.2
+    """Share of the steps after which it is judged, and the first guess made."""
+    spread: Annotated[float, Range(0, 1)] = 0.02
+    """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
+    rate: Rate = 0.01
+    rate_final: Annotated[float, Range(1e-9, 1)] = 0.001
+
+    def __post_init__(self) -> None:
+        if self.when not in WHEN:
+            raise ValueError(f"training.exposure.when is '{self.when}'; choose from {', '.join(WHEN)}")
+        if not 0 < self.start < 1:
+            raise ValueError(f"training.exposure.start is {self.start}; give a share of the steps between 0 and 1")
+
+
+# -- what photographs and renders say ----------------------------------------------------------------------------------
+
+
+def log_gains(
+    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, "3"]:
+    """Median of log(photograph / image) of each channel, over pixels that count and are neither dark nor light in
+    either; nan where they are too few."""
+    told = ((image > DARK) & (image < LIGHT) & (photograph > DARK) & (photograph < LIGHT)).all(0)
+    told = told if counted is None else told & counted
+    if int(told.sum()) < FEWEST:
+        return torch.full((3,), math.nan)
+    return (photograph[:, told] / image[:, told]).log().double().median(dim=1).values.float().cpu()
+
+
+def of_halves(image: Tensor, photograph: Tensor, counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "3 3"]:
+    """Log gains of the whole picture, of its left and of its right half."""
+    half = image.shape[2] // 2
+    parts = (slice(None), slice(half), slice(half, None))
+    return torch.stack(
+        [log_gains(image[..., p], photograph[..., p], None if counted is None else counted[..., p]) for p in parts]
+    )
+
+
+def shared_spread(left: Float[Tensor, "N 3"], right: Float[Tensor, "N 3"]) -> float:
+    """Standard deviation of log gains over photographs, without the noise in which halves of one differ: the root of
+    the covariance of their halves, in the mean over channels; 0 where that is negative, or nothing is told."""
+    known = (left.isfinite() & right.isfinite()).all(1)
+    if int(known.sum()) < 3:
+        return 0.0
+    centred = [half[known] - half[known].mean(0) for half in (left, right)]
+    covariance = (centred[0] * centred[1]).sum(0) / (int(known.sum()) - 1)
+    return math.sqrt(max(0.0, float(covariance.mean())))
+
+
+# -- what is learnt ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Exposures:
+    """Of a run's training photographs. Nothing is learnt, and no picture changed, before they were `begun`."""
+
+    options: ExposureOptions
+    names: Sequence[str]
+    """Of the photographs."""
+    iterations: int
+    device: torch.device
+    matrices: Float[Tensor, "N 3 4"] | None = None
+    adam: torch.optim.Adam | None = None
+
+    def due(self, number: int) -> bool:
+        """Whether this step is the one before which they are judged."""
+        first = max(1, round(self.options.start * self.iterations)) + 1
+        return self.options.when != "never" and self.matrices is None and number == first
+
+    def judge(self, pairs: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> float:
+        """Begin with the gains of (render, photograph, which pixels count) of each photograph in order, if they are
+        spread enough, or have to be; returns their spread."""
+        found = torch.stack([of_halves(*pair) for pair in pairs])
+        spread = shared_spread(found[:, 1], found[:, 2])
+        if self.options.when == "always" or spread > self.options.spread:
+            gains = found[:, 0].nan_to_num(0.0).exp()
+            matrices = torch.cat([torch.diag_embed(gains), torch.zeros(len(gains), 3, 1)], dim=2)
+            self.begin(centred_on_identity(matrices))
+        return spread
+
+    def begin(self, matrices: Float[Tensor, "N 3 4"]) -> None:
+        """Learn from these on."""
+        self.matrices = matrices.to(self.device).requires_grad_()
+        self.adam = torch.optim.Adam([self.matrices], lr=self.options.rate, eps=1e-8)
+
+    def applied(self, image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
+        """The render as the photograph of that name would have it."""
+        if self.matrices is None:
+            return image
+        return transformed(image, self.matrices[self.names.index(name)])
+
+    def update(self, number: int) -> None:
+        """One step of Adam with the rate of step `number`; the mean stays the identity."""
+        if self.matrices is None or self.adam is None or self.matrices.grad is None:
+            return
+        first = self.options.start * self.iterations
+        passed = min(1.0, max(0.0, (number - first) / max(1.0, self.iterations - first)))
+        self.adam.param_groups[0]["lr"] = self.options.rate ** (1 - passed) * self.options.rate_final**passed
+        self.adam.step()
+        with torch.no_grad():
+            self.matrices.copy_(centred_on_identity(self.matrices))
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop gradients."""
+        if self.matrices is not None:
+            self.matrices.grad = None
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint holds of them; nothing where there are none."""
+        if self.matrices is None or self.adam is None:
+            return {}
+        state = self.adam.state.get(self.matrices, {})
+        return {"matrices": self.matrices.detach()} | {key: state[key] for key in sorted(state)}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a checkpoint's tensors; none: there are no exposures."""
+        self.matrices = self.adam = None
+        if not tensors:
+            return
+        own = dict(tensors)
+        self.begin(own.pop("matrices").clone())
+        if own and self.adam is not None:
+            moved = {key: value.clone() if key == "step" else value.to(self.device) for key, value in own.items()}
+            self.adam.state[self.matrices] = moved
+
+
+def transformed(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 H W"]:
+    """A [r, g, b, 1]^T of every pixel."""
+    return (matrix[:, :3] @ image.flatten(1)).view_as(image) + matrix[:, 3, None, None]
+
+
+def centred_on_identity(matrices: Float[Tensor, "N 3 4"]) -> Float[Tensor, "N 3 4"]:
+    """The matrices less what their mean is off the identity."""
+    return matrices - matrices.mean(0) + torch.eye(3, 4, device=matrices.device)
+
+
+# -- pictures that are judged ------------------------------------------------------------------------------------------
+
+
+def best_matrix(
+    image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"]
+) -> Float[Tensor, "3 4"]:
+    """The matrix that brings the pixels that count closest to the truth, by least squares."""
+    counted = counted.to(image.device)
+    rows = torch.cat([image, torch.ones_like(image[:1])])[:, counted].double().T.cpu()
+    wanted = truth[:, counted].double().T.cpu()
+    return torch.linalg.lstsq(rows, wanted, driver="gelsd").solution.T.float().to(image.device)  # of lower rank: least

@@ -1,0 +1,176 @@
+"""Exposures of photographs: found where they are, absent where they are not, learnt, kept and resumed."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import final_tensors, tiny_run
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.core.errors import ConfigError
+from gsx.core.training.distributed import Ranks
+from gsx.core.training.exposure import (
+    ExposureOptions,
+    Exposures,
+    best_matrix,
+    centred_on_identity,
+    log_gains,
+    shared_spread,
+    transformed,
+)
+from gsx.core.training.run import TrainingOptions
+from gsx.experiments.runs.build import refuse_shared_exposures
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+
+CPU = torch.device("cpu")
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    """Numbers in [0, 1]."""
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_gains_are_told_by_pixels_that_are_neither_dark_nor_saturated() -> None:
+    image = 0.2 + 0.3 * noise(3, 20, 30)
+    gains = torch.tensor([1.5, 1.0, 0.7])
+    photograph = image * gains[:, None, None]
+    photograph[:, :2], photograph[:, 2:4] = 1.0, 0.0  # saturated; a black border
+    torch.testing.assert_close(log_gains(image, photograph), gains.log())
+    covered = torch.ones(20, 30, dtype=torch.bool)
+    covered[:15] = False
+    photograph[:, :15] = image[:, :15]  # masked out: they say nothing
+    torch.testing.assert_close(log_gains(image, photograph, covered), gains.log())
+    assert log_gains(image[:, :2], photograph[:, :2] * 0).isnan().all()
+
+
+def test_the_spread_is_that_which_halves_share() -> None:
+    true = 0.1 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(1))
+    left, right = (true + 0.3 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(s)) for s in (2, 3))
+    assert shared_spread(left + 5, right - 5) == pytest.approx(0.1, abs=0.02)  # 0.3 of noise, and offsets, do not count
+    left[7] = math.nan
+    assert shared_spread(left, right) == pytest.approx(0.1, abs=0.02)
+    assert shared_spread(left[:2], right[:2]) == 0
+
+
+def photographs_at(gains: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, None]]]:
+    """(what the model shows, (that, photograph at its gain, no mask) of every view)."""
+    image = 0.2 + 0.3 * noise(3, 16, 24)
+    return image, [(image, image * gain, None) for gain in gains]
+
+
+def options(**changes: object) -> ExposureOptions:
+    """Those of conf, and changes."""
+    return replace(ExposureOptions(when="auto"), **changes)
+
+
+def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity() -> None:
+    names, gains = list("abcd"), torch.tensor([0.8, 1.3, 1.0, 0.9])
+    image, pairs = photographs_at(gains)
+    found = Exposures(options(), names, 1000, CPU)
+    assert found.due(201)
+    assert not found.due(200)
+    assert found.judge(pairs) == pytest.approx(float(gains.log().std()), rel=1e-4)
+    assert not found.due(201)
+    for name, gain in zip(names, gains - gains.mean() + 1, strict=True):
+        torch.testing.assert_close(found.applied(image, name).detach(), image * gain)
+
+
+def test_equal_photographs_have_none_unless_asked_for() -> None:
+    image, pairs = photographs_at(torch.tensor([1.01, 1.0, 0.99, 1.0]))
+    found = Exposures(options(), list("abcd"), 1000, CPU)
+    assert found.judge(pairs) < found.options.spread
+    assert found.matrices is None
+    assert found.tensors() == {}
+    assert found.applied(image, "a") is image
+    asked = Exposures(options(when="always"), list("abcd"), 1000, CPU)
+    asked.judge(pairs)
+    assert asked.matrices is not None
+    assert not Exposures(options(when="never"), list("abcd"), 1000, CPU).due(201)
+
+
+def test_they_are_learnt_and_go_on_from_what_was_kept() -> None:
+    image, truth = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4).repeat(2, 1, 1)
+    truth[0, 0, 3], truth[1, 0, 3] = 0.1, -0.1
+    found = Exposures(options(rate_final=0.01), ["a", "b"], 100, CPU)
+    found.begin(torch.eye(3, 4).repeat(2, 1, 1))
+
+    def go_on(exposures: Exposures, first: int, last: int) -> None:
+        for number in range(first, last):
+            name = "ab"[number % 2]
+            wanted = transformed(image, truth["ab".index(name)])
+            (exposures.applied(image, name) - wanted).square().mean().backward()
+            exposures.update(number)
+
+    go_on(found, 21, 60)
+    other = Exposures(options(rate_final=0.01), ["a", "b"], 100, CPU)
+    other.restore({name: value.clone() for name, value in found.tensors().items()})
+    go_on(found, 60, 400)
+    go_on(other, 60, 400)
+    assert found.matrices is not None
+    assert other.matrices is not None
+    assert torch.equal(found.matrices, other.matrices)
+    torch.testing.assert_close(
+        transformed(image, found.matrices[0].detach()), transformed(image, truth[0]), atol=5e-3, rtol=0
+    )
+    torch.testing.assert_close(found.matrices.detach().mean(0), torch.eye(3, 4), atol=1e-6, rtol=0)
+
+
+def test_the_rate_falls_from_the_first_to_the_last() -> None:
+    found = Exposures(options(), ["a", "b"], 1000, CPU)
+    found.begin(torch.eye(3, 4).repeat(2, 1, 1))
+    for number, rate in ((200, 0.01), (600, math.sqrt(0.01 * 0.001)), (1000, 0.001)):
+        assert found.matrices is not None
+        assert found.adam is not None
+        found.matrices.grad = torch.zeros_like(found.matrices)
+        found.update(number)
+        assert found.adam.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_the_matrix_fits_what_counts() -> None:
+    image, matrix = noise(3, 10, 12), torch.tensor([[0.9, 0.1, 0, 0.02], [0, 1.1, 0, 0], [0.05, 0, 0.8, 0.1]])
+    truth, left = transformed(image, matrix), torch.zeros(10, 12, dtype=torch.bool)
+    left[:, :6] = True
+    truth[..., 6:] = 0
+    torch.testing.assert_close(best_matrix(image, truth, left), matrix, atol=1e-5, rtol=0)
+    grey = torch.full((3, 10, 12), 0.5)  # of one colour: the least matrix of many
+    torch.testing.assert_close(transformed(grey, best_matrix(grey, 0.5 * grey, left)), 0.5 * grey)
+    assert torch.equal(centred_on_identity(matrix[None]), torch.eye(3, 4)[None])
+
+
+def test_several_processes_are_refused() -> None:
+    training = TrainingOptions(ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=1,
+                               checkpoints_kept=1, test_points=0, exposure=options())  # fmt: skip
+    refuse_shared_exposures(training, Ranks())
+    with pytest.raises(ConfigError, match="set it to never"):
+        refuse_shared_exposures(training, Ranks(size=2))
+
+
+DISTURBED = ("scene.disturb.exposure=0.3", "training.exposure.when=auto", "iterations=12")
+
+
+def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
+    whole = tiny_run(tmp_path / "whole", DISTURBED)
+    assert whole.exposures.matrices is not None
+    tiny_run(tmp_path / "stopped", DISTURBED, stop_after=7)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    execute(run, settings, plugins())
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert "exposure.matrices" in a
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_without_need_training_is_bit_for_bit_that_without_exposures(tmp_path: Path) -> None:
+    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
+    judged = tiny_run(
+        tmp_path / "judged", ["iterations=12", "training.exposure.when=auto", "training.exposure.spread=1"]
+    )
+    assert plain.exposures.matrices is None
+    assert judged.exposures.matrices is None
+    a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
