@@ -14,15 +14,15 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from gsx.core.ranges import Range, Rate, Share
+from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 
+PositiveRate = Annotated[float, Range(1e-9, 1)]
 WHEN = ("never", "auto", "always")
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
-FEWEST = 64
-"""Pixels of a channel that tell a gain."""
-LUMINANCE = (0.299, 0.587, 0.114)
+FEWEST_PIXELS, FEWEST_VIEWS = 64, 3
+"""That tell a gain; that tell a spread."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +35,9 @@ class ExposureOptions:
     """Share of the steps after which it is judged, and the first guess made."""
     spread: Annotated[float, Range(0, 1)] = 0.02
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
-    rate: Rate = 0.01
-    rate_final: Annotated[float, Range(1e-9, 1)] = 0.001
+    rate: PositiveRate = 0.01
+    rate_final: PositiveRate = 0.001
+    """Of Adam at the first and at the last step; their logarithm is interpolated."""
 
     def __post_init__(self) -> None:
         if self.when not in WHEN:
@@ -54,8 +55,8 @@ def log_gains(
     """Median of log(photograph / image) of each channel, over pixels that count and are neither dark nor light in
     either; nan where they are too few."""
     told = ((image > DARK) & (image < LIGHT) & (photograph > DARK) & (photograph < LIGHT)).all(0)
-    told = told if counted is None else told & counted
-    if int(told.sum()) < FEWEST:
+    told = told if counted is None else told & counted.to(told.device)
+    if int(told.sum()) < FEWEST_PIXELS:
         return torch.full((3,), math.nan)
     return (photograph[:, told] / image[:, told]).log().double().median(dim=1).values.float().cpu()
 
@@ -73,7 +74,7 @@ def shared_spread(left: Float[Tensor, "N 3"], right: Float[Tensor, "N 3"]) -> fl
     """Standard deviation of log gains over photographs, without the noise in which halves of one differ: the root of
     the covariance of their halves, in the mean over channels; 0 where that is negative, or nothing is told."""
     known = (left.isfinite() & right.isfinite()).all(1)
-    if int(known.sum()) < 3:
+    if int(known.sum()) < FEWEST_VIEWS:
         return 0.0
     centred = [half[known] - half[known].mean(0) for half in (left, right)]
     covariance = (centred[0] * centred[1]).sum(0) / (int(known.sum()) - 1)
@@ -85,7 +86,7 @@ def shared_spread(left: Float[Tensor, "N 3"], right: Float[Tensor, "N 3"]) -> fl
 
 @dataclass(eq=False)
 class Exposures:
-    """Of a run's training photographs. Nothing is learnt, and no picture changed, before they were `begun`."""
+    """Of a run's training photographs. Nothing is learnt, and no picture changed, before `begin`."""
 
     options: ExposureOptions
     names: Sequence[str]
