@@ -35,6 +35,7 @@ class Outer:
     word: str = ""
     loose_or_none: int | None = None
     either: Annotated[int, Range(1, 3)] | None = None
+    named: Annotated[dict[str, int], Range(1, 3)] = field(default_factory=lambda: {"a": 1})
     switch: bool = False
 
 
@@ -49,6 +50,7 @@ def test_numbers_beyond_their_range_are_found_in_lists_and_below() -> None:
 def test_numbers_without_a_range_are_found() -> None:
     assert list(without_range(Outer)) == ["inner.loose", "bare", "loose_or_none"]
     assert list(beyond_range(Outer, {"either": 4})) == [("either", 4, Range(1, 3))]
+    assert list(beyond_range(Outer, {"named": {"a": 3, "b": 4}})) == [("named.b", 4, Range(1, 3))]
 
 
 @pytest.mark.parametrize("options", GENERAL, ids=lambda options: options.__name__)

@@ -54,14 +54,20 @@ def beyond_range(options: type, values: Mapping[str, Any], prefix: str = "") -> 
         if isinstance(value, Mapping):
             for inner in kinds:
                 yield from beyond_range(inner, value, f"{key}.")
-        if bounds is not None and not all(number in bounds for number in numbers_in(value)):
-            yield key, value, bounds
+        if bounds is not None:
+            by_key = (
+                {f"{key}.{inner}": one for inner, one in value.items()} if isinstance(value, Mapping) else {key: value}
+            )
+            for own, one in by_key.items():
+                if not all(number in bounds for number in numbers_in(one)):
+                    yield own, one, bounds
 
 
 def numbers_in(value: Any) -> list[float]:
-    """A number, or those of a list or mapping; none where there is no value yet."""
-    several = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else [value]
-    return [number for number in several if isinstance(number, int | float)]
+    """A number, or those of a list; none where there is no value yet."""
+    return [
+        number for number in (value if isinstance(value, list | tuple) else [value]) if isinstance(number, int | float)
+    ]
 
 
 def without_range(options: type, prefix: str = "") -> Iterator[str]:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from gsx.core.data.disturbed import Disturbance
 from gsx.core.options import without_effect
 from gsx.core.ranges import Gigabytes, Range, Share, Steps
 
@@ -36,8 +35,8 @@ class SceneOptions:
     0.2, least distances, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
-    disturb: Disturbance = field(default_factory=Disturbance)
-    """What training photographs are made to suffer, for research; nothing unless asked for."""
+    disturb: Annotated[dict[str, float], Range(0, 2)] = field(default_factory=lambda: {"exposure": 0.0})
+    """What training photographs are made to suffer, for research (gsx.core.data.disturbed); 0: nothing."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)

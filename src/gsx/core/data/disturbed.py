@@ -1,17 +1,17 @@
 """Photographs made worse in a known way, so that the truth of what mends them is known (research alone)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import FromFile, ImageSource, Masked, Scene, View
-from gsx.core.ranges import Range
+from gsx.core.errors import ConfigError
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float, UInt8
 
@@ -19,21 +19,13 @@ BALANCE = 0.25
 """Spread of a channel's own gain, of that of the exposure."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Disturbance:
-    """What training photographs suffer; test photographs stay as they are."""
-
-    exposure: Annotated[float, Range(0, 2)] = 0.0
-    """Standard deviation of log gains of display values, one a photograph; channels differ by a quarter of it."""
-
-
 @runtime_checkable
 class Disturbable(Protocol):
     """Options of a scene whose photographs may be made worse."""
 
     @property
-    def disturb(self) -> Disturbance:
-        """By what."""
+    def disturb(self) -> Mapping[str, float]:
+        """By what, and how much."""
         ...
 
 
@@ -84,15 +76,24 @@ def exposed(views: Sequence[View], spread: float) -> list[View]:
     return out
 
 
-def disturbed(scene: Scene, by: Disturbance) -> Scene:
-    """The scene with its training photographs made worse, and a note that says so."""
-    if by.exposure == 0:
+def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
+    """The scene with its training photographs made worse, and a note that says so; test photographs stay as they are.
+
+    by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
+
+    Raises:
+        ConfigError: there is no such disturbance.
+    """
+    if unknown := sorted(set(by) - {"exposure"}):
+        raise ConfigError(f"scene.disturb.{unknown[0]}: photographs can be disturbed in exposure alone")
+    spread = by.get("exposure", 0.0)
+    if spread == 0:
         return scene
-    percent = 100 * (math.exp(by.exposure) - 1)
+    percent = 100 * (math.exp(spread) - 1)
     note = f"disturbed: exposures of training photographs are spread by {percent:.0f} % (scene.disturb.exposure)"
     return replace(
         scene,
-        train=exposed(scene.train, by.exposure),
+        train=exposed(scene.train, spread),
         notes=[*scene.notes, note],
-        provenance=scene.provenance | {"disturbed": {"exposure": by.exposure}},
+        provenance=scene.provenance | {"disturbed": {"exposure": spread}},
     )
