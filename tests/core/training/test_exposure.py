@@ -119,15 +119,20 @@ def test_they_are_learnt_and_go_on_from_what_was_kept() -> None:
     torch.testing.assert_close(found.matrices.detach().mean(0), torch.eye(3, 4), atol=1e-6, rtol=0)
 
 
-def test_the_rate_falls_from_the_first_to_the_last() -> None:
-    found = Exposures(options(), ["a", "b"], 1000, CPU)
-    found.begin(torch.eye(3, 4).repeat(2, 1, 1))
-    for number, rate in ((200, 0.01), (600, math.sqrt(0.01 * 0.001)), (1000, 0.001)):
-        assert found.matrices is not None
-        assert found.adam is not None
-        found.matrices.grad = torch.zeros_like(found.matrices)
-        found.update(number)
-        assert found.adam.param_groups[0]["lr"] == pytest.approx(rate)
+def test_each_photograph_takes_steps_of_its_own_by_a_rate_that_falls() -> None:
+    found = Exposures(options(), ["a", "b", "c", "d"], 1000, CPU)
+    assert [found.rate(number) for number in (200, 600, 1000)] == pytest.approx([0.01, math.sqrt(1e-5), 0.001])
+    found.begin(torch.eye(3, 4).repeat(4, 1, 1))
+    image, still = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4)
+    found.applied(image, "a").sum().backward()
+    found.update(200)  # Adam's first step is one rate: down, and up by a quarter of it for the mean's sake
+    assert found.matrices is not None
+    torch.testing.assert_close(found.matrices[0].detach(), still - 0.01 * 3 / 4, atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.matrices[1].detach(), still + 0.01 / 4, atol=1e-6, rtol=0)
+    before = found.matrices.detach().clone()
+    found.applied(image, "b").sum().backward()
+    found.update(200)  # what was shown before does not go on moving
+    torch.testing.assert_close((found.matrices - before)[0].detach(), torch.full((3, 4), 0.01 / 4), atol=1e-6, rtol=0)
 
 
 def test_the_matrix_fits_what_counts() -> None:

@@ -2,13 +2,14 @@
 
 A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers per training photograph, learnt by Adam
 (3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
-photographs and renders say instead of at the identity; and their mean stays the identity, so that the model has the
-exposure of the mean photograph.
+photographs and renders say instead of at the identity; their mean stays the identity, so that the model has the
+exposure of the mean photograph; and Adam keeps the steps of each photograph apart. One Adam over all of them, as
+published, goes on moving a photograph while others are shown: by several rates a visit, where one is meant.
 """
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import torch
@@ -18,6 +19,8 @@ from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
+BETAS, EPS = (0.9, 0.99), 1e-8
+"""Of Adam; a photograph is seen a few dozen times in a short run."""
 WHEN = ("never", "auto", "always")
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
@@ -33,7 +36,7 @@ class ExposureOptions:
     """auto: where photographs differ."""
     start: Share = 0.2
     """Share of the steps after which it is judged, and the first guess made."""
-    spread: Annotated[float, Range(0, 1)] = 0.02
+    spread: Annotated[float, Range(0, 1)] = 0.03
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
     rate: PositiveRate = 0.01
     rate_final: PositiveRate = 0.001
@@ -94,7 +97,12 @@ class Exposures:
     iterations: int
     device: torch.device
     matrices: Float[Tensor, "N 3 4"] | None = None
-    adam: torch.optim.Adam | None = None
+    moments: Float[Tensor, "2 N 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 3, 4))
+    """Adam's means of gradients and of their squares."""
+    visits: Float[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0))
+    """Steps of each photograph."""
+    shown: set[int] = field(default_factory=set)
+    """Photographs of the step under way."""
 
     def due(self, number: int) -> bool:
         """Whether this step is the one before which they are judged."""
@@ -115,48 +123,59 @@ class Exposures:
     def begin(self, matrices: Float[Tensor, "N 3 4"]) -> None:
         """Learn from these on."""
         self.matrices = matrices.to(self.device).requires_grad_()
-        self.adam = torch.optim.Adam([self.matrices], lr=self.options.rate, eps=1e-8)
+        self.moments, self.visits = torch.zeros(2, *matrices.shape, device=self.device), torch.zeros(len(matrices))
 
     def applied(self, image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
         """The render as the photograph of that name would have it."""
         if self.matrices is None:
             return image
-        return transformed(image, self.matrices[self.names.index(name)])
+        index = self.names.index(name)
+        self.shown.add(index)
+        return transformed(image, self.matrices[index])
 
-    def update(self, number: int) -> None:
-        """One step of Adam with the rate of step `number`; the mean stays the identity."""
-        if self.matrices is None or self.adam is None or self.matrices.grad is None:
-            return
+    def rate(self, number: int) -> float:
+        """Of step `number`."""
         first = self.options.start * self.iterations
         passed = min(1.0, max(0.0, (number - first) / max(1.0, self.iterations - first)))
-        self.adam.param_groups[0]["lr"] = self.options.rate ** (1 - passed) * self.options.rate_final**passed
-        self.adam.step()
-        with torch.no_grad():
-            self.matrices.copy_(centred_on_identity(self.matrices))
+        return self.options.rate ** (1 - passed) * self.options.rate_final**passed
+
+    @torch.no_grad()
+    def update(self, number: int) -> None:
+        """One step of Adam for each photograph that was shown; the mean stays the identity."""
+        if self.matrices is None or self.matrices.grad is None:
+            return
+        for index in sorted(self.shown):
+            self.matrices[index] -= self.rate(number) * self.direction(index, self.matrices.grad[index])
+        self.matrices.copy_(centred_on_identity(self.matrices))
         self.forget()
 
+    def direction(self, index: int, gradient: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """Adam's, of one photograph."""
+        self.visits[index] += 1
+        for moment, beta, value in zip(self.moments, BETAS, (gradient, gradient.square()), strict=True):
+            moment[index] = beta * moment[index] + (1 - beta) * value
+        seen = float(self.visits[index])
+        mean, square = (m[index] / (1 - beta**seen) for m, beta in zip(self.moments, BETAS, strict=True))
+        return mean / (square.sqrt() + EPS)
+
     def forget(self) -> None:
-        """Drop gradients."""
+        """Drop the gradients of a step."""
+        self.shown.clear()
         if self.matrices is not None:
             self.matrices.grad = None
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where there are none."""
-        if self.matrices is None or self.adam is None:
+        if self.matrices is None:
             return {}
-        state = self.adam.state.get(self.matrices, {})
-        return {"matrices": self.matrices.detach()} | {key: state[key] for key in sorted(state)}
+        return {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: there are no exposures."""
-        self.matrices = self.adam = None
-        if not tensors:
-            return
-        own = dict(tensors)
-        self.begin(own.pop("matrices").clone())
-        if own and self.adam is not None:
-            moved = {key: value.clone() if key == "step" else value.to(self.device) for key, value in own.items()}
-            self.adam.state[self.matrices] = moved
+        self.matrices = None
+        if tensors:
+            self.begin(tensors["matrices"].clone())
+            self.moments, self.visits = tensors["moments"].to(self.device).clone(), tensors["visits"].clone()
 
 
 def transformed(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 H W"]:
