@@ -18,6 +18,7 @@ from gsx.core.training.exposure import (
     best_matrix,
     centred_on_identity,
     log_gains,
+    saturated,
     shared_spread,
     transformed,
 )
@@ -133,6 +134,16 @@ def test_each_photograph_takes_steps_of_its_own_by_a_rate_that_falls() -> None:
     found.applied(image, "b").sum().backward()
     found.update(200)  # what was shown before does not go on moving
     torch.testing.assert_close((found.matrices - before)[0].detach(), torch.full((3, 4), 0.01 / 4), atol=1e-6, rtol=0)
+
+
+def test_more_than_a_saturated_value_is_no_error() -> None:
+    found, image = Exposures(options(), ["a"], 1000, CPU), torch.tensor([0.4, 1.3, 1.3]).view(3, 1, 1).requires_grad_()
+    photograph = torch.tensor([1.0, 1.0, 0.9]).view(3, 1, 1)
+    assert saturated(image, photograph, found) is image
+    found.begin(torch.eye(3, 4)[None])
+    (saturated(image, photograph, found) - photograph).abs().sum().backward()
+    assert image.grad is not None
+    assert image.grad.flatten().tolist() == [-1, 0, 1]
 
 
 def test_the_matrix_fits_what_counts() -> None:

@@ -36,7 +36,7 @@ class ExposureOptions:
     """auto: where photographs differ."""
     start: Share = 0.2
     """Share of the steps after which it is judged, and the first guess made."""
-    spread: Annotated[float, Range(0, 1)] = 0.03
+    spread: Annotated[float, Range(0, 1)] = 0.06
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
     rate: PositiveRate = 0.01
     rate_final: PositiveRate = 0.001
@@ -181,6 +181,16 @@ class Exposures:
 def transformed(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 H W"]:
     """A [r, g, b, 1]^T of every pixel."""
     return (matrix[:, :3] @ image.flatten(1)).view_as(image) + matrix[:, 3, None, None]
+
+
+def saturated(
+    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], exposures: Exposures
+) -> Float[Tensor, "3 H W"]:
+    """A render at the exposure of its photograph, where there are any: a saturated value says "at least 1", and more
+    is no error."""
+    if exposures.matrices is None:
+        return image
+    return torch.where((photograph >= 1) & (image > 1), photograph, image)
 
 
 def centred_on_identity(matrices: Float[Tensor, "N 3 4"]) -> Float[Tensor, "N 3 4"]:

@@ -19,6 +19,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
+from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
@@ -131,7 +132,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    shown = run.exposures.applied(rendering.image, view.name)
+    shown = saturated(run.exposures.applied(rendering.image, view.name), target, run.exposures)
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
