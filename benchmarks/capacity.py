@@ -30,7 +30,7 @@ from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from measuring.runs import gsx, train
-from zoom import numbers, over_seeds, told
+from zoom import over_seeds, shared_arguments, told
 
 RESULTS = Path(__file__).parent / "results"
 SUBJECTS = {
@@ -51,17 +51,11 @@ ZOOMS = ("1", "2", "4")
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser = shared_arguments(__doc__, "fox,fox_4,lego,castle,demo", "outputs/capacity")
     parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence")
-    parser.add_argument("--only", default="fox,fox_4,lego,castle,demo", help="scenes, by commas")
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
-    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
     parser.add_argument("--label", default="", help="of tables over other scenes, seeds or rows: added to their names")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/capacity"), help="where the runs are kept")
-    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
     return parser.parse_args(words)
 
 

@@ -10,24 +10,16 @@ the built-in scene is measured. `exposure`: training photographs at exposures of
 import argparse
 import statistics
 import sys
-import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsx.builtin import plugins
-from gsx.core.files import read_json, write_json
-from gsx.experiments.evaluation.evaluator import Evaluator
-from gsx.experiments.runs.open import open_run
+from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
-from measuring.runs import train
-from zoom import SUBJECTS, numbers, told
+from zoom import SUBJECTS, looked_at, over_seeds, scenes_at_hand, shared_arguments, steps_among, told, trained
 
-RESULTS = Path(__file__).parent / "results"
 ZOOMS = ("1", "4")
 OWN = ("backbone=mip_splatting", "backbone.rates.shortened=0.4")
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
@@ -37,40 +29,23 @@ ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*D
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
-    parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
-    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
+    parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/captures")
     parser.add_argument("--share", type=float, default=1.0, help="of the steps")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/captures"), help="where the runs are kept")
-    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
     return parser.parse_args(words)
 
 
 def measured(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
-    """A run, and its figures by both protocols of colours."""
-    folder = given.runs / "_".join([*arm.replace(",", "").split(), scene, str(seed)])
-    print(time.strftime("%H:%M"), folder.name, flush=True)
-    where = [] if scene == "demo" else [f"scene.path={given.scenes / scene}"]
-    words = [*OWN, *ARMS[arm], *SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    steps = next(int(word.partition("=")[2]) for word in words if word.startswith("iterations="))
-    words = [
-        *(word for word in words if not word.startswith("iterations=")),
-        f"iterations={round(given.share * steps)}",
-    ]
-    threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    rendered = train(folder, words, threads, folder.with_name(f"{folder.name}.log"))
-    path = folder / "fitted.json"
-    if not path.is_file():
-        run, settings = open_run(folder, plugins(), ["eval.colours=fitted"])
-        write_json(path, Evaluator(run, settings.evaluation).evaluate()["zoom"])
-    asking = (rendered.get("exposures") or {}).get("seconds", 0.0) / rendered["train_seconds"]
+    """Figures of a run by both protocols of colours, and what it found of exposures."""
+    steps = round(given.share * steps_among(SUBJECTS[scene]))
+    words = [*OWN, *ARMS[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    folder = trained(scene, seed, given, words, arm)
+    evaluation = read_json(folder / "evaluation.json")
+    exposures = evaluation.get("exposures", {})
     return {
-        "asking": asking,
-        "rendered": rendered["zoom"],
-        "fitted": read_json(path),
-        "exposures": rendered.get("exposures"),
+        "asking": exposures.get("seconds", 0.0) / evaluation["train_seconds"],
+        "rendered": evaluation["zoom"],
+        "fitted": looked_at(folder, "fitted", ["eval.colours=fitted"]),
+        "exposures": exposures,
     }
 
 
@@ -84,7 +59,7 @@ def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     spreads = [100 * one["exposures"]["spread"] for one in found if one["exposures"]]
     row["spread"] = told(spreads, ".1f") if spreads else ""
-    row["learnt"] = f"{sum(bool(one['exposures'] and one['exposures']['learnt']) for one in found)} of {len(found)}"
+    row["learnt"] = f"{sum(one['exposures'].get('learnt', 0) > 0 for one in found)} of {len(found)}"
     row["asking"] = f"{100 * statistics.mean(one['asking'] for one in found):.1f}" if spreads else ""
     for zoom in ZOOMS:
         row[f"fitted{zoom}"] = told(fitted(found, zoom), ".2f")
@@ -110,18 +85,11 @@ def main(words: Sequence[str]) -> None:
     machine, load = describe_machine(torch.device("cpu")), told_load()
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "captures_cpu.json")  # what cannot be added to is refused before training
-    if unknown := [name for name in given.only.split(",") if name not in SUBJECTS]:
-        sys.exit(f"{', '.join(unknown)}: choose from {', '.join(SUBJECTS)}")
-    scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
-    if not scenes:
-        sys.exit(f"--only {given.only}: all but demo need --scenes FOLDER")
-    keys = [(scene, seed, arm) for scene in scenes for seed in given.seeds for arm in ARMS]
-    with ThreadPoolExecutor(given.jobs) as pool:
-        measurements = pool.map(lambda key: measured(key[0], key[1], key[2], given), keys)
-        found = dict(zip(keys, measurements, strict=True))
+    scenes = scenes_at_hand(given)
+    found = over_seeds(lambda scene, seed: {arm: measured(scene, seed, arm, given) for arm in ARMS}, scenes, given)
     rows = []
     for scene in scenes:
-        by_arm = {arm: [found[scene, seed, arm] for seed in given.seeds] for arm in ARMS}
+        by_arm = {arm: [one[arm] for one in found[scene]] for arm in ARMS}
         rows += [row_of(scene, arm, by_arm) for arm in ARMS]
     columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["spread", "spread found, %"]]
     columns += [["learnt", "learnt"], ["asking", "asking, % of training"], ["fitted1", "x1"], ["fitted4", "x4"]]

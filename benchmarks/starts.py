@@ -17,10 +17,10 @@ from typing import Any
 
 import torch
 
-from capacity import ADAPTIVE, PUBLISHED, RESULTS, SUBJECTS, ZOOMS, row_of, scenes_of, trained, words_of
+from capacity import ADAPTIVE, PUBLISHED, SUBJECTS, ZOOMS, row_of, scenes_of, trained, words_of
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
-from zoom import numbers, over_seeds, told
+from zoom import over_seeds, shared_arguments, steps_among, told
 
 BACKBONE = "gs3d"
 FILL = {"room": 3000, "fox": 5000, "castle": 3000}
@@ -48,14 +48,7 @@ NOTE = (
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
-    parser.add_argument("--only", default=",".join(FILL), help="scenes, by commas")
-    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/starts"), help="where the runs are kept")
-    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
-    return parser.parse_args(words)
+    return shared_arguments(__doc__, ",".join(FILL), "outputs/starts").parse_args(words)
 
 
 def evaluation_of(scene: str, arm: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
@@ -63,8 +56,7 @@ def evaluation_of(scene: str, arm: str, seed: int, given: argparse.Namespace) ->
     wish = [f"scene.fill={FILL[scene]}" if word == "scene.fill" else word for word in ARMS[arm] if word != "iterations"]
     words = [*words_of(wish, scene, BACKBONE, seed, given), "training.log_every=1"]
     if "iterations" in ARMS[arm]:
-        steps = next(int(word.partition("=")[2]) for word in SUBJECTS[scene] if word.startswith("iterations="))
-        words.append(f"iterations={round(LONGER * steps)}")
+        words.append(f"iterations={round(LONGER * steps_among(SUBJECTS[scene]))}")
     folder = given.runs / "_".join([scene, *arm.replace(",", "").split(), str(seed)])
     found = trained(folder, words, given)
     return found | {"seen": seen_in_training(folder)}

@@ -18,7 +18,7 @@ import re
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
@@ -111,22 +111,48 @@ def numbers(text: str) -> list[int]:
     return [int(word) for word in text.split(",")]
 
 
+def shared_arguments(description: str | None, only: str, kept: str) -> argparse.ArgumentParser:
+    """What benchmarks over captures are all asked; only: their scenes, by commas; kept: where their runs are."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser.add_argument("--only", default=only, help="scenes, by commas")
+    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
+    parser.add_argument("--runs", type=Path, default=Path(kept), help="where the runs are kept")
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
+    return parser
+
+
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
+    parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/zoom")
     parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
-    parser.add_argument("--only", default=",".join(SUBJECTS), help="scenes, by commas")
-    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="by commas (0,1,2)")
     parser.add_argument(
         "--share", type=float, default=1.0, help="of the steps of truth, 1: as many as the other tables"
     )
     parser.add_argument("--rows", default="", help="of truth, by commas; none given: all")
     parser.add_argument("--label", default="", help="of tables over other scenes or seeds: added to their names")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/zoom"), help="where the runs are kept")
-    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
     return parser.parse_args(words)
+
+
+def refuse_unknown(asked: str, known: Collection[str]) -> None:
+    """End with a message where a name is none of those known; asked: by commas."""
+    if unknown := [name for name in asked.split(",") if name not in known]:
+        sys.exit(f"{', '.join(unknown)}: choose from {', '.join(known)}")
+
+
+def scenes_at_hand(given: argparse.Namespace) -> list[str]:
+    """Those asked for that are there; ends with a message where there are none."""
+    refuse_unknown(given.only, SUBJECTS)
+    scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
+    if not scenes:
+        sys.exit(f"--only {given.only}: all but demo need --scenes FOLDER")
+    return scenes
+
+
+def steps_among(words: Sequence[str]) -> int:
+    """What `iterations=` among overrides says."""
+    return next(int(word.partition("=")[2]) for word in words if word.startswith("iterations="))
 
 
 def folder_of(scene: str, seed: int, given: argparse.Namespace, name: str = "") -> Path:
@@ -135,12 +161,12 @@ def folder_of(scene: str, seed: int, given: argparse.Namespace, name: str = "") 
 
 
 def trained(scene: str, seed: int, given: argparse.Namespace, overrides: Sequence[str], name: str = "") -> Path:
-    """The folder of a run, which is trained unless it is there."""
+    """The folder of a run, which is trained unless it is there; overrides win over the subject's own."""
     where = () if scene == "demo" else (f"scene.path={given.scenes / scene}",)
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
     folder = folder_of(scene, seed, given, name)
     print(time.strftime("%H:%M"), folder.name, flush=True)
-    words = [*overrides, *SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    words = [*SUBJECTS[scene], *where, f"seed={seed}", f"eval.zoom=[{','.join(ZOOMS)}]", *overrides]
     refuse_another(folder, words)
     train(folder, words, threads, folder.with_name(f"{folder.name}.log"))
     return folder
@@ -433,12 +459,8 @@ def main(words: Sequence[str]) -> None:
     machine, load = describe_machine(torch.device("cpu")), told_load()
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "zoom_cpu.json")  # what cannot be added to is refused before training
-    for asked, known in ((given.only, SUBJECTS), (given.what, WHAT)):
-        if unknown := [name for name in asked.split(",") if name not in known]:
-            sys.exit(f"{', '.join(unknown)}: choose from {', '.join(known)}")
-    scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
-    if not scenes:
-        sys.exit(f"--only {given.only}: all but demo need --scenes FOLDER")
+    refuse_unknown(given.what, WHAT)
+    scenes = scenes_at_hand(given)
     for name in given.what.split(","):
         title, columns, rows, note = WHAT[name](scenes, given)
         table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/zoom.py"))

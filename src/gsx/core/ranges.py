@@ -54,20 +54,20 @@ def beyond_range(options: type, values: Mapping[str, Any], prefix: str = "") -> 
         if isinstance(value, Mapping):
             for inner in kinds:
                 yield from beyond_range(inner, value, f"{key}.")
-        if bounds is not None:
-            by_key = (
-                {f"{key}.{inner}": one for inner, one in value.items()} if isinstance(value, Mapping) else {key: value}
-            )
-            for own, one in by_key.items():
-                if not all(number in bounds for number in numbers_in(one)):
-                    yield own, one, bounds
+        for own, one in by_key(key, value).items():
+            if bounds is not None and not all(number in bounds for number in numbers_in(one)):
+                yield own, one, bounds
+
+
+def by_key(key: str, value: Any) -> dict[str, Any]:
+    """A value by its dotted key, those of a mapping by theirs."""
+    return {f"{key}.{inner}": one for inner, one in value.items()} if isinstance(value, Mapping) else {key: value}
 
 
 def numbers_in(value: Any) -> list[float]:
     """A number, or those of a list; none where there is no value yet."""
-    return [
-        number for number in (value if isinstance(value, list | tuple) else [value]) if isinstance(number, int | float)
-    ]
+    several = value if isinstance(value, list | tuple) else [value]
+    return [number for number in several if isinstance(number, int | float)]
 
 
 def without_range(options: type, prefix: str = "") -> Iterator[str]:

@@ -41,10 +41,9 @@ def write(run: Run, folder: Path) -> Path:
     """Write a checkpoint of the current step into a folder."""
     from safetensors.torch import save as to_bytes
 
-    tensors = {
-        name: value.detach().cpu().contiguous().clone() for name, value in table_tensors(run.backbone.table).items()
-    }
-    tensors |= {EXPOSURE + name: value.cpu().contiguous().clone() for name, value in run.exposures.tensors().items()}
+    of_exposures = {EXPOSURE + name: value for name, value in run.exposures.tensors().items()}
+    held = table_tensors(run.backbone.table) | of_exposures
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in held.items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
     path = folder / f"step_{run.step:07d}.safetensors"

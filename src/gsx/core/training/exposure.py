@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
@@ -135,9 +136,8 @@ class Exposures:
 
     def rate(self, number: int) -> float:
         """Of step `number`."""
-        first = self.options.start * self.iterations
-        passed = min(1.0, max(0.0, (number - first) / max(1.0, self.iterations - first)))
-        return self.options.rate ** (1 - passed) * self.options.rate_final**passed
+        own, first = self.options, round(self.options.start * self.iterations)
+        return log_linear(number - first, self.iterations - first, own.rate, own.rate_final)
 
     @torch.no_grad()
     def update(self, number: int) -> None:

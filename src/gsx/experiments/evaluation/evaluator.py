@@ -157,9 +157,9 @@ def silent(amount: float, part: str) -> None:
     """Tells nobody."""
 
 
-def half(view: View, right: bool) -> Bool[Tensor, "H W"]:
-    """Which pixels of one half of a view count."""
-    counted, middle = view.counted(), view.camera.width // 2
+def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[Tensor, "H W"]:
+    """Which pixels of one half of a view count, of those that do."""
+    middle = view.camera.width // 2
     out = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
     out[:, slice(middle) if right else slice(middle, None)] = False
     return out
@@ -187,12 +187,13 @@ class Evaluator:
         if self.options.colours == "rendered":
             return image
         if view.name not in self.matrices:
-            self.matrices[view.name] = best_matrix(image, view.image().to(image.device), half(view, right=False))
+            left = half(view, view.counted(), right=False)
+            self.matrices[view.name] = best_matrix(image, view.image().to(image.device), left)
         return transformed(image, self.matrices[view.name]).clamp(0, 1)
 
-    def judged(self, view: View) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of a view count; None: all."""
-        return view.counted() if self.options.colours == "rendered" else half(view, right=True)
+    def judged(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
+        """Which pixels of a view are judged, of those that count; None: all."""
+        return counted if self.options.colours == "rendered" else half(view, counted, right=True)
 
     def rendered(self, view: View, factor: float = 1) -> TiledRendering:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
@@ -207,14 +208,14 @@ class Evaluator:
         begun = time.perf_counter()
         tiled = self.rendered(view)
         self.times.append(time.perf_counter() - begun)
-        whole, counted = self.measured(self.fitted(view, tiled.image)), self.judged(view)
+        whole, counted = self.measured(self.fitted(view, tiled.image)), view.counted()
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
-        image, truth = (blacked(picture, view.counted()) for picture in (whole, view.image()))
+        image, truth, judged = blacked(whole, counted), blacked(view.image(), counted), self.judged(view, counted)
         return {
             "name": view.name,
             "group": view.group,
-            "psnr": psnr(image, truth, counted),
-            "ssim": ssim(image, truth, self.options.ssim, counted),
+            "psnr": psnr(image, truth, judged),
+            "ssim": ssim(image, truth, self.options.ssim, judged),
             "lpips": None if self.lpips is None else self.lpips.distance(self.seen(image), self.seen(truth)),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
@@ -244,7 +245,7 @@ class Evaluator:
             render=blacked(self.measured(image), counted),
             enlarged=blacked(self.measured(enlarged), counted),
             photograph=blacked(self.measured(photograph), counted),
-            counted=self.judged(finer),
+            counted=self.judged(finer, counted),
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:

@@ -57,19 +57,17 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     cap = {"step": held[0]["step"], "primitives": sum(line["withheld"] for line in held)} if held else {}
     told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
     pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
-    judged = [line for line in lines if "exposure_spread" in line][-1:]
-    exposures = (
-        {
-            "step": judged[0]["step"],
-            "spread": judged[0]["exposure_spread"],
-            "learnt": judged[0]["exposures"],
-            "seconds": judged[0]["exposure_seconds"],
-        }
-        if judged
-        else {}
-    )
-    found = {"withheld": cap, "pseudo": pseudo, "exposures": exposures}
+    found = {"withheld": cap, "pseudo": pseudo, "exposures": judged_exposures(lines)}
     return {key: value for key, value in found.items() if value}
+
+
+def judged_exposures(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """At which step exposures were judged, their spread, of how many photographs they were learnt, and seconds."""
+    for line in lines:
+        if "exposure_spread" in line:
+            told = {"spread": "exposure_spread", "learnt": "exposures", "seconds": "exposure_seconds"}
+            return {"step": line["step"]} | {name: line[key] for name, key in told.items()}
+    return {}
 
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
