@@ -364,7 +364,15 @@ def afar(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 MORE, MORE_STEPS = 1.25, "zoom, a quarter more steps"
 """By how many more steps `zoom` is trained once again, which is what its arms with pseudo details take in time, and the
 name of that row."""
-TRUTH_FIGURES = {"PSNR": "x1", "PSNR x2": "x2", "PSNR x4": "x4", "detail x2": "detail2", "detail x4": "detail4"}
+TRUTH_FIGURES = {
+    "PSNR": "x1",
+    "PSNR x2": "x2",
+    "PSNR x4": "x4",
+    "over enlarged x2": "over2",
+    "over enlarged x4": "over4",
+    "detail x2": "detail2",
+    "detail x4": "detail4",
+}
 """Metrics of the experiment's table: keys of ours."""
 
 
@@ -378,7 +386,9 @@ def truth(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
         for name, lines in figures.items()
     ]
     columns = [["scene", "scene"], ["name", "row"], ["seeds", "seeds"]]
-    columns += [[key, key] for key in ("x1", "x2", "x4", "detail2", "detail4")]
+    columns += [[key, key] for key in ("x1", "x2", "x4")]
+    columns += [[f"over{factor}", f"x{factor} - x1 enlarged"] for factor in ZOOMS[1:]]
+    columns += [[key, key] for key in ("detail2", "detail4")]
     columns += [[f"more{key}", f"{key} - Mip-Splatting"] for key in ("x1", "x2", "x4", "detail4")]
     note = (
         f"PSNR on held-out views and explained detail above the training Nyquist frequency by {given.share:g} of the "
@@ -420,7 +430,8 @@ def truth_row(scene: str, name: str, lines: Mapping[str, dict[str, str]]) -> dic
     row: dict[str, Any] = {"scene": scene, "name": name, "seeds": int(lines["PSNR"]["seeds"])}
     for metric, key in TRUTH_FIGURES.items():
         line, digits = lines[metric], 3 if "detail" in key else 2
-        row[key] = spread_text(line["ours"], line["spread"], f".{digits}f")
+        sign = "+" if key.startswith("over") else ""
+        row[key] = spread_text(line["ours"], line["spread"], f"{sign}.{digits}f")
         row[f"more{key}"] = spread_text(line["gain"], line["gain_spread"], f"+.{digits}f")
     return row | {"s": round(float(lines["s"]["ours"]))}
 

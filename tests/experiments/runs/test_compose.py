@@ -192,6 +192,19 @@ def test_a_folder_named_by_a_number_is_a_folder() -> None:
     assert compose(["scene=colmap", "scene.path=2024"], plugins()).scene.options.path.endswith("/2024")
 
 
+def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> None:
+    config = compose(["backbone=mip_splatting"], plugins()).resolved
+    del config["eval"]["colours"], config["training"]["exposure"], config["backbone"]["mip"]["views"]
+    write_config(tmp_path / "config.yaml", config)
+    words = ["eval.colours=fitted", "training.exposure.when=always", "backbone.mip.views=2"]
+    settings = read_config(tmp_path / "config.yaml", plugins(), words)
+    assert (settings.evaluation.colours, settings.training.exposure.when) == ("fitted", "always")
+    assert settings.backbone.options.mip.views == 2
+    assert settings.resolved["eval"]["colours"] == "fitted"
+    with pytest.raises(ConfigError, match=r"Did you mean 'eval.colours'"):
+        read_config(tmp_path / "config.yaml", plugins(), ["eval.colors=fitted"])
+
+
 def test_runs_of_an_older_gsx_open_and_know_newer_rasterizer_settings(tmp_path: Path) -> None:
     config = compose(["rasterizer.tile_size=16"], plugins()).resolved
     del config["rasterizer"]["tile_cap"], config["rasterizer"]["path"]

@@ -23,6 +23,7 @@ from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
 
@@ -284,10 +285,10 @@ def write_config(path: Path, resolved: dict[str, Any]) -> None:
 
 
 def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
-    """Settings of an existing run, with `key=value` overrides of existing keys.
+    """Settings of an existing run, with `key=value` overrides of its keys, and of those that gsx has had since.
 
     Raises:
-        ConfigError: the file is unreadable, or an override names no key of it.
+        ConfigError: the file is unreadable, or an override names no such key.
     """
     try:
         config = OmegaConf.load(path)
@@ -297,16 +298,26 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         config = OmegaConf.create(renamed(OmegaConf.to_container(config)))  # type: ignore[arg-type]
         refuse_interpolation(path, config)
     add_newer_settings(config)
-    known = list(dotted(OmegaConf.to_container(config)))
+    written = OmegaConf.to_container(config)
+    known = list(dict.fromkeys([*dotted(written), *newer_keys(written, plugins)])) if overrides else []
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or key not in known:
             raise ConfigError(f"'{key}' is no key of {path}.{right_key(key, known)}")
         try:
-            OmegaConf.update(config, key, value_of(value))
+            OmegaConf.update(config, key, value_of(value), force_add=True)
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)  # type: ignore[arg-type]
+
+
+def newer_keys(config: Any, plugins: Plugins) -> Iterator[str]:
+    """Dotted keys that a run's composition may have by today's schemas; an older run's file lacks some of them."""
+    schemas: dict[str, type] = {"training.": TrainingOptions, "eval.": EvalOptions, "": GeneralOptions}
+    for kind in COMPONENT_KINDS:
+        schemas[f"{kind}."] = plugins.registry.find(kind, str(part(config, kind).get("name", ""))).options
+    for prefix, schema in schemas.items():
+        yield from schema_keys(schema, prefix)
 
 
 def refuse_interpolation(path: Path, config: DictConfig) -> None:

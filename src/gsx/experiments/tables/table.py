@@ -26,6 +26,12 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
 }
 """By metric, from an evaluation or one of its groups; Mem is the size of the model file, as the paper has it; s: of
 training."""
+ZOOM_MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "PSNR": lambda entry: entry.get("psnr"),
+    "over enlarged": lambda entry: over_enlarged(entry),
+    "detail": lambda entry: detail_share(entry),
+}
+"""By the name of `NAME xK`, from the figures at a zoom; detail: explained, above the training Nyquist frequency."""
 PLACES = ("model", "revision", "variant", "dtype", "tiling")
 """Keys of regenerators that say where a model comes from and how it fits into memory."""
 SHOWN_KEYS = 12
@@ -35,6 +41,12 @@ SHOWN_KEYS = 12
 def thousandth(value: Any) -> float | None:
     """A number in thousands."""
     return value / 1000 if is_number(value) else None
+
+
+def over_enlarged(entry: dict[str, Any]) -> float | None:
+    """PSNR over that of the x1 render, enlarged, dB."""
+    own, enlarged = entry.get("psnr"), entry.get("enlarged_psnr")
+    return own - enlarged if is_number(own) and is_number(enlarged) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,12 +172,9 @@ def table_of(
     files = {cell.folder: read_run(cell.folder) for cell in cells}
     scopes = scopes_of(datasets, experiment.scenes, published)
     zooms = sorted({z for run in files.values() for z in part(run.evaluation, "zoom") if float(z) > 1}, key=float)
-    zoomed = [f"PSNR x{zoom}" for zoom in zooms]
-    detailed = [f"detail x{zoom}" for zoom in zooms]
-    zoomed += [
-        name for name in detailed if any(zoom_figure(run.evaluation, name) is not None for run in files.values())
-    ]
-    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS", "s"]), *zoomed]
+    zoomed = [f"{name} x{zoom}" for name in ZOOM_MEASURES for zoom in zooms]
+    known = [name for name in zoomed if any(zoom_figure(run.evaluation, name) is not None for run in files.values())]
+    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS", "s"]), *known]
     figures = [
         figure(row, scope, metric, [c for c in cells if c.row == row], files, published, lacking)
         for scope in scopes
@@ -243,10 +252,9 @@ def measured(files: RunFiles, metric: str, group: str) -> float | None:
 
 
 def zoom_figure(evaluation: dict[str, Any], metric: str) -> float | None:
-    """`PSNR xK`, or `detail xK`: explained detail above the training Nyquist frequency."""
+    """`NAME xK`, by ZOOM_MEASURES."""
     name, _, factor = metric.partition(" x")
-    entry = part(part(evaluation, "zoom"), factor)
-    value = entry.get("psnr") if name == "PSNR" else detail_share(entry)
+    value = ZOOM_MEASURES[name](part(part(evaluation, "zoom"), factor))
     return value if is_number(value) else None
 
 
