@@ -8,12 +8,11 @@ by every rule for zoomed cameras. `compositions`: each is trained by mip_splatti
 `views`: by the preset with `backbone.mip.views=2`. `parts`: by parts of the preset. `levels`: by Octree-GS with its
 preset for zooming in. `pictures`: by the preset with pseudo details, enlarged or true, in half of the run; `trusted`:
 by such that narrow the 3D filter. `afar`: what compositions draw from four times as far as photographs were taken, by
-each way of looking. `truth`: `gsx +experiment=zoom_truth` by --share of its steps, and its row `zoom` by a quarter more
-of them. Finished runs below --runs are not trained again. Some hours on two cores.
+each way of looking. Finished runs below --runs are not trained again. Some hours on two cores. What
+`gsx +experiment=zoom_truth` finds is measured by benchmarks/zoom_truth.py.
 """
 
 import argparse
-import csv
 import re
 import statistics
 import sys
@@ -36,7 +35,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
-from measuring.runs import gsx, train
+from measuring.runs import train
 
 RESULTS = Path(__file__).parent / "results"
 SUBJECTS = {
@@ -127,10 +126,6 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/zoom")
     parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
-    parser.add_argument(
-        "--share", type=float, default=1.0, help="of the steps of truth, 1: as many as the other tables"
-    )
-    parser.add_argument("--rows", default="", help="of truth, by commas; none given: all")
     parser.add_argument("--label", default="", help="of tables over other scenes or seeds: added to their names")
     return parser.parse_args(words)
 
@@ -361,87 +356,6 @@ def afar(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Looking from afar", [*columns, ["psnr", "x1/4"]], rows, note
 
 
-MORE, MORE_STEPS = 1.25, "zoom, a quarter more steps"
-"""By how many more steps `zoom` is trained once again, which is what its arms with pseudo details take in time, and the
-name of that row."""
-TRUTH_FIGURES = {
-    "PSNR": "x1",
-    "PSNR x2": "x2",
-    "PSNR x4": "x4",
-    "over enlarged x2": "over2",
-    "over enlarged x4": "over4",
-    "detail x2": "detail2",
-    "detail x4": "detail4",
-}
-"""Metrics of the experiment's table: keys of ours."""
-
-
-def truth(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
-    """The experiment: every row against the same seed of Mip-Splatting and of `zoom`."""
-    with ThreadPoolExecutor(given.jobs) as pool:
-        found = list(pool.map(lambda scene: by_row(experiment(scene, given)), scenes))
-    rows = [
-        truth_row(scene, name, lines)
-        for scene, figures in zip(scenes, found, strict=True)
-        for name, lines in figures.items()
-    ]
-    columns = [["scene", "scene"], ["name", "row"], ["seeds", "seeds"]]
-    columns += [[key, key] for key in ("x1", "x2", "x4")]
-    columns += [[f"over{factor}", f"x{factor} - x1 enlarged"] for factor in ZOOMS[1:]]
-    columns += [[key, key] for key in ("detail2", "detail4")]
-    columns += [[f"more{key}", f"{key} - Mip-Splatting"] for key in ("x1", "x2", "x4", "detail4")]
-    note = (
-        f"PSNR on held-out views and explained detail above the training Nyquist frequency by {given.share:g} of the "
-        "steps, means over seeds ± half their range; differences seed by seed. s: of training, branches counted whole."
-    )
-    return "What helps when looking closer", [*columns, ["s", "s"]], rows, note
-
-
-def experiment(scene: str, given: argparse.Namespace) -> list[dict[str, str]]:
-    """Lines of the table of the experiment over a scene, and of its row `zoom` by more steps."""
-    lines = []
-    chosen = [f"experiment.only=[{given.rows}]"] if given.rows else []
-    for share, more in ((given.share, chosen), (MORE * given.share, ["experiment.only=[zoom]"])):
-        output = given.runs / "truth" / f"{share:g}"
-        words = ["+experiment=zoom_truth", f"output={output}", f"budget.share={share:g}", *more]
-        words += [f"experiment.seeds={list(given.seeds)}".replace(" ", ""), f"experiment.scenes=[{scene}]"]
-        words += [f"data_root={given.scenes}"] if given.scenes else []
-        log = given.runs / f"truth_{share:g}_{scene}.log"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        gsx(words, {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}, log)
-        path = Path(log.read_text().splitlines()[-1]).with_suffix(".csv")
-        with path.open() as file:
-            found = [line for line in csv.DictReader(file) if int(line["seeds"])]  # other datasets have none
-        name = MORE_STEPS if share != given.share else ""
-        lines += [line | {"row": name or line["row"]} for line in found]
-    return lines
-
-
-def by_row(lines: Sequence[dict[str, str]]) -> dict[str, dict[str, dict[str, str]]]:
-    """Lines of one scene by row and metric."""
-    found: dict[str, dict[str, dict[str, str]]] = {}
-    for line in lines:
-        found.setdefault(line["row"], {})[line["metric"]] = line
-    return found
-
-
-def truth_row(scene: str, name: str, lines: Mapping[str, dict[str, str]]) -> dict[str, Any]:
-    """One row of the table."""
-    row: dict[str, Any] = {"scene": scene, "name": name, "seeds": int(lines["PSNR"]["seeds"])}
-    for metric, key in TRUTH_FIGURES.items():
-        line, digits = lines[metric], 3 if "detail" in key else 2
-        sign = "+" if key.startswith("over") else ""
-        row[key] = spread_text(line["ours"], line["spread"], f"{sign}.{digits}f")
-        row[f"more{key}"] = spread_text(line["gain"], line["gain_spread"], f"+.{digits}f")
-    return row | {"s": round(float(lines["s"]["ours"]))}
-
-
-def spread_text(value: str, half: str, form: str) -> str:
-    """A figure of a CSV file, ± half its range where there is one."""
-    text = f"{float(value):{form}}" if value else ""
-    return text + (f" ± {float(half):{form.removeprefix('+')}}" if half else "")
-
-
 def over_seeds(
     look: Callable[[str, int], dict[Any, Any]], scenes: Sequence[str], given: argparse.Namespace
 ) -> dict[str, list[dict[Any, Any]]]:
@@ -460,7 +374,6 @@ WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
     "pictures": pictures,
     "trusted": trusted,
     "afar": afar,
-    "truth": truth,
 }
 
 

@@ -383,6 +383,39 @@ def test_controls_are_trained_before_what_branches_from_them() -> None:
         assert set(both) == {"control", *family.added}
 
 
+def test_seeds_of_the_experiment_are_kept_and_added_to(tmp_path: Path) -> None:
+    """zoom - Mip-Splatting at x4: 0.5 with seed 0, 0.1 with seed 1, which is measured twice; seed 2 has no `zoom`."""
+    import zoom_truth
+
+    given = zoom_truth.arguments(["--share", "0.4", "--to", str(tmp_path)])
+
+    def row(name: str, seed: int, x4: str) -> dict:
+        figures = {"x1": "27.000", "x4": x4, "over4": "-0.250", "s": "20.4"}
+        return {"share": "0.4", "scene": "demo", "name": name, "seed": seed, "commit": "abc"} | figures
+
+    for rows in (
+        [row("zoom", 0, "25.500"), row("Mip-Splatting", 0, "25.000"), row("zoom", 1, "30.000")],
+        [row("zoom", 1, "26.100"), row("Mip-Splatting", 1, "26.000"), row("Mip-Splatting", 2, "27.500")],
+    ):
+        zoom_truth.keep(rows, given, {"cpu": "any"}, (0.0, "command"))
+    assert [(r["name"], r["seed"]) for r in zoom_truth.read_rows(tmp_path)] == [
+        *(("Mip-Splatting", seed) for seed in range(3)),
+        *(("zoom", seed) for seed in range(2)),
+    ]
+    base, zoom = read_sections(tmp_path / "zoom_truth_cpu.json")["table"]["rows"]
+    assert (base["seeds"], base["x4"], base.get("more_x4")) == (3, "26.17 ± 1.25", None)
+    assert (zoom["seeds"], zoom["x4"], zoom["more_x4"]) == (2, "25.80 ± 0.30", "+0.30 ± 0.20")
+    assert (zoom["over4"], zoom["x2"], zoom["s"]) == ("-0.25 ± 0.00", "", 20)
+
+
+def test_figures_of_the_experiment_are_read_from_its_table() -> None:
+    import zoom_truth
+
+    line = {"row": "zoom", "metric": "PSNR x4", "ours": "25.50049"}
+    more = [line | {"metric": "SSIM"}, line | {"metric": "detail x4", "ours": ""}]
+    assert zoom_truth.figures([line, *more]) == {"zoom": {"x4": "25.500"}}
+
+
 # -- whole commands ------------------------------------------------------------------------------------------------
 
 TINY = ["scene.width=32", "scene.height=24", "scene.points=50", "scene.train_views=2", "scene.test_views=1"]
