@@ -1,35 +1,61 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--only demo,fox] [--seeds 0,1,2] [--share 0.4] [--jobs 2]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,faults] [--only demo,fox] [--seeds 0,1] [--share 0.4]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
-`training.exposure.when=auto`, beside the scene as it is, with it. Finished runs below --runs are not trained again.
+`training.exposure.when=auto`, beside the scene as it is, with it. `faults`: a tenth of the photographs are made worse,
+and what `gsx photographs` names is counted. Finished runs below --runs are not trained again.
 """
 
 import argparse
+import math
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 
+from gsx.builtin import plugins
+from gsx.core.data.disturbed import chosen
 from gsx.core.files import read_json
+from gsx.experiments.runs.photographs import judge_photographs
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
-from zoom import SUBJECTS, looked_at, over_seeds, scenes_at_hand, shared_arguments, steps_among, told, trained
+from zoom import (
+    SUBJECTS,
+    Measured,
+    looked_at,
+    over_seeds,
+    refuse_unknown,
+    scenes_at_hand,
+    shared_arguments,
+    steps_among,
+    told,
+    trained,
+)
 
 ZOOMS = ("1", "4")
 OWN = ("backbone=mip_splatting", "backbone.rates.shortened=0.4")
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
+FEW = 0.1
+"""Share of the photographs that are made worse."""
+FAULTS = {
+    "none": ("", ""),
+    "exposure": ("scene.disturb.exposure=0.7", "stops"),
+    "pose": ("scene.disturb.pose=3", "px beside the model's render"),
+    "covered": ("scene.disturb.covered=0.05", "of its error lies in"),
+}
+"""What is done to them, and what a remark says that names it."""
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/captures")
+    parser.add_argument("--what", default="exposure,faults", help="tables, by commas")
     parser.add_argument("--share", type=float, default=1.0, help="of the steps")
     return parser.parse_args(words)
 
@@ -79,13 +105,55 @@ def shares_won(by_arm: Mapping[str, Found], zoom: str) -> list[float]:
     return [(m - w) / (b - w) for b, w, m in zip(best, worst, mended, strict=True)]
 
 
-def main(words: Sequence[str]) -> None:
-    """Train and look, and write the table."""
-    given = arguments(words)
-    machine, load = describe_machine(torch.device("cpu")), told_load()
-    machine |= {"threads": 1} if given.jobs > 1 else {}
-    read_sections(given.to / "captures_cpu.json")  # what cannot be added to is refused before training
-    scenes = scenes_at_hand(given)
+# -- which photographs are bad? ----------------------------------------------------------------------------------------
+
+
+def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[str, Any]:
+    """How many photographs of a run were made worse, and how many of these and of the others are named."""
+    steps, (word, _) = round(given.share * steps_among(SUBJECTS[scene])), FAULTS[fault]
+    disturbances = [word, f"scene.disturb.some={FEW}"] if word else []
+    folder = trained(scene, seed, given, [*OWN, *disturbances, f"iterations={steps}"], f"fault {fault}")
+    if not (folder / "photographs" / "index.json").is_file():
+        judge_photographs(folder, plugins(), worst=10)
+    found = read_json(folder / "photographs" / "index.json")["views"]
+    bad = chosen([view["name"] for view in found], FEW) if word else set()
+    by_name = {view["name"]: view["remarks"] for view in found}
+    return {
+        "bad": len(bad),
+        "good": len(found) - len(bad),
+        "found": sum(any(FAULTS[fault][1] in remark for remark in by_name[name]) for name in bad),
+        "wrongly": sum(bool(remarks) for name, remarks in by_name.items() if name not in bad),
+        "shift": statistics.median(math.hypot(*(view["shift"] or (0, 0))) for view in found),
+    }
+
+
+def fault_row(scene: str, fault: str, found: Found) -> dict[str, Any]:
+    """Counts over seeds."""
+    row: dict[str, Any] = {"scene": scene, "name": fault, "seeds": len(found)}
+    if sum(one["bad"] for one in found):
+        row["found"] = f"{sum(one['found'] for one in found)} of {sum(one['bad'] for one in found)}"
+    row["others"] = f"{sum(one['wrongly'] for one in found)} of {sum(one['good'] for one in found)}"
+    return row | {"shift": told([one["shift"] for one in found], ".2f")}
+
+
+def faults(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Photographs that were made worse, found again."""
+    found = over_seeds(lambda scene, seed: {f: named(scene, seed, f, given) for f in FAULTS}, scenes, given)
+    rows = [fault_row(scene, fault, [one[fault] for one in found[scene]]) for scene in scenes for fault in FAULTS]
+    columns = [["scene", "scene"], ["name", "made worse in"], ["seeds", "seeds"], ["found", "of these named for it"]]
+    columns += [["others", "of the others named for anything"], ["shift", "median shift, px"]]
+    note = (
+        f"{given.share:g} of the steps; {FEW:.0%} of the training photographs made worse, and trained with all the "
+        "same; counts over seeds. How much each is made worse is drawn, for some it is little."
+    )
+    return "Bad photographs, found", columns, rows, note
+
+
+# -- exposure ----------------------------------------------------------------------------------------------------------
+
+
+def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Exposures of their own, and what mends them."""
     found = over_seeds(lambda scene, seed: {arm: measured(scene, seed, arm, given) for arm in ARMS}, scenes, given)
     rows = []
     for scene in scenes:
@@ -98,10 +166,25 @@ def main(words: Sequence[str]) -> None:
         f"{given.share:g} of the steps; PSNR on held-out views that are not disturbed, of right halves in colours "
         "fitted on the left (as rendered: of whole views as the model shows them); means over seeds ± half their range."
     )
-    title = "Photographs at exposures of their own"
-    table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/captures.py"))
-    write_results(given.to, "captures_cpu", machine, {"exposure": table})
-    print(text_table(table))
+    return "Photographs at exposures of their own", columns, rows, note
+
+
+WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {"exposure": exposure, "faults": faults}
+
+
+def main(words: Sequence[str]) -> None:
+    """Train and look, and write the tables."""
+    given = arguments(words)
+    machine, load = describe_machine(torch.device("cpu")), told_load()
+    machine |= {"threads": 1} if given.jobs > 1 else {}
+    read_sections(given.to / "captures_cpu.json")  # what cannot be added to is refused before training
+    refuse_unknown(given.what, WHAT)
+    scenes = scenes_at_hand(given)
+    for name in given.what.split(","):
+        title, columns, rows, note = WHAT[name](scenes, given)
+        table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/captures.py"))
+        write_results(given.to, "captures_cpu", machine, {name: table})
+        print(text_table(table))
 
 
 if __name__ == "__main__":

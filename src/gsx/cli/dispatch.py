@@ -10,7 +10,7 @@ from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import explained, set_up_logging, unheard
-from gsx.cli.runs import verb_eval, verb_export, verb_render, verb_view
+from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
@@ -27,6 +27,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
   gsx view RUN|FILE         look around in a browser, also while RUN is trained (gsx[viewer]); or viewer=true
   gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
+  gsx photographs RUN       what is wrong with training photographs: exposure, pose, blur, passers-by; the ten worst
   gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
   gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
   gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
@@ -111,6 +112,7 @@ def dispatch(arguments: list[str]) -> int:
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "resume": verb_resume,
     "eval": verb_eval,
+    "photographs": verb_photographs,
     "render": verb_render,
     "export": verb_export,
     "compact": verb_compact,

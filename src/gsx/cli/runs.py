@@ -1,4 +1,4 @@
-"""Verbs on a finished run: eval, render, export."""
+"""Verbs on a finished run: eval, photographs, render, export."""
 
 import argparse
 import logging
@@ -46,6 +46,26 @@ def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
     folders: list[Path] = []
     code = train(compose(composition_of(path, overrides), loaded := plugins()), loaded, folders)
     return tell_report(code, *folders)
+
+
+def verb_photographs(arguments: list[str]) -> int:
+    """gsx photographs RUN [KEY=VALUE ...] [--worst N]"""
+    told = (
+        "What is wrong with training photographs, told from what the trained model shows in their places: exposure, "
+        "pose, blur, things that only one shows. The report then shows the worst."
+    )
+    parser = Parser(prog="gsx photographs", description=told)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
+    parser.add_argument("--worst", type=positive(int), default=10, help="photographs that are shown (10)")
+    given = parser.parse_intermixed_args(arguments)
+    from gsx.experiments.runs.photographs import judge_photographs, lines
+
+    findings = judge_photographs(given.run, plugins(), given.worst, given.overrides)
+    for line in lines(findings, given.worst):
+        logger.info("%s", line)
+    sys.stdout.write(f"{given.run / 'report.html'}\n")
+    return 0
 
 
 def verb_render(arguments: list[str]) -> int:

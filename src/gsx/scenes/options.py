@@ -35,7 +35,9 @@ class SceneOptions:
     0.2, least distances, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
-    disturb: Annotated[dict[str, float], Range(0, 2)] = field(default_factory=lambda: {"exposure": 0.0})
+    disturb: Annotated[dict[str, float], Range(0, 64)] = field(
+        default_factory=lambda: {"exposure": 0.0, "pose": 0.0, "covered": 0.0, "some": 1.0}
+    )
     """What training photographs are made to suffer, for research (gsx.core.data.disturbed); 0: nothing."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""

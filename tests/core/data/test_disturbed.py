@@ -8,7 +8,7 @@ import torch
 from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.disturbed import disturbed, gains_of
+from gsx.core.data.disturbed import disturbed, gains_of, generator_of
 from gsx.core.data.scene import FromFile, Masked, View
 from gsx.core.errors import ConfigError
 
@@ -56,6 +56,53 @@ def test_values_saturate_and_files_and_masks_stay_those_of_the_source() -> None:
     assert worse.source.image(worse.camera).dtype == torch.uint8
 
 
+class Asked(Grey):
+    """Remembers the camera that was asked for."""
+
+    def image(self, camera: Camera) -> torch.Tensor:
+        self.camera = camera
+        return super().image(camera)
+
+
+def test_a_wrong_pose_moves_the_picture_and_the_photograph_stays_where_it_was_taken() -> None:
+    scene, source = small_scene(spread(5)), Asked()
+    own = View("a", scene.train[0].camera, source)
+    [worse] = disturbed(replace(scene, train=[own]), {"pose": 3.0}).train
+    far = torch.tensor([[0.0, 0.0, 1000.0]]).double() @ own.camera.rotation + own.camera.centre  # what its middle shows
+    (before, _), (after, _) = own.camera.project(far), worse.camera.project(far)
+    moved = 3 * torch.randn(2, generator=generator_of("pose", "a")).double()
+    torch.testing.assert_close(after - before, moved[None], atol=0.02 * 3, rtol=0)
+    torch.testing.assert_close(worse.camera.centre, own.camera.centre, atol=1e-6, rtol=0)
+    assert worse.image().shape == (3, 16, 24)
+    assert torch.equal(source.camera.rotation, own.camera.rotation)
+    finer = worse.source.image(worse.camera.zoom(2))
+    assert torch.equal(source.camera.translation, own.camera.translation)
+    assert (source.camera.width, finer.shape) == (48, (3, 32, 48))
+
+
+def test_what_stands_before_a_photograph_covers_its_share_at_every_size() -> None:
+    scene = small_scene(spread(5))
+    [one] = disturbed(replace(scene, train=scene.train[:1]), {"covered": 0.25}).train
+    for camera in (one.camera.zoom(8), one.camera.zoom(16)):
+        covered = (one.source.image(camera) != 128).any(0)
+        assert abs(float(covered.float().mean()) - 0.25) < 0.01
+    whole, crop = one.camera.zoom(8), one.camera.zoom(8).crop(50, 30, 60, 40)
+    assert torch.equal(one.source.image(crop), one.source.image(whole)[:, 30:70, 50:110])
+
+
+def test_some_photographs_suffer_the_same_in_every_run() -> None:
+    scene = small_scene(spread(5), views=10)
+    by = {"exposure": 0.5, "some": 0.3}
+    first, again = (disturbed(scene, by).train for _ in range(2))
+    suffering = [view.source is not own.source for view, own in zip(first, scene.train, strict=True)]
+    assert sum(suffering) == 3
+    assert suffering == [view.source is not own.source for view, own in zip(again, scene.train, strict=True)]
+    assert disturbed(scene, by).notes[-1] == "disturbed: 3 of 10 training photographs (scene.disturb: exposure 0.5)"
+    assert disturbed(scene, {"some": 0.5}) is scene
+
+
 def test_what_cannot_be_disturbed_is_named() -> None:
     with pytest.raises(ConfigError, match=r"scene\.disturb\.blur"):
         disturbed(small_scene(spread(5)), {"blur": 1.0})
+    with pytest.raises(ConfigError, match=r"scene\.disturb\.covered is 1; give at most 0.9"):
+        disturbed(small_scene(spread(5)), {"covered": 1.0})

@@ -25,6 +25,7 @@ def run(
         evaluation=evaluation,
         pictures={},
         pseudo={},
+        photographs={},
         status={},
         problems={},
     )

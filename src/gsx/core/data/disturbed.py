@@ -1,4 +1,4 @@
-"""Photographs made worse in a known way, so that the truth of what mends them is known (research alone)."""
+"""Photographs made worse in a known way, so that the truth of what finds and mends them is known (research alone)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,6 +17,8 @@ from gsx.core.shapes import Bool, Float, UInt8
 
 BALANCE = 0.25
 """Spread of a channel's own gain, of that of the exposure."""
+MOST = {"exposure": 2.0, "pose": 64.0, "covered": 0.9, "some": 1.0}
+"""What photographs may suffer, and the largest value of each."""
 
 
 @runtime_checkable
@@ -29,29 +31,39 @@ class Disturbable(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class Exposed:
-    """A source whose values are multiplied, channel by channel, and saturate."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Worse:
+    """A source of a photograph that was taken at another exposure, from elsewhere, with something in the way."""
 
     source: ImageSource
-    gains: Float[Tensor, "3"]
+    taken: Camera
+    """Its pose is that of the photograph, whatever a view says."""
+    gains: Float[Tensor, "3"] | None = None
+    """Display values are multiplied by them, and saturate."""
+    patch: "Patch | None" = None
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """The truth at another exposure."""
-        scaled = self.source.image(camera) * self.gains[:, None, None]
-        return scaled.round().clamp(0, 255).to(torch.uint8)
+        """What was photographed."""
+        image = self.source.image(self.really(camera))
+        if self.gains is not None:
+            image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
+        return image if self.patch is None else self.patch.over(image, camera)
+
+    def really(self, camera: Camera) -> Camera:
+        """The camera where it stood."""
+        return replace(camera, rotation=self.taken.rotation, translation=self.taken.translation)
 
     def max_zoom(self, camera: Camera) -> float:
         """That of the source."""
-        return self.source.max_zoom(camera)
+        return self.source.max_zoom(self.really(camera))
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """That of the source."""
-        return self.source.counted(camera) if isinstance(self.source, Masked) else None
+        return self.source.counted(self.really(camera)) if isinstance(self.source, Masked) else None
 
 
-@dataclass(frozen=True, eq=False)
-class ExposedFile(Exposed):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorseFile(Worse):
     """The same of a source that reads a file."""
 
     @property
@@ -61,39 +73,113 @@ class ExposedFile(Exposed):
         return self.source.path
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Patch:
+    """Something plain in front of a camera."""
+
+    edges: tuple[float, float, float, float]
+    """Left, top, right, bottom, as shares of the frame's sides."""
+    colour: UInt8[Tensor, "3"]
+
+    def over(self, image: UInt8[Tensor, "3 H W"], camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """The image with it: pixels whose centres it covers."""
+        frame, (left, top, right, bottom) = camera.frame, self.edges
+        x = (torch.arange(camera.width) + 0.5 + frame.left) / frame.width
+        y = (torch.arange(camera.height) + 0.5 + frame.top) / frame.height
+        covered = ((y >= top) & (y < bottom))[:, None] & ((x >= left) & (x < right))
+        return torch.where(covered.to(image.device), self.colour.to(image.device)[:, None, None], image)
+
+
+# -- what one photograph suffers ---------------------------------------------------------------------------------------
+
+
+def generator_of(kind: str, name: str) -> torch.Generator:
+    """Of one photograph's numbers: the same in every run, whatever the seed."""
+    return torch.Generator().manual_seed(derived_seed(f"disturbed {kind}", name))
+
+
 def gains_of(name: str, spread: float) -> Float[Tensor, "3"]:
-    """Gains of the photograph of that name: the same in every run, whatever the seed."""
-    drawn = torch.randn(4, generator=torch.Generator().manual_seed(derived_seed("disturbed exposure", name)))
+    """Gains of the photograph of that name."""
+    drawn = torch.randn(4, generator=generator_of("exposure", name))
     return (spread * (drawn[0] + BALANCE * drawn[1:])).exp()
 
 
-def exposed(views: Sequence[View], spread: float) -> list[View]:
-    """Views at exposures of their own."""
-    out = []
-    for view in views:
-        kind = ExposedFile if isinstance(view.source, FromFile) else Exposed
-        out.append(replace(view, source=kind(view.source, gains_of(view.name, spread))))
+def turned(camera: Camera, name: str, spread: float) -> Camera:
+    """The camera turned about its centre, so that the middle of its picture moves along each axis by numbers of that
+    standard deviation, px."""
+    across, down = (spread * torch.randn(2, generator=generator_of("pose", name)).double()).tolist()
+    turn = about(0, -down / camera.fy) @ about(1, across / camera.fx)
+    rotation, translation = (turn @ part.double() for part in (camera.rotation, camera.translation))
+    return replace(camera, rotation=rotation.to(camera.rotation), translation=translation.to(camera.translation))
+
+
+def about(axis: int, angle: float) -> Float[Tensor, "3 3"]:
+    """Rotation about a coordinate axis, radians, float64."""
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    out = torch.eye(3, dtype=torch.float64)
+    out[one, one] = out[other, other] = math.cos(angle)
+    out[other, one] = math.sin(angle)
+    out[one, other] = -math.sin(angle)
     return out
 
 
+def patch_of(name: str, share: float) -> Patch:
+    """A patch that covers that share of the photograph of that name, anywhere on it, in any colour."""
+    generator, side = generator_of("covered", name), math.sqrt(share)
+    left, top = ((1 - side) * torch.rand(2, generator=generator)).tolist()
+    colour = torch.randint(0, 256, (3,), generator=generator, dtype=torch.uint8)
+    return Patch(edges=(left, top, left + side, top + side), colour=colour)
+
+
+def worse(view: View, by: Mapping[str, float]) -> View:
+    """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken."""
+    exposure, pose, covered = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered"))
+    kind = WorseFile if isinstance(view.source, FromFile) else Worse
+    source = kind(
+        source=view.source,
+        taken=view.camera,
+        gains=gains_of(view.name, exposure) if exposure else None,
+        patch=patch_of(view.name, covered) if covered else None,
+    )
+    return replace(view, source=source, camera=turned(view.camera, view.name, pose) if pose else view.camera)
+
+
+# -- what a scene suffers ----------------------------------------------------------------------------------------------
+
+
+def chosen(names: Sequence[str], share: float) -> set[str]:
+    """That share of the photographs, at least one: the same in every run."""
+    order = sorted(names, key=lambda name: derived_seed("disturbed some", name))
+    return set(order[: max(1, round(share * len(order)))])
+
+
 def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
-    """The scene with its training photographs made worse, and a note that says so; test photographs stay as they are.
+    """The scene with training photographs made worse, and a note that says so; test photographs stay as they are.
 
     by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
+    `pose`: of how far pictures move along each axis when cameras are turned, px. `covered`: share of each photograph
+    that something plain stands before. `some`: the share of photographs that suffer; 1 where it is not said.
 
     Raises:
-        ConfigError: there is no such disturbance.
+        ConfigError: there is no such disturbance, or it is too large.
     """
-    if unknown := sorted(set(by) - {"exposure"}):
-        raise ConfigError(f"scene.disturb.{unknown[0]}: photographs can be disturbed in exposure alone")
-    spread = by.get("exposure", 0.0)
-    if spread == 0:
+    for kind, value in by.items():
+        if kind not in MOST:
+            raise ConfigError(f"scene.disturb.{kind}: photographs can be disturbed by {', '.join(MOST)}")
+        if value > MOST[kind]:
+            raise ConfigError(f"scene.disturb.{kind} is {value:g}; give at most {MOST[kind]:g}")
+    asked = {kind: value for kind, value in by.items() if value and kind != "some"}
+    some = by.get("some", 1.0)
+    if not asked or not some:
         return scene
-    percent = 100 * (math.exp(spread) - 1)
-    note = f"disturbed: exposures of training photographs are spread by {percent:.0f} % (scene.disturb.exposure)"
+    names = chosen([view.name for view in scene.train], some)
+    told = ", ".join(f"{kind} {value:g}" for kind, value in asked.items())
     return replace(
         scene,
-        train=exposed(scene.train, spread),
-        notes=[*scene.notes, note],
-        provenance=scene.provenance | {"disturbed": {"exposure": spread}},
+        train=[worse(view, asked) if view.name in names else view for view in scene.train],
+        notes=[
+            *scene.notes,
+            f"disturbed: {len(names)} of {len(scene.train)} training photographs (scene.disturb: {told})",
+        ],
+        provenance=scene.provenance | {"disturbed": asked | ({"some": some} if some < 1 else {})},
     )

@@ -5,6 +5,7 @@ ratio of both, along the axis that has less of it, is alike for photographs of o
 neighbours, a photograph that moved by three pixels has half of it or less (docs/photographs.md).
 """
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -53,18 +54,29 @@ def against_neighbours(values: Float[Tensor, "N 2"]) -> Float[Tensor, "N"]:
     return out
 
 
+def sharpness(photos: Sequence[Path]) -> dict[Path, float]:
+    """What each photograph has of its neighbours' fineness, in their order; those of which nothing is known are left
+    out.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    if not photos:
+        return {}
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        values = list(pool.map(lambda path: fineness(read_image(path)), photos))
+    found = against_neighbours(torch.stack(values)).tolist()
+    return {path: ratio for path, ratio in zip(photos, found, strict=True) if not math.isnan(ratio)}
+
+
 def blurred(photos: Sequence[Path]) -> list[tuple[Path, float]]:
     """(photograph, what it has of its neighbours' fineness) of those that are blurred, worst first.
 
     Raises:
         InputError: one cannot be read.
     """
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        values = list(pool.map(lambda path: fineness(read_image(path)), photos))
-    if not values:
-        return []
-    found = against_neighbours(torch.stack(values)).tolist()
-    return sorted(((p, r) for p, r in zip(photos, found, strict=True) if r < BLURRED), key=lambda pair: pair[1])
+    found = sharpness(photos).items()
+    return sorted(((path, ratio) for path, ratio in found if ratio < BLURRED), key=lambda pair: pair[1])
 
 
 def sharpness_line(photos: Sequence[Path]) -> str:

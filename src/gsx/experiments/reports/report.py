@@ -103,6 +103,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "flight": flight_of(run),
         "pages": pages_of(run.folder),
         "pseudo": [with_pseudo_images(run, entry) for entry in run.pseudo.get("views", [])],
+        "photographs": photographs_of(run),
         "error_full": run.pictures.get("error_full"),
         "ramp": ", ".join(f"rgb{colour} {place:.0%}" for place, colour in ERROR_COLOURS),
         "bars": bars(evaluation.get("views", [])),
@@ -327,6 +328,24 @@ def flight_of(run: RunFiles) -> dict[str, Any] | None:
     return known | {"image": image} if image and sound and is_number(frames) and frames > 1 else None
 
 
+def photographs_of(run: RunFiles) -> dict[str, Any]:
+    """What `gsx photographs` found, with the pictures of the worst; empty where it was not asked."""
+    found = run.photographs
+    if not found:
+        return {}
+    worst = [view | {"images": images_in(run.folder / "photographs", view)} for view in found["views"]]
+    return found | {
+        "worst": [view for view in worst if view["images"]],
+        "wrong": [view for view in found["views"] if view["remarks"]],
+        "stale": found.get("step") != run.step,
+    }
+
+
+def images_in(folder: Path, entry: dict[str, Any]) -> dict[str, str | None]:
+    """Pictures of an entry by kind, embedded; None for files that are gone."""
+    return {kind: embedded(folder / Path(str(file)).name) for kind, file in part(entry, "files").items()}
+
+
 def pages_of(folder: Path) -> list[str]:
     """Pages beside the report that `gsx export RUN FILE.html` wrote."""
     return sorted(path.name for path in folder.glob("*.html") if path.name != "report.html")
@@ -334,7 +353,7 @@ def pages_of(folder: Path) -> list[str]:
 
 def with_images(run: RunFiles, entry: dict[str, Any]) -> dict[str, Any]:
     """An entry of renders/index.json with its pictures embedded; None for files that are gone."""
-    images = {kind: embedded(run.folder / "renders" / Path(file).name) for kind, file in part(entry, "files").items()}
+    images = images_in(run.folder / "renders", entry)
     depth = entry.get("depth")
     sound = isinstance(depth, list) and len(depth) == 2 and all(map(is_number, depth))
     return entry | {"images": images, "depth": depth if sound else []}

@@ -43,6 +43,8 @@ class RunFiles:
     pictures: dict[str, Any]
     pseudo: dict[str, Any]
     """Content of pseudo/index.json."""
+    photographs: dict[str, Any]
+    """Content of photographs/index.json."""
     status: dict[str, Any]
     problems: dict[str, str]
     """What is wrong, by file."""
@@ -161,6 +163,7 @@ def read_run(folder: Path) -> RunFiles:
         evaluation=evaluation,
         pictures=read("renders/index.json", sound_pictures),
         pseudo=read("pseudo/index.json", lambda content: rows(content.get("views", []))),
+        photographs=read("photographs/index.json", sound_photographs),
         status=read("status.json", sound_step),
         problems=problems,
     )
@@ -218,6 +221,15 @@ def sound_pictures(content: dict[str, Any]) -> bool:
     sized = all(is_size(view.get("size")) for view in views)
     names = [name for one in (*views, *crops) for name in part(one, "files").values()]
     return sized and all(isinstance(name, str) and Path(name).name not in ("", "..") for name in names)
+
+
+def sound_photographs(content: dict[str, Any]) -> bool:
+    """Whether a photographs/index.json has the form that gsx gives it."""
+    views = content.get("views", [])
+    if not (sound_step(content) and rows(views) and is_number(content.get("median_psnr"))):
+        return False
+    told = all(isinstance(view.get("name"), str) and isinstance(view.get("remarks"), list) for view in views)
+    return told and all(is_number(view.get("psnr")) and isinstance(view.get("files", {}), dict) for view in views)
 
 
 def pictures_in(index: dict[str, Any]) -> list[str]:

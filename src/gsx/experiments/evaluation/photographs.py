@@ -1,0 +1,222 @@
+"""What is wrong with training photographs, told from what a trained model shows in their places.
+
+A model shows what photographs agree on. Where one of them differs from it, and others do not, it is mostly that
+photograph: its exposure, its pose, a blur, or something in it that no other shows.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import median
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from gsx.core.quality.sharpness import BLURRED
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.exposure import log_gains
+
+UNEVEN = 1 / 3
+"""Stops from the middle from which on a photograph is named, and between its channels: the step of cameras' dials."""
+SHIFTED, TIMES = 0.5, 3.0
+"""Px by which a photograph is named that lies beside the render, if it is so many times the usual."""
+CELL, FEW = 8, 0.05
+"""Px of the squares that errors are summed in; the share of the squares with the most of them."""
+ELSEWHERE, MORE = 0.5, 1.5
+"""Share of the error in these squares from which on a photograph is named, if it is so many times the usual."""
+ROUNDS = 8
+"""Of the search for a shift."""
+BORDER = 4
+"""Px at the borders that say nothing of it, beside the shift itself."""
+LEAST = 64
+"""Pixels that tell it."""
+TELLING = 1e-5
+"""Least eigenvalue of the normal equations, of columns of length 1, from which on they tell a shift."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One training photograph beside the model's render."""
+
+    name: str
+    psnr: float
+    """At the exposure that was learnt for it, if any, dB."""
+    gains: tuple[float, float, float] | None
+    """Stops by which each channel is brighter than the render at the model's own exposure; None: nothing tells."""
+    shift: tuple[float, float] | None
+    """Px to the right and down by which it lies beside the render; None: nothing tells."""
+    concentrated: float
+    """Share of its squared error in the FEW squares with the most."""
+    sharpness: float | None
+    """Its fineness by that of its neighbours (`gsx.core.quality.sharpness`); None: not told."""
+    masked: float
+    """Share of its pixels that count in nothing."""
+    remarks: list[str] = field(default_factory=list)
+    """What is wrong, and what was done or can be done about it."""
+
+    @property
+    def moved(self) -> float:
+        """Length of the shift, px; 0 where none is told."""
+        return math.hypot(*self.shift) if self.shift else 0.0
+
+    @property
+    def stops(self) -> float:
+        """Mean of its gains; 0 where none are told."""
+        return sum(self.gains) / 3 if self.gains else 0.0
+
+
+# -- one photograph ----------------------------------------------------------------------------------------------------
+
+
+def gains_of(
+    render: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+) -> tuple[float, float, float] | None:
+    """Stops by which each channel of a photograph is brighter; None where too few pixels tell."""
+    red, green, blue = (log_gains(render, photograph, counted) / math.log(2)).tolist()
+    return (red, green, blue) if math.isfinite(red + green + blue) else None
+
+
+def shift_of(
+    render: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+) -> tuple[float, float] | None:
+    """Px to the right and down by which a photograph lies beside a render; None where nothing tells.
+
+    The translation that explains their difference best, beside a gain and an offset: by least squares on slopes of the
+    render, moved there again and again (Lucas and Kanade 1981), in which pixels that differ by more than the usual
+    count little.
+    """
+    still, shown = grey(render), grey(photograph)
+    inside = torch.ones_like(still, dtype=torch.bool) if counted is None else counted.to(still.device)
+    shift, first, error = still.new_zeros(2), math.inf, math.inf
+    told = inside & interior(still, 0)
+    residual = shown - still * (shown[told].median() / still[told].median().clamp_min(1e-6)) if told.any() else still
+    for number in range(ROUNDS):
+        moved = translated(still, shift)
+        told = inside & interior(still, float(shift.abs().max()))
+        columns = torch.stack([central(moved, 1), central(moved, 0), moved, torch.ones_like(moved)])[:, told]
+        fit = least_squares(columns, shown[told], robust(residual[told]))
+        if fit is None:
+            return None
+        residual = shown - fit[2] * moved - fit[3]
+        error = float(residual[told].abs().median())
+        first = error if number == 0 else first
+        shift = shift - fit[:2] / fit[2]
+        if not bool(shift.abs().max() < min(still.shape) / 4):
+            return None
+    return (float(shift[0]), float(shift[1])) if error <= first else (0.0, 0.0)
+
+
+def robust(residual: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+    """Weights of pixels: less than half for a residual beyond the median of all (Cauchy)."""
+    return 1 / (1 + (residual / (residual.abs().median() + 1e-4)).square())
+
+
+def grey(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
+    """Mean of the channels, a little smoothed: slopes then hold over a pixel or two."""
+    return avg_pool2d(image.double().mean(0)[None], 3, stride=1, padding=1, count_include_pad=False)[0]
+
+
+def translated(image: Float[Tensor, "H W"], shift: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:
+    """The image moved by so many px to the right and down."""
+    height, width = image.shape
+    y, x = torch.meshgrid(*(torch.arange(n, device=image.device).double() + 0.5 for n in image.shape), indexing="ij")
+    places = torch.stack([2 * (x - shift[0]) / width - 1, 2 * (y - shift[1]) / height - 1], -1)
+    return grid_sample(image[None, None], places[None], mode="bicubic", padding_mode="border", align_corners=False)[
+        0, 0
+    ]
+
+
+def central(image: Float[Tensor, "H W"], axis: int) -> Float[Tensor, "H W"]:
+    """Central differences along an axis."""
+    return (image.roll(-1, axis) - image.roll(1, axis)) / 2
+
+
+def interior(image: Float[Tensor, "H W"], shift: float) -> Bool[Tensor, "H W"]:
+    """Pixels that are not near a border."""
+    edge = BORDER + math.ceil(shift)
+    out = torch.zeros_like(image, dtype=torch.bool)
+    out[edge : image.shape[0] - edge, edge : image.shape[1] - edge] = True
+    return out
+
+
+def least_squares(
+    columns: Float[Tensor, "C P"], wanted: Float[Tensor, "P"], weights: Float[Tensor, "P"]
+) -> Float[Tensor, "C"] | None:
+    """The factors that bring the sum of columns closest to what is wanted; None where the columns cannot tell them."""
+    if columns.shape[1] < LEAST:
+        return None
+    scale = columns.square().mean(1).sqrt()
+    if not bool((scale > 1e-6).all()):
+        return None
+    unit = columns / scale[:, None]
+    system = (unit * weights) @ unit.T / weights.sum()
+    if not bool(torch.linalg.eigvalsh(system)[0] > TELLING):
+        return None
+    return torch.linalg.solve(system, (unit * weights) @ wanted / weights.sum()) / scale
+
+
+def concentrated(error: Float[Tensor, "H W"]) -> float:
+    """Share of squared errors in the FEW squares of CELL px that have the most."""
+    cells = avg_pool2d(error[None], CELL, ceil_mode=True, count_include_pad=False)[0].flatten()
+    most = cells.topk(max(1, round(FEW * len(cells)))).values.sum()
+    return float(most / cells.sum().clamp_min(1e-30))
+
+
+# -- all of them -------------------------------------------------------------------------------------------------------
+
+
+def remarks_on(findings: Sequence[Finding], learnt: bool) -> list[list[str]]:
+    """What is wrong with each, against the others; `learnt`: each has an exposure of its own in training."""
+    usual_stops = median(f.stops for f in findings)
+    usual_shift, usual_part = (median(of) for of in zip(*((f.moved, f.concentrated) for f in findings), strict=True))
+    worse_than = median(f.psnr for f in findings)
+    return [
+        [
+            *exposure_remarks(one, one.stops - usual_stops, learnt),
+            *shift_remarks(one, usual_shift),
+            *blur_remarks(one),
+            *part_remarks(one, usual_part, worse_than),
+            *([f"{one.masked:.0%} of it is masked"] if one.masked else []),
+        ]
+        for one in findings
+    ]
+
+
+def exposure_remarks(one: Finding, stops: float, learnt: bool) -> list[str]:
+    """Of a photograph that is brighter than the middle one by so many stops, or differs in its balance of colours."""
+    if one.gains is None:
+        return []
+    done = "its exposure was learnt" if learnt else "training.exposure.when=auto learns exposures"
+    balance = max(one.gains) - min(one.gains)
+    out = []
+    if abs(stops) > UNEVEN:
+        out.append(f"{abs(stops):.2f} stops {'brighter' if stops > 0 else 'darker'} than the others: {done}")
+    if balance > UNEVEN:
+        out.append(f"its colours are balanced otherwise, channels by up to {balance:.2f} stops: {done}")
+    return out
+
+
+def shift_remarks(one: Finding, usual: float) -> list[str]:
+    """Of a photograph that lies beside the render."""
+    if one.shift is None or one.moved < SHIFTED or one.moved < TIMES * usual:
+        return []
+    x, y = one.shift
+    return [f"it lies {one.moved:.1f} px beside the model's render ({x:+.1f} across, {y:+.1f} down): look at its pose"]
+
+
+def blur_remarks(one: Finding) -> list[str]:
+    """Of a blurred photograph."""
+    if one.sharpness is None or one.sharpness >= BLURRED:
+        return []
+    return [f"it has {one.sharpness:.2f} of its neighbours' fine contrast: blurred, leave it out or take it again"]
+
+
+def part_remarks(one: Finding, usual: float, worse_than: float) -> list[str]:
+    """Of a photograph with an error in one place."""
+    if one.concentrated < max(ELSEWHERE, MORE * usual) or one.psnr > worse_than:
+        return []
+    return [
+        f"{one.concentrated:.0%} of its error lies in {FEW:.0%} of it: if only this photograph shows what is there, "
+        "mask it (masks/)"
+    ]

@@ -1,0 +1,128 @@
+"""`gsx photographs RUN`: training photographs by how badly the model shows them, and what is wrong with them."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.masks import blacked
+from gsx.core.data.photo_source import PhotoSource
+from gsx.core.data.scene import View
+from gsx.core.files import write_json
+from gsx.core.plugins import Plugins
+from gsx.core.quality.metrics import psnr
+from gsx.core.quality.sharpness import sharpness
+from gsx.core.shapes import Float
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
+from gsx.experiments.reports.pictures import Pictures, error_map, file_names, forget, reduced
+from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder.claims import claimed
+from gsx.experiments.runs.open import as_trained, open_run, refuse_other
+from gsx.experiments.runs.progress import Countdown
+from gsx.experiments.runs.rasterizer_path import warm
+
+logger = logging.getLogger(__name__)
+
+FOLDER = "photographs"
+"""Of the run's, with index.json and pictures of the worst."""
+
+
+def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
+    """Findings on all training photographs of a run, worst first; its folder keeps them, with pictures of so many, and
+    its report shows them.
+
+    Raises:
+        ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.
+        CheckpointError: there is no usable checkpoint.
+    """
+    refuse_other(folder)
+    with claimed(folder):
+        run, settings = open_run(folder, plugins, overrides)
+        run.raster = as_trained(run)
+        warm(run.raster, run.device)
+        findings = findings_of(run, settings.evaluation.tile_pixels)
+        write_findings(run, findings, worst, settings.evaluation.tile_pixels)
+        write_report(folder)
+    return findings
+
+
+def findings_of(run: Run, pixels: int) -> list[Finding]:
+    """Of every training photograph, worst first."""
+    views = run.scene.train
+    progress, known = Countdown("looking at photographs", len(views)), sharpness_of(views)
+    found = []
+    for view in views:
+        found.append(finding(run, view, known.get(view.name), pixels))
+        progress.advance(1, view.name)
+    told = remarks_on(found, run.exposures.matrices is not None)
+    return sorted((replace(one, remarks=said) for one, said in zip(found, told, strict=True)), key=lambda one: one.psnr)
+
+
+def sharpness_of(views: Sequence[View]) -> dict[str, float]:
+    """Fineness against neighbours by name, of views that are photographs."""
+    files = {view.source.path: view.name for view in views if isinstance(view.source, PhotoSource)}
+    return {files[path]: ratio for path, ratio in sharpness(sorted(files)).items()}
+
+
+@torch.no_grad()
+def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) -> Finding:
+    """One photograph beside the render; without remarks."""
+    own, counted = render(run, view.camera, pixels).image, view.counted()
+    photograph = view.image().to(own.device)
+    shown = at_exposure(run, view, own)
+    error = blacked(shown - photograph, counted).square().mean(0)
+    return Finding(
+        name=view.name,
+        psnr=psnr(shown, photograph, counted),
+        gains=gains_of(own, photograph, counted),
+        shift=shift_of(shown, photograph, counted),
+        concentrated=concentrated(error),
+        sharpness=known_sharpness,
+        masked=0.0 if counted is None else 1 - float(counted.float().mean()),
+    )
+
+
+def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """A render at the exposure that was learnt for its photograph, if any."""
+    return run.exposures.applied(image, view.name).clamp(0, 1)
+
+
+def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: int) -> None:
+    """index.json with all findings, and pictures of the worst."""
+    place = Pictures(run.folder / FOLDER, run.step)
+    place.folder.mkdir(parents=True, exist_ok=True)
+    forget(place.folder)
+    views, shown = {view.name: view for view in run.scene.train}, findings[:worst]
+    entries: list[dict[str, Any]] = [asdict(one) for one in findings]
+    for entry, name in zip(entries, file_names([one.name for one in shown]), strict=False):
+        view = views[entry["name"]]
+        entry["files"] = draw(run, view, place, name, pixels)
+        entry["size"] = list(view.camera.size)
+    summary = {"step": run.step, "median_psnr": median(one.psnr for one in findings)}
+    write_json(place.folder / "index.json", summary | {"views": entries})
+
+
+@torch.no_grad()
+def draw(run: Run, view: View, place: Pictures, name: str, pixels: int) -> dict[str, str]:
+    """Photograph, render and error; their files by kind."""
+    image, truth = at_exposure(run, view, render(run, view.camera, pixels).image).cpu(), view.image()
+    error = error_map(*(blacked(picture, view.counted()) for picture in (image, truth)))
+    pictures = {"truth": truth, "render": image, "error": error}
+    return {kind: place.save(f"{name}.{kind}", reduced(picture)) for kind, picture in pictures.items()}
+
+
+def lines(findings: Sequence[Finding], worst: int) -> list[str]:
+    """What is told on the terminal."""
+    wrong = [one for one in findings if one.remarks]
+    middle = median(one.psnr for one in findings)
+    told = [f"{len(findings)} training photographs, in the middle {middle:.2f} dB; {len(wrong)} with something to say:"]
+    told = told if wrong else [f"{told[0].partition(';')[0]}; none stands out"]
+    out = told + [f"{one.name}  {one.psnr:.2f} dB  {'; '.join(one.remarks)}" for one in wrong[:worst]]
+    return out + ([f"and {len(wrong) - worst} more in {FOLDER}/index.json"] if len(wrong) > worst else [])

@@ -1,0 +1,183 @@
+"""Training photographs beside the model: shifts, gains and parts that are known, and what is said of them."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import tiny_run
+from torch import Tensor
+
+from gsx.cli.dispatch import main
+from gsx.core.data.camera import Camera
+from gsx.core.data.resize import to_uint8
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
+from gsx.experiments.runs.photographs import findings_of, lines
+
+PIXELS = 1 << 20
+
+
+def waves(across: float = 0.0, down: float = 0.0) -> Tensor:
+    """A smooth picture of 80 x 60 px, as it looks when it has moved by so many px."""
+    x, y = torch.arange(80.0)[None] - across, torch.arange(60.0)[:, None] - down
+    grey = 0.5 + 0.15 * (0.35 * x + 0.1 * y).sin() + 0.1 * (0.2 * x - 0.4 * y).sin() + 0.1 * (0.07 * x * 1.0).cos()
+    return torch.stack([grey, 0.9 * grey, 0.8 * grey])
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (1.3, -0.7), (-2.5, 0.4)])
+def test_a_shift_is_found_whatever_the_exposure(shift: tuple[float, float]) -> None:
+    """To the accuracy of the interpolation between pixels."""
+    found = shift_of(waves(), 0.6 * waves(*shift) + 0.05, None)
+    assert found == pytest.approx(shift, abs=0.06)
+
+
+def test_a_shift_is_told_by_what_counts_and_hardly_by_what_stands_before_it() -> None:
+    photograph, counted = waves(1.0, 0.5), torch.ones(60, 80, dtype=torch.bool)
+    photograph[:, 20:32, 30:44] = 1.0
+    assert shift_of(waves(), photograph, None) == pytest.approx((1.0, 0.5), abs=0.15)
+    photograph[:, :, :40] = waves(-2.0, -2.0)[:, :, :40]
+    counted[:, :45] = False
+    assert shift_of(waves(), photograph, counted) == pytest.approx((1.0, 0.5), abs=0.03)
+
+
+def test_a_plain_picture_a_stripe_and_a_small_one_tell_no_shift() -> None:
+    stripes = (0.4 * torch.arange(80.0)).sin().expand(3, 60, 80) / 2 + 0.5
+    for picture in (torch.full((3, 60, 80), 0.5), stripes, waves()[:, :9, :9]):
+        assert shift_of(picture, picture, None) is None
+
+
+def test_gains_are_stops_of_each_channel() -> None:
+    image = 0.2 + 0.3 * torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
+    photograph = image * torch.tensor([2.0, 1.0, 0.5])[:, None, None]
+    photograph[:, :5] = 0.0
+    assert gains_of(image, photograph, None) == pytest.approx((0.5 * 2, 0, -1), abs=1e-5)
+    assert gains_of(image, torch.zeros_like(image), None) is None
+
+
+def test_how_much_of_the_error_lies_in_few_squares() -> None:
+    """64 squares, of which 3 are counted: one of error 1, all others of 0.1."""
+    error = torch.full((64, 64), 0.1)
+    error[8:16, 24:32] = 1.0
+    assert concentrated(error) == pytest.approx((1 + 2 * 0.1) / (1 + 63 * 0.1))
+    assert concentrated(torch.zeros(64, 64)) == 0
+
+
+def finding(name: str, psnr: float = 30.0, stops: float = 0.0, **more: object) -> Finding:
+    """One of the ordinary kind, but for `more`."""
+    ordinary = {"shift": (0.05, 0.0), "concentrated": 0.3, "sharpness": 1.0, "masked": 0.0}
+    return Finding(**{"name": name, "psnr": psnr, "gains": (stops, stops, stops), **ordinary, **more})
+
+
+def test_what_is_said_of_photographs_against_the_others() -> None:
+    findings = [
+        *(finding(f"ordinary{i}", stops=0.1) for i in range(6)),
+        finding("dark", stops=-0.4),
+        finding("warm", gains=(0.4, 0.1, -0.2)),
+        finding("moved", shift=(1.5, -2.0)),
+        finding("blurred", sharpness=0.4),
+        finding("passer-by", psnr=25.0, concentrated=0.8),
+        finding("good, with a highlight", psnr=35.0, concentrated=0.8),
+        finding("masked", masked=0.25, gains=None, shift=None, sharpness=None),
+    ]
+    said = {one.name: told for one, told in zip(findings, remarks_on(findings, learnt=False), strict=True)}
+    assert [name for name, told in said.items() if told] == ["dark", "warm", "moved", "blurred", "passer-by", "masked"]
+    assert said["dark"] == ["0.50 stops darker than the others: training.exposure.when=auto learns exposures"]
+    assert said["warm"][0].startswith("its colours are balanced otherwise, channels by up to 0.60 stops")
+    assert said["moved"][0].startswith("it lies 2.5 px beside the model's render (+1.5 across, -2.0 down)")
+    assert "0.40 of its neighbours' fine contrast" in said["blurred"][0]
+    assert said["passer-by"][0].startswith("80% of its error lies in 5% of it")
+    assert said["masked"] == ["25% of it is masked"]
+    learnt = remarks_on(findings, learnt=True)[6]
+    assert learnt == ["0.50 stops darker than the others: its exposure was learnt"]
+
+
+def test_where_all_poses_are_a_little_off_none_is_named() -> None:
+    findings = [finding(str(i), shift=(0.8 * math.cos(i), 0.8 * math.sin(i))) for i in range(9)]
+    assert not any(remarks_on(findings, learnt=False))
+
+
+# -- of a run ----------------------------------------------------------------------------------------------------------
+
+
+class Taken:
+    """A photograph that was taken already."""
+
+    def __init__(self, picture: Tensor) -> None:
+        self.picture = to_uint8(picture)
+
+    def image(self, camera: Camera) -> Tensor:
+        return self.picture
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    """A tiny run that is finished."""
+    return tiny_run(tmp_path_factory.mktemp("photographs") / "run", ["iterations=3", "scene.train_views=8"])
+
+
+def test_the_photographs_that_a_model_did_not_take_are_named(run: Run) -> None:
+    """All are what the model shows, but for three: at half the light, 2 px to the right, with something white in it."""
+    pictures, views = {}, run.scene.train
+    for number, view in enumerate(views):
+        moved = replace(view.camera, cx=view.camera.cx + 2) if number == 3 else view.camera
+        pictures[view.name] = render(run, moved, PIXELS).image.detach().clamp(0, 1) * (0.5 if number == 1 else 1)
+    pictures[views[5].name][:, 8:16, 16:24] = 1.0
+    scene = run.scene
+    run.scene = replace(scene, train=[replace(view, source=Taken(pictures[view.name])) for view in views])
+    try:
+        found = {one.name: one for one in findings_of(run, PIXELS)}
+    finally:
+        run.scene = scene
+    dark, moved, covered = (found[views[number].name] for number in (1, 3, 5))
+    assert {name for name, one in found.items() if one.remarks} == {dark.name, moved.name, covered.name}
+    assert dark.gains == pytest.approx((-1, -1, -1), abs=0.05)
+    assert moved.shift == pytest.approx((2, 0), abs=0.1)
+    assert (dark.remarks[0][:24], moved.remarks[0][:16]) == ("1.00 stops darker than t", "it lies 2.0 px b")
+    assert "of its error lies in" in covered.remarks[0]
+    assert covered.concentrated > 0.95
+    names = [one.name for one in found.values()]
+    assert set(names[:3]) == {dark.name, moved.name, covered.name}
+
+
+def test_findings_lie_in_the_run_and_in_its_report(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run.folder / "report.html").read_text()
+    assert f"gsx photographs {run.folder}" in before
+    assert main(["photographs", str(run.folder), "--worst", "2"]) == 0
+    assert capsys.readouterr().out.strip() == str(run.folder / "report.html")
+    index = json.loads((run.folder / "photographs" / "index.json").read_text())
+    assert sorted(entry["name"] for entry in index["views"]) == sorted(view.name for view in run.scene.train)
+    figures = [entry["psnr"] for entry in index["views"]]
+    assert figures == sorted(figures)
+    assert ["files" in entry for entry in index["views"]] == [True, True] + [False] * 6
+    report = (run.folder / "report.html").read_text()
+    assert "8 photographs beside what the model shows" in report
+    assert report.count('alt="truth of ' + index["views"][0]["name"]) == 1
+    assert "looks again" not in report
+    drawn = sorted(path.name for path in (run.folder / "photographs").iterdir())
+    assert len(drawn) == 1 + 2 * 3
+    assert main(["photographs", str(run.folder), "--worst", "1"]) == 0
+    assert len(list((run.folder / "photographs").iterdir())) == 1 + 3
+
+
+def test_lines_on_the_terminal() -> None:
+    assert lines([finding("a"), finding("b", psnr=31.0)], 10) == [
+        "2 training photographs, in the middle 30.50 dB; none stands out"
+    ]
+    wrong = [replace(finding(name), remarks=["is odd", "and old"]) for name in "abc"]
+    assert lines(wrong, 2) == [
+        "3 training photographs, in the middle 30.00 dB; 3 with something to say:",
+        *(f"{name}  30.00 dB  is odd; and old" for name in "ab"),
+        "and 1 more in photographs/index.json",
+    ]
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    assert main(["photographs", str(tmp_path)]) == 2
+    assert main(["photographs", str(tmp_path), "--worst", "0"]) == 2
