@@ -113,8 +113,7 @@ def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[
     steps, (word, _) = round(given.share * steps_among(SUBJECTS[scene])), FAULTS[fault]
     disturbances = [word, f"scene.disturb.some={FEW}"] if word else []
     folder = trained(scene, seed, given, [*OWN, *disturbances, f"iterations={steps}"], f"fault {fault}")
-    if not (folder / "photographs" / "index.json").is_file():
-        judge_photographs(folder, plugins(), worst=10)
+    judge_photographs(folder, plugins(), worst=10)
     found = read_json(folder / "photographs" / "index.json")["views"]
     bad = chosen([view["name"] for view in found], FEW) if word else set()
     by_name = {view["name"]: view["remarks"] for view in found}

@@ -57,9 +57,12 @@ Row = dict[str, Any]
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/zoom_truth")
-    parser.add_argument("--share", type=float, default=1.0, help="of the steps of benchmarks/zoom.py")
+    parser.add_argument("--share", type=float, default=0.4, help="of the steps of benchmarks/zoom.py (0.4)")
     parser.add_argument("--rows", default="", help="of the experiment, by commas; none given: all")
-    return parser.parse_args(words)
+    given = parser.parse_args(words)
+    if not 0 < given.share <= 1 / MORE:
+        sys.exit(f"--share {given.share:g}: give more than 0 and at most {1 / MORE:g} ({MORE_STEPS})")
+    return given
 
 
 # -- one seed ----------------------------------------------------------------------------------------------------------
@@ -123,7 +126,7 @@ def read_rows(folder: Path) -> list[Row]:
 def section_of_runs(rows: list[Row], stamp: Sequence[Any]) -> Section:
     """Every seed by itself."""
     keys = ["share", "scene", "name", "seed", *FIGURES.values(), "commit"]
-    note = "One seed a line; `commit`: of the revision that trained it. s: of training, branches counted whole."
+    note = "One seed a line; `commit`: of the revision that measured it. s: of training, branches counted whole."
     return stamped("What helps when looking closer, seed by seed", [[key, key] for key in keys], rows, [note], *stamp)
 
 
@@ -136,7 +139,8 @@ def table(rows: Sequence[Row], stamp: Sequence[Any]) -> Section:
     columns += [[f"more_{key}", f"{key} - {BASE}"] for key in COMPARED]
     note = (
         "PSNR on held-out views and explained detail above the training Nyquist frequency, means over the seeds that "
-        "were measured ± half their range; differences seed by seed. s: of training, branches counted whole."
+        "were measured ± half their range, blank where a seed lacks the figure; differences seed by seed. s: of "
+        "training, branches counted whole."
     )
     names = list(dict.fromkeys((row["share"], row["scene"], row["name"]) for row in rows))
     by_seed = {place_of(row): row for row in rows}
@@ -150,7 +154,8 @@ def line_of(share: str, scene: str, name: str, by_seed: dict[tuple[Any, ...], Ro
     own = [by_seed[share, scene, name, seed] for seed in seeds]
     line: Row = {"share": share, "scene": scene, "name": name, "seeds": len(seeds)}
     for key in FIGURES.values():
-        line[key] = spread_text([float(row[key]) for row in own if key in row], FORMS.get(key, ".2f"))
+        known = [float(row[key]) for row in own if key in row]
+        line[key] = spread_text(known if len(known) == len(own) else [], FORMS.get(key, ".2f"))
     pairs = [(row, by_seed[place]) for row in own if (place := (share, scene, BASE, row["seed"])) in by_seed]
     for key in COMPARED if name not in (BASE, MORE_STEPS) else ():
         gains = [float(row[key]) - float(base[key]) for row, base in pairs if key in row and key in base]

@@ -416,6 +416,18 @@ def test_figures_of_the_experiment_are_read_from_its_table() -> None:
     assert zoom_truth.figures([line, *more]) == {"zoom": {"x4": "25.500"}}
 
 
+def test_bad_photographs_are_counted_over_seeds() -> None:
+    import captures
+
+    found = [
+        {"bad": 5, "good": 45, "found": 4, "wrongly": 1, "shift": 0.02},
+        {"bad": 5, "good": 45, "found": 5, "wrongly": 0, "shift": 0.04},
+    ]
+    row = captures.fault_row("fox", "pose", found)
+    assert (row["found"], row["others"], row["shift"]) == ("9 of 10", "1 of 90", "0.03 ± 0.01")
+    assert "found" not in captures.fault_row("fox", "none", [found[0] | {"bad": 0, "found": 0}])
+
+
 # -- whole commands ------------------------------------------------------------------------------------------------
 
 TINY = ["scene.width=32", "scene.height=24", "scene.points=50", "scene.train_views=2", "scene.test_views=1"]

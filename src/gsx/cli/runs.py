@@ -58,6 +58,8 @@ def verb_photographs(arguments: list[str]) -> int:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
     parser.add_argument("--worst", type=positive(int), default=10, help="photographs that are shown (10)")
+    if not arguments and Path("photographs").is_dir():
+        raise InputError("gsx photographs RUN judges a run's photographs: to train from that folder, gsx ./photographs")
     given = parser.parse_intermixed_args(arguments)
     from gsx.experiments.runs.photographs import judge_photographs, lines
 

@@ -16,7 +16,9 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
-from gsx.experiments.runs.photographs import findings_of, lines
+from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder.files import read_run, state_of
+from gsx.experiments.runs.photographs import different, findings_of, lines
 
 PIXELS = 1 << 20
 
@@ -62,8 +64,11 @@ def test_how_much_of_the_error_lies_in_few_squares() -> None:
     """64 squares, of which 3 are counted: one of error 1, all others of 0.1."""
     error = torch.full((64, 64), 0.1)
     error[8:16, 24:32] = 1.0
-    assert concentrated(error) == pytest.approx((1 + 2 * 0.1) / (1 + 63 * 0.1))
-    assert concentrated(torch.zeros(64, 64)) == 0
+    assert concentrated(error, None) == pytest.approx((1 + 2 * 0.1) / (1 + 63 * 0.1))
+    assert concentrated(torch.zeros(64, 64), None) == 0
+    counted = torch.zeros(64, 64, dtype=torch.bool)
+    counted[:32, :40] = True  # 20 squares, of which one is counted
+    assert concentrated(error * counted, counted) == pytest.approx(1 / (1 + 19 * 0.1))
 
 
 def finding(name: str, psnr: float = 30.0, stops: float = 0.0, **more: object) -> Finding:
@@ -81,23 +86,22 @@ def test_what_is_said_of_photographs_against_the_others() -> None:
         finding("blurred", sharpness=0.4),
         finding("passer-by", psnr=25.0, concentrated=0.8),
         finding("good, with a highlight", psnr=35.0, concentrated=0.8),
-        finding("masked", masked=0.25, gains=None, shift=None, sharpness=None),
+        *(finding(f"untold{i}", masked=0.25, gains=None, shift=None, sharpness=None) for i in range(20)),
     ]
-    said = {one.name: told for one, told in zip(findings, remarks_on(findings, learnt=False), strict=True)}
-    assert [name for name, told in said.items() if told] == ["dark", "warm", "moved", "blurred", "passer-by", "masked"]
+    said = {one.name: told for one, told in zip(findings, remarks_on(findings, "never", False), strict=True)}
+    assert [name for name, told in said.items() if told] == ["dark", "warm", "moved", "blurred", "passer-by"]
     assert said["dark"] == ["0.50 stops darker than the others: training.exposure.when=auto learns exposures"]
     assert said["warm"][0].startswith("its colours are balanced otherwise, channels by up to 0.60 stops")
     assert said["moved"][0].startswith("it lies 2.5 px beside the model's render (+1.5 across, -2.0 down)")
     assert "0.40 of its neighbours' fine contrast" in said["blurred"][0]
     assert said["passer-by"][0].startswith("80% of its error lies in 5% of it")
-    assert said["masked"] == ["25% of it is masked"]
-    learnt = remarks_on(findings, learnt=True)[6]
-    assert learnt == ["0.50 stops darker than the others: its exposure was learnt"]
+    assert remarks_on(findings, "auto", True)[6] == ["0.50 stops darker than the others: its exposure was learnt"]
+    assert remarks_on(findings, "auto", False)[6][0].endswith("training.exposure.when=always learns exposures")
 
 
 def test_where_all_poses_are_a_little_off_none_is_named() -> None:
     findings = [finding(str(i), shift=(0.8 * math.cos(i), 0.8 * math.sin(i))) for i in range(9)]
-    assert not any(remarks_on(findings, learnt=False))
+    assert not any(remarks_on(findings, "never", False))
 
 
 # -- of a run ----------------------------------------------------------------------------------------------------------
@@ -164,20 +168,52 @@ def test_findings_lie_in_the_run_and_in_its_report(run: Run, capsys: pytest.Capt
     assert len(drawn) == 1 + 2 * 3
     assert main(["photographs", str(run.folder), "--worst", "1"]) == 0
     assert len(list((run.folder / "photographs").iterdir())) == 1 + 3
+    index["step"] = 2
+    (run.folder / "photographs" / "index.json").write_text(json.dumps(index))
+    assert "looks again" in write_report(run.folder).read_text()
+
+
+def test_a_damaged_index_is_told_and_makes_no_run_unfinished(run: Run) -> None:
+    path = run.folder / "photographs" / "index.json"
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
+    before = read_run(run.folder)
+    for content in ('{"views": 3}', '{"views": [{"name": 1}]}', "{"):
+        path.write_text(content)
+        files = read_run(run.folder)
+        assert (files.photographs, list(files.problems)) == ({}, ["photographs/index.json"])
+        assert (files.unfinished, state_of(files)) == (before.unfinished, state_of(before))
+    path.write_text('{"step": 3, "median_psnr": null, "views": [{"name": "a", "psnr": null, "remarks": []}]}')
+    assert "1 photographs beside" in write_report(run.folder).read_text()
+
+
+def test_views_that_several_steps_show_are_looked_at_once(run: Run) -> None:
+    views = run.scene.train
+    assert different([*views, *views]) == list(views)
 
 
 def test_lines_on_the_terminal() -> None:
     assert lines([finding("a"), finding("b", psnr=31.0)], 10) == [
-        "2 training photographs, in the middle 30.50 dB; none stands out"
+        "training photographs: 2, median 30.50 dB; standing out: 0"
     ]
     wrong = [replace(finding(name), remarks=["is odd", "and old"]) for name in "abc"]
     assert lines(wrong, 2) == [
-        "3 training photographs, in the middle 30.00 dB; 3 with something to say:",
+        "training photographs: 3, median 30.00 dB; standing out: 3",
         *(f"{name}  30.00 dB  is odd; and old" for name in "ab"),
         "and 1 more in photographs/index.json",
     ]
 
 
-def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
-    assert main(["photographs", str(tmp_path)]) == 2
-    assert main(["photographs", str(tmp_path), "--worst", "0"]) == 2
+def test_mistakes_are_named(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photographs").mkdir()
+    for words, told in (
+        ([str(tmp_path)], "is no run folder"),
+        ([str(run.folder), "--worst", "0"], "'0' is no whole number of 1 or more"),
+        ([str(run.folder), "scene.nothing=1"], "'scene.nothing' is no key of"),
+        ([], "to train from that folder, gsx ./photographs"),
+    ):
+        assert main(["photographs", *words]) == 2
+        assert told in capsys.readouterr().err

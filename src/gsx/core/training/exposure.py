@@ -127,12 +127,13 @@ class Exposures:
         self.moments, self.visits = torch.zeros(2, *matrices.shape, device=self.device), torch.zeros(len(matrices))
 
     def applied(self, image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
-        """The render as the photograph of that name would have it."""
+        """The render as the photograph of that name would have it, on the device that learns; as it is where there are
+        no exposures."""
         if self.matrices is None:
             return image
         index = self.names.index(name)
         self.shown.add(index)
-        return transformed(image, self.matrices[index])
+        return transformed(image.to(self.device), self.matrices[index])
 
     def rate(self, number: int) -> float:
         """Of step `number`."""

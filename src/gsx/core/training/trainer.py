@@ -66,7 +66,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
 def judge_exposures(run: Run) -> dict[str, float]:
     """Whether training photographs have exposures of their own, from what the model shows in their places; for the
     line of the step."""
-    pairs = ((render(run, view.camera).image, view.image().to(run.device), view.counted()) for view in run.scene.train)
+    pairs = ((render(run, view.camera).image, view.image(), view.counted()) for view in run.scene.train)
     begun = time.perf_counter()
     spread = run.exposures.judge(pairs)
     learnt = run.exposures.matrices is not None

@@ -29,6 +29,8 @@ ROUNDS = 8
 """Of the search for a shift."""
 BORDER = 4
 """Px at the borders that say nothing of it, beside the shift itself."""
+ALIKE = 1e-3
+"""Differences of display values below it, a quarter of what eight bits tell, are none."""
 LEAST = 64
 """Pixels that tell it."""
 TELLING = 1e-5
@@ -56,14 +58,14 @@ class Finding:
     """What is wrong, and what was done or can be done about it."""
 
     @property
-    def moved(self) -> float:
-        """Length of the shift, px; 0 where none is told."""
-        return math.hypot(*self.shift) if self.shift else 0.0
+    def moved(self) -> float | None:
+        """Length of the shift, px."""
+        return math.hypot(*self.shift) if self.shift else None
 
     @property
-    def stops(self) -> float:
-        """Mean of its gains; 0 where none are told."""
-        return sum(self.gains) / 3 if self.gains else 0.0
+    def stops(self) -> float | None:
+        """Mean of its gains."""
+        return sum(self.gains) / 3 if self.gains else None
 
 
 # -- one photograph ----------------------------------------------------------------------------------------------------
@@ -80,7 +82,8 @@ def gains_of(
 def shift_of(
     render: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
 ) -> tuple[float, float] | None:
-    """Px to the right and down by which a photograph lies beside a render; None where nothing tells.
+    """Px to the right and down by which a photograph lies beside a render; None where nothing tells, or what is found
+    explains no more than no shift does.
 
     The translation that explains their difference best, beside a gain and an offset: by least squares on slopes of the
     render, moved there again and again (Lucas and Kanade 1981), in which pixels that differ by more than the usual
@@ -104,7 +107,7 @@ def shift_of(
         shift = shift - fit[:2] / fit[2]
         if not bool(shift.abs().max() < min(still.shape) / 4):
             return None
-    return (float(shift[0]), float(shift[1])) if error <= first else (0.0, 0.0)
+    return (float(shift[0]), float(shift[1])) if error <= first + ALIKE else None
 
 
 def robust(residual: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
@@ -156,9 +159,11 @@ def least_squares(
     return torch.linalg.solve(system, (unit * weights) @ wanted / weights.sum()) / scale
 
 
-def concentrated(error: Float[Tensor, "H W"]) -> float:
-    """Share of squared errors in the FEW squares of CELL px that have the most."""
+def concentrated(error: Float[Tensor, "H W"], counted: Bool[Tensor, "H W"] | None) -> float:
+    """Share of squared errors in the FEW squares of CELL px that have the most, of those in which any pixel counts."""
     cells = avg_pool2d(error[None], CELL, ceil_mode=True, count_include_pad=False)[0].flatten()
+    if counted is not None:
+        cells = cells[avg_pool2d(counted.to(error)[None], CELL, ceil_mode=True)[0].flatten() > 0]
     most = cells.topk(max(1, round(FEW * len(cells)))).values.sum()
     return float(most / cells.sum().clamp_min(1e-30))
 
@@ -166,29 +171,37 @@ def concentrated(error: Float[Tensor, "H W"]) -> float:
 # -- all of them -------------------------------------------------------------------------------------------------------
 
 
-def remarks_on(findings: Sequence[Finding], learnt: bool) -> list[list[str]]:
-    """What is wrong with each, against the others; `learnt`: each has an exposure of its own in training."""
-    usual_stops = median(f.stops for f in findings)
-    usual_shift, usual_part = (median(of) for of in zip(*((f.moved, f.concentrated) for f in findings), strict=True))
-    worse_than = median(f.psnr for f in findings)
+def remarks_on(findings: Sequence[Finding], exposures: str, learnt: bool) -> list[list[str]]:
+    """What is wrong with each, against the others; `exposures`: training.exposure.when; `learnt`: whether each has its
+    own."""
+    stops, shift, part, usual_psnr = (
+        usual(of) for of in zip(*((f.stops, f.moved, f.concentrated, f.psnr) for f in findings), strict=True)
+    )
+    remedy = f"training.exposure.when={'auto' if exposures == 'never' else 'always'} learns exposures"
+    done = "its exposure was learnt" if learnt else remedy
     return [
         [
-            *exposure_remarks(one, one.stops - usual_stops, learnt),
-            *shift_remarks(one, usual_shift),
+            *exposure_remarks(one, stops, done),
+            *shift_remarks(one, shift),
             *blur_remarks(one),
-            *part_remarks(one, usual_part, worse_than),
-            *([f"{one.masked:.0%} of it is masked"] if one.masked else []),
+            *part_remarks(one, part, usual_psnr),
         ]
         for one in findings
     ]
 
 
-def exposure_remarks(one: Finding, stops: float, learnt: bool) -> list[str]:
-    """Of a photograph that is brighter than the middle one by so many stops, or differs in its balance of colours."""
-    if one.gains is None:
+def usual(values: Sequence[float | None]) -> float:
+    """Median of those that are told; 0 of none."""
+    known = [value for value in values if value is not None]
+    return median(known) if known else 0.0
+
+
+def exposure_remarks(one: Finding, middle: float, done: str) -> list[str]:
+    """Of a photograph that is brighter or darker than the middle one, or differs in its balance of colours; `done`:
+    about it."""
+    if one.gains is None or one.stops is None:
         return []
-    done = "its exposure was learnt" if learnt else "training.exposure.when=auto learns exposures"
-    balance = max(one.gains) - min(one.gains)
+    stops, balance = one.stops - middle, max(one.gains) - min(one.gains)
     out = []
     if abs(stops) > UNEVEN:
         out.append(f"{abs(stops):.2f} stops {'brighter' if stops > 0 else 'darker'} than the others: {done}")
@@ -197,9 +210,9 @@ def exposure_remarks(one: Finding, stops: float, learnt: bool) -> list[str]:
     return out
 
 
-def shift_remarks(one: Finding, usual: float) -> list[str]:
+def shift_remarks(one: Finding, usual_shift: float) -> list[str]:
     """Of a photograph that lies beside the render."""
-    if one.shift is None or one.moved < SHIFTED or one.moved < TIMES * usual:
+    if one.shift is None or one.moved is None or one.moved < max(SHIFTED, TIMES * usual_shift):
         return []
     x, y = one.shift
     return [f"it lies {one.moved:.1f} px beside the model's render ({x:+.1f} across, {y:+.1f} down): look at its pose"]
@@ -212,9 +225,9 @@ def blur_remarks(one: Finding) -> list[str]:
     return [f"it has {one.sharpness:.2f} of its neighbours' fine contrast: blurred, leave it out or take it again"]
 
 
-def part_remarks(one: Finding, usual: float, worse_than: float) -> list[str]:
-    """Of a photograph with an error in one place."""
-    if one.concentrated < max(ELSEWHERE, MORE * usual) or one.psnr > worse_than:
+def part_remarks(one: Finding, usual_part: float, usual_psnr: float) -> list[str]:
+    """Of a photograph with an error in one place, that is shown worse than the usual one."""
+    if one.concentrated < max(ELSEWHERE, MORE * usual_part) or one.psnr >= usual_psnr:
         return []
     return [
         f"{one.concentrated:.0%} of its error lies in {FEW:.0%} of it: if only this photograph shows what is there, "

@@ -29,6 +29,7 @@ from gsx.experiments.run_folder.files import (
     read_run,
     state_of,
 )
+from gsx.experiments.run_folder.heads import newest_checkpoint
 
 __all__ = ["report_on", "write_overview", "write_report"]
 
@@ -337,7 +338,7 @@ def photographs_of(run: RunFiles) -> dict[str, Any]:
     return found | {
         "worst": [view for view in worst if view["images"]],
         "wrong": [view for view in found["views"] if view["remarks"]],
-        "stale": found.get("step") != run.step,
+        "stale": found.get("step") != newest_checkpoint(run.folder),
     }
 
 

@@ -24,6 +24,8 @@ COMPACT = "compact.json"
 REPORT = "report.html"
 LOST = ("metrics.jsonl", "checkpoints/")
 """What nothing makes again of a run that is trained to its end; but from an older checkpoint, the newest."""
+ASIDE = "photographs/index.json"
+"""What is told of a run beside its results; no run needs it, and `gsx photographs` makes it again."""
 LARGEST = 1e100
 """Numbers beyond it are none that a run has, and not safe to reckon with."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
@@ -88,7 +90,7 @@ class RunFiles:
     @cached_property
     def damaged(self) -> dict[str, str]:
         """What is wrong, by file, with those that a complete run has: what is read of them, and sizes of the others."""
-        found = {name: told for name, told in self.problems.items() if name not in LOST}
+        found = {name: told for name, told in self.problems.items() if name not in (*LOST, ASIDE)}
         if self.iterations > 0 and not self.lines and "metrics.jsonl" in self.begun:
             found["metrics.jsonl"] = "metrics.jsonl holds no line of the run"
         found[SPLATS] = splats_problem(self.folder / SPLATS)
@@ -163,7 +165,7 @@ def read_run(folder: Path) -> RunFiles:
         evaluation=evaluation,
         pictures=read("renders/index.json", sound_pictures),
         pseudo=read("pseudo/index.json", lambda content: rows(content.get("views", []))),
-        photographs=read("photographs/index.json", sound_photographs),
+        photographs=read(ASIDE, sound_photographs),
         status=read("status.json", sound_step),
         problems=problems,
     )
@@ -226,10 +228,10 @@ def sound_pictures(content: dict[str, Any]) -> bool:
 def sound_photographs(content: dict[str, Any]) -> bool:
     """Whether a photographs/index.json has the form that gsx gives it."""
     views = content.get("views", [])
-    if not (sound_step(content) and rows(views) and is_number(content.get("median_psnr"))):
+    if not (sound_step(content) and rows(views)):
         return False
     told = all(isinstance(view.get("name"), str) and isinstance(view.get("remarks"), list) for view in views)
-    return told and all(is_number(view.get("psnr")) and isinstance(view.get("files", {}), dict) for view in views)
+    return told and all(isinstance(view.get("files", {}), dict) for view in views)
 
 
 def pictures_in(index: dict[str, Any]) -> list[str]:

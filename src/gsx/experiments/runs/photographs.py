@@ -55,27 +55,32 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Of every training photograph, worst first."""
-    views = run.scene.train
+    views = different(run.scene.train)
     progress, known = Countdown("looking at photographs", len(views)), sharpness_of(views)
     found = []
     for view in views:
         found.append(finding(run, view, known.get(view.name), pixels))
         progress.advance(1, view.name)
-    told = remarks_on(found, run.exposures.matrices is not None)
+    told = remarks_on(found, run.training.exposure.when, run.exposures.matrices is not None)
     return sorted((replace(one, remarks=said) for one, said in zip(found, told, strict=True)), key=lambda one: one.psnr)
 
 
+def different(views: Sequence[View]) -> list[View]:
+    """Each view once: some protocols show the same one several times."""
+    return list({view.name: view for view in views}.values())
+
+
 def sharpness_of(views: Sequence[View]) -> dict[str, float]:
-    """Fineness against neighbours by name, of views that are photographs."""
-    files = {view.source.path: view.name for view in views if isinstance(view.source, PhotoSource)}
-    return {files[path]: ratio for path, ratio in sharpness(sorted(files)).items()}
+    """Fineness against neighbours by the name of a view, of those that are photographs."""
+    files = {view.name: view.source.path for view in views if isinstance(view.source, PhotoSource)}
+    found = sharpness(sorted(set(files.values())))
+    return {name: found[path] for name, path in files.items() if path in found}
 
 
 @torch.no_grad()
 def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) -> Finding:
     """One photograph beside the render; without remarks."""
-    own, counted = render(run, view.camera, pixels).image, view.counted()
-    photograph = view.image().to(own.device)
+    own, photograph, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
     shown = at_exposure(run, view, own)
     error = blacked(shown - photograph, counted).square().mean(0)
     return Finding(
@@ -83,15 +88,15 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
         psnr=psnr(shown, photograph, counted),
         gains=gains_of(own, photograph, counted),
         shift=shift_of(shown, photograph, counted),
-        concentrated=concentrated(error),
+        concentrated=concentrated(error, counted),
         sharpness=known_sharpness,
         masked=0.0 if counted is None else 1 - float(counted.float().mean()),
     )
 
 
 def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """A render at the exposure that was learnt for its photograph, if any."""
-    return run.exposures.applied(image, view.name).clamp(0, 1)
+    """A render at the exposure that was learnt for its photograph, if any; on the CPU."""
+    return run.exposures.applied(image, view.name).clamp(0, 1).cpu()
 
 
 def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: int) -> None:
@@ -112,7 +117,7 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
 @torch.no_grad()
 def draw(run: Run, view: View, place: Pictures, name: str, pixels: int) -> dict[str, str]:
     """Photograph, render and error; their files by kind."""
-    image, truth = at_exposure(run, view, render(run, view.camera, pixels).image).cpu(), view.image()
+    image, truth = at_exposure(run, view, render(run, view.camera, pixels).image), view.image()
     error = error_map(*(blacked(picture, view.counted()) for picture in (image, truth)))
     pictures = {"truth": truth, "render": image, "error": error}
     return {kind: place.save(f"{name}.{kind}", reduced(picture)) for kind, picture in pictures.items()}
@@ -122,7 +127,6 @@ def lines(findings: Sequence[Finding], worst: int) -> list[str]:
     """What is told on the terminal."""
     wrong = [one for one in findings if one.remarks]
     middle = median(one.psnr for one in findings)
-    told = [f"{len(findings)} training photographs, in the middle {middle:.2f} dB; {len(wrong)} with something to say:"]
-    told = told if wrong else [f"{told[0].partition(';')[0]}; none stands out"]
-    out = told + [f"{one.name}  {one.psnr:.2f} dB  {'; '.join(one.remarks)}" for one in wrong[:worst]]
+    out = [f"training photographs: {len(findings)}, median {middle:.2f} dB; standing out: {len(wrong)}"]
+    out += [f"{one.name}  {one.psnr:.2f} dB  {'; '.join(one.remarks)}" for one in wrong[:worst]]
     return out + ([f"and {len(wrong) - worst} more in {FOLDER}/index.json"] if len(wrong) > worst else [])

@@ -23,6 +23,7 @@ from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
@@ -270,9 +271,11 @@ def right_key(key: str, known: Iterable[str]) -> str:
 
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
-    """Dotted field names of a dataclass and of those inside it."""
+    """Dotted field names of a dataclass and of those inside it, with keys of mappings by default."""
     for entry in dataclasses.fields(schema):
         yield f"{prefix}{entry.name}"
+        made = entry.default_factory() if entry.default_factory is not dataclasses.MISSING else None
+        yield from (f"{prefix}{entry.name}.{key}" for key in (made if isinstance(made, dict) else ()))
         if dataclasses.is_dataclass(entry.type):
             yield from schema_keys(entry.type, f"{prefix}{entry.name}.")  # type: ignore[arg-type]
 
@@ -299,7 +302,8 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         refuse_interpolation(path, config)
     add_newer_settings(config)
     written = OmegaConf.to_container(config)
-    known = list(dict.fromkeys([*dotted(written), *newer_keys(written, plugins)])) if overrides else []
+    newer = newer_keys(written, plugins) if overrides and isinstance(written, dict) else ()
+    known = list(dict.fromkeys([*dotted(written), *newer]))
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or key not in known:
@@ -313,11 +317,15 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 
 def newer_keys(config: Any, plugins: Plugins) -> Iterator[str]:
     """Dotted keys that a run's composition may have by today's schemas; an older run's file lacks some of them."""
-    schemas: dict[str, type] = {"training.": TrainingOptions, "eval.": EvalOptions, "": GeneralOptions}
-    for kind in COMPONENT_KINDS:
-        schemas[f"{kind}."] = plugins.registry.find(kind, str(part(config, kind).get("name", ""))).options
-    for prefix, schema in schemas.items():
-        yield from schema_keys(schema, prefix)
+    schemas: dict[str, type] = {"training": TrainingOptions, "eval": EvalOptions, "metrics.lpips": LpipsOptions}
+    nodes = {kind: (kind, part(config, kind)) for kind in COMPONENT_KINDS}
+    for kind in ("augmenter", "regenerator", "tracker"):
+        nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(config, kind).items() if isinstance(node, dict)}
+    for key, (kind, node) in nodes.items():
+        schemas[key] = plugins.registry.find(kind, str(node.get("name", ""))).options
+    yield from schema_keys(GeneralOptions)
+    for key, schema in schemas.items():
+        yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith("eval.lpips"))
 
 
 def refuse_interpolation(path: Path, config: DictConfig) -> None:

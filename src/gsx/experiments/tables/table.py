@@ -10,7 +10,16 @@ from gsx.core.cache import source_revision
 from gsx.core.files import read_json
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.baselines import spread
-from gsx.experiments.run_folder.files import RunFiles, detail_share, has_figures, is_number, part, read_run, state_of
+from gsx.experiments.run_folder.files import (
+    RunFiles,
+    detail_share,
+    gain_of,
+    has_figures,
+    is_number,
+    part,
+    read_run,
+    state_of,
+)
 from gsx.experiments.run_folder.run_key import NAMES, WHERE, asked_for, comparable, other_revision, without
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
@@ -28,8 +37,8 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
 training."""
 ZOOM_MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "PSNR": lambda entry: entry.get("psnr"),
-    "over enlarged": lambda entry: over_enlarged(entry),
-    "detail": lambda entry: detail_share(entry),
+    "over enlarged": gain_of,
+    "detail": detail_share,
 }
 """By the name of `NAME xK`, from the figures at a zoom; detail: explained, above the training Nyquist frequency."""
 PLACES = ("model", "revision", "variant", "dtype", "tiling")
@@ -41,12 +50,6 @@ SHOWN_KEYS = 12
 def thousandth(value: Any) -> float | None:
     """A number in thousands."""
     return value / 1000 if is_number(value) else None
-
-
-def over_enlarged(entry: dict[str, Any]) -> float | None:
-    """PSNR over that of the x1 render, enlarged, dB."""
-    own, enlarged = entry.get("psnr"), entry.get("enlarged_psnr")
-    return own - enlarged if is_number(own) and is_number(enlarged) else None
 
 
 @dataclass(frozen=True, kw_only=True)
