@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from gsx.builtin import plugins
-from gsx.core.data.disturbed import chosen
+from gsx.core.data.disturbed import chosen, turn_of
 from gsx.core.files import read_json
 from gsx.experiments.runs.photographs import judge_photographs
 from measuring.machine import describe_machine, shown_command, told_load
@@ -43,10 +43,12 @@ ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*D
 """Overrides by the name of a row; the first is what there is to win back."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
+TURNED = 3.0
+"""Px by which cameras are turned, standard deviation along each axis."""
 FAULTS = {
     "none": ("", ""),
     "exposure": ("scene.disturb.exposure=0.7", "stops"),
-    "pose": ("scene.disturb.pose=3", "px beside the model's render"),
+    "pose": (f"scene.disturb.pose={TURNED:g}", "px beside the model's render"),
     "covered": ("scene.disturb.covered=0.05", "of its error lies in"),
 }
 """What is done to them, and what a remark says that names it."""
@@ -123,7 +125,14 @@ def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[
         "found": sum(any(FAULTS[fault][1] in remark for remark in by_name[name]) for name in bad),
         "wrongly": sum(bool(remarks) for name, remarks in by_name.items() if name not in bad),
         "shift": statistics.median(math.hypot(*(view["shift"] or (0, 0))) for view in found),
+        "off": [error_of(view) for view in found if view["name"] in bad] if fault == "pose" else [],
     }
+
+
+def error_of(view: Mapping[str, Any]) -> float:
+    """How far the shift that was told is from the one that was made, px: a picture lies where its camera really was."""
+    made = turn_of(view["name"], TURNED)
+    return math.hypot(*(told + own for told, own in zip(view["shift"] or (0, 0), made, strict=True)))
 
 
 def fault_row(scene: str, fault: str, found: Found) -> dict[str, Any]:
@@ -132,6 +141,8 @@ def fault_row(scene: str, fault: str, found: Found) -> dict[str, Any]:
     if sum(one["bad"] for one in found):
         row["found"] = f"{sum(one['found'] for one in found)} of {sum(one['bad'] for one in found)}"
     row["others"] = f"{sum(one['wrongly'] for one in found)} of {sum(one['good'] for one in found)}"
+    off = [error for one in found for error in one["off"]]
+    row["off"] = f"{statistics.median(off):.1f}" if off else ""
     return row | {"shift": told([one["shift"] for one in found], ".2f")}
 
 
@@ -141,6 +152,7 @@ def faults(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     rows = [fault_row(scene, fault, [one[fault] for one in found[scene]]) for scene in scenes for fault in FAULTS]
     columns = [["scene", "scene"], ["name", "made worse in"], ["seeds", "seeds"], ["found", "of these named for it"]]
     columns += [["others", "of the others named for anything"], ["shift", "median shift, px"]]
+    columns += [["off", "shifts made are told to, px"]]
     note = (
         f"{given.share:g} of the steps; {FEW:.0%} of the training photographs made worse, and trained with all the "
         "same; counts over seeds. How much each is made worse is drawn, for some it is little."

@@ -420,11 +420,14 @@ def test_bad_photographs_are_counted_over_seeds() -> None:
     import captures
 
     found = [
-        {"bad": 5, "good": 45, "found": 4, "wrongly": 1, "shift": 0.02},
-        {"bad": 5, "good": 45, "found": 5, "wrongly": 0, "shift": 0.04},
+        {"bad": 5, "good": 45, "found": 4, "wrongly": 1, "shift": 0.02, "off": [0.1, 0.4]},
+        {"bad": 5, "good": 45, "found": 5, "wrongly": 0, "shift": 0.04, "off": [3.0]},
     ]
     row = captures.fault_row("fox", "pose", found)
     assert (row["found"], row["others"], row["shift"]) == ("9 of 10", "1 of 90", "0.03 ± 0.01")
+    assert row["off"] == "0.4"
+    turned = {"name": "a", "shift": [-value for value in captures.turn_of("a", captures.TURNED)]}
+    assert captures.error_of(turned) == 0
     assert "found" not in captures.fault_row("fox", "none", [found[0] | {"bad": 0, "found": 0}])
 
 

@@ -8,7 +8,7 @@ import torch
 from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.disturbed import disturbed, gains_of, generator_of
+from gsx.core.data.disturbed import disturbed, gains_of, turn_of
 from gsx.core.data.scene import FromFile, Masked, View
 from gsx.core.errors import ConfigError
 
@@ -70,7 +70,7 @@ def test_a_wrong_pose_moves_the_picture_and_the_photograph_stays_where_it_was_ta
     [worse] = disturbed(replace(scene, train=[own]), {"pose": 3.0}).train
     far = torch.tensor([[0.0, 0.0, 1000.0]]).double() @ own.camera.rotation + own.camera.centre  # what its middle shows
     (before, _), (after, _) = own.camera.project(far), worse.camera.project(far)
-    moved = 3 * torch.randn(2, generator=generator_of("pose", "a")).double()
+    moved = torch.tensor(turn_of("a", 3.0), dtype=torch.float64)
     torch.testing.assert_close(after - before, moved[None], atol=0.02 * 3, rtol=0)
     torch.testing.assert_close(worse.camera.centre, own.camera.centre, atol=1e-6, rtol=0)
     assert worse.image().shape == (3, 16, 24)
@@ -88,6 +88,12 @@ def test_what_stands_before_a_photograph_covers_its_share_at_every_size() -> Non
         assert abs(float(covered.float().mean()) - 0.25) < 0.01
     whole, crop = one.camera.zoom(8), one.camera.zoom(8).crop(50, 30, 60, 40)
     assert torch.equal(one.source.image(crop), one.source.image(whole)[:, 30:70, 50:110])
+
+
+def test_turns_are_spread_as_asked() -> None:
+    drawn = torch.tensor([turn_of(str(number), 3.0) for number in range(2000)])
+    assert (drawn.std(0) - 3).abs().max() < 0.15
+    assert drawn.mean(0).abs().max() < 0.2
 
 
 def test_some_photographs_suffer_the_same_in_every_run() -> None:

@@ -37,6 +37,17 @@ def test_a_shift_is_found_whatever_the_exposure(shift: tuple[float, float]) -> N
     assert found == pytest.approx(shift, abs=0.06)
 
 
+def slow(across: float, down: float) -> Tensor:
+    """A picture of 160 x 120 px with long waves under short ones, moved."""
+    x, y = torch.arange(160.0)[None] - across, torch.arange(120.0)[:, None] - down
+    long = 0.2 * (0.04 * x + 0.03 * y).sin() + 0.1 * (0.02 * x - 0.06 * y).cos()
+    return torch.stack([0.5 + long + 0.05 * (0.7 * x + 0.2 * y).sin() * (0.3 * x - 0.8 * y).cos()] * 3)
+
+
+def test_a_large_shift_is_found_coarse_to_fine() -> None:
+    assert shift_of(slow(0, 0), slow(9, -7), None) == pytest.approx((9, -7), abs=0.1)
+
+
 def test_a_shift_is_told_by_what_counts_and_hardly_by_what_stands_before_it() -> None:
     photograph, counted = waves(1.0, 0.5), torch.ones(60, 80, dtype=torch.bool)
     photograph[:, 20:32, 30:44] = 1.0

@@ -104,10 +104,16 @@ def gains_of(name: str, spread: float) -> Float[Tensor, "3"]:
     return (spread * (drawn[0] + BALANCE * drawn[1:])).exp()
 
 
-def turned(camera: Camera, name: str, spread: float) -> Camera:
-    """The camera turned about its centre, so that the middle of its picture moves along each axis by numbers of that
-    standard deviation, px."""
+def turn_of(name: str, spread: float) -> tuple[float, float]:
+    """Px to the right and down by which the middle of the picture of that photograph moves, of that standard
+    deviation."""
     across, down = (spread * torch.randn(2, generator=generator_of("pose", name)).double()).tolist()
+    return across, down
+
+
+def turned(camera: Camera, name: str, spread: float) -> Camera:
+    """The camera turned about its centre, so that its picture moves so (`turn_of`)."""
+    across, down = turn_of(name, spread)
     turn = about(0, -down / camera.fy) @ about(1, across / camera.fx)
     rotation, translation = (turn @ part.double() for part in (camera.rotation, camera.translation))
     return replace(camera, rotation=rotation.to(camera.rotation), translation=translation.to(camera.translation))

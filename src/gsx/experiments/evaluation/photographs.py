@@ -25,8 +25,8 @@ CELL, FEW = 8, 0.05
 """Px of the squares that errors are summed in; the share of the squares with the most of them."""
 ELSEWHERE, MORE = 0.5, 1.5
 """Share of the error in these squares from which on a photograph is named, if it is so many times the usual."""
-ROUNDS = 8
-"""Of the search for a shift."""
+ROUNDS, SMALLEST = 8, 24
+"""Of the search for a shift at each size; the least side of a picture that is searched, px."""
 BORDER = 4
 """Px at the borders that say nothing of it, beside the shift itself."""
 ALIKE = 1e-3
@@ -87,27 +87,63 @@ def shift_of(
 
     The translation that explains their difference best, beside a gain and an offset: by least squares on slopes of the
     render, moved there again and again (Lucas and Kanade 1981), in which pixels that differ by more than the usual
-    count little.
+    count little; in pictures of a half and of a quarter of the size first, where those are large enough.
     """
     still, shown = grey(render), grey(photograph)
     inside = torch.ones_like(still, dtype=torch.bool) if counted is None else counted.to(still.device)
-    shift, first, error = still.new_zeros(2), math.inf, math.inf
-    told = inside & interior(still, 0)
-    residual = shown - still * (shown[told].median() / still[told].median().clamp_min(1e-6)) if told.any() else still
-    for number in range(ROUNDS):
-        moved = translated(still, shift)
-        told = inside & interior(still, float(shift.abs().max()))
+    found = shift_between(still, shown, inside)
+    if found is None or mismatch(still, shown, inside, found) > mismatch(still, shown, inside, 0 * found) + ALIKE:
+        return None
+    return float(found[0]), float(found[1])
+
+
+def shift_between(
+    still: Float[Tensor, "H W"], shown: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"]
+) -> Float[Tensor, "2"] | None:
+    """Coarse to fine; see `shift_of`."""
+    start = None
+    if min(still.shape) >= 2 * SMALLEST:
+        half = [avg_pool2d(values[None].double(), 2)[0] for values in (still, shown, inside)]
+        start = shift_between(half[0], half[1], half[2] == 1)
+    return refined(still, shown, inside, still.new_zeros(2) if start is None else 2 * start)
+
+
+def refined(
+    still: Float[Tensor, "H W"], shown: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"], shift: Float[Tensor, "2"]
+) -> Float[Tensor, "2"] | None:
+    """The shift found from one near to it; None where nothing tells, or it runs away."""
+    residual = None
+    for _ in range(ROUNDS):
+        moved, told = translated(still, shift), inside & interior(still, float(shift.abs().max()))
         columns = torch.stack([central(moved, 1), central(moved, 0), moved, torch.ones_like(moved)])[:, told]
+        residual = by_medians(moved, shown, told) if residual is None else residual
         fit = least_squares(columns, shown[told], robust(residual[told]))
         if fit is None:
             return None
         residual = shown - fit[2] * moved - fit[3]
-        error = float(residual[told].abs().median())
-        first = error if number == 0 else first
         shift = shift - fit[:2] / fit[2]
         if not bool(shift.abs().max() < min(still.shape) / 4):
             return None
-    return (float(shift[0]), float(shift[1])) if error <= first + ALIKE else None
+    return shift
+
+
+def mismatch(
+    still: Float[Tensor, "H W"], shown: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"], shift: Float[Tensor, "2"]
+) -> float:
+    """Median of what a shift leaves, beside a gain and an offset; infinite where nothing tells."""
+    moved, told = translated(still, shift), inside & interior(still, float(shift.abs().max()))
+    weights = robust(by_medians(moved, shown, told)[told])
+    fit = least_squares(torch.stack([moved, torch.ones_like(moved)])[:, told], shown[told], weights)
+    return math.inf if fit is None else float((shown - fit[0] * moved - fit[1])[told].abs().median())
+
+
+def by_medians(
+    image: Float[Tensor, "H W"], wanted: Float[Tensor, "H W"], told: Bool[Tensor, "H W"]
+) -> Float[Tensor, "H W"]:
+    """wanted - image, brought to the same median."""
+    if not told.any():
+        return wanted - image
+    return wanted - image * (wanted[told].median() / image[told].median().clamp_min(1e-6))
 
 
 def robust(residual: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
