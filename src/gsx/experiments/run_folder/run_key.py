@@ -17,6 +17,8 @@ NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 """Keys that name what other keys hold."""
 EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
+NEWER = {"supersample": 0, "colours": "rendered"}
+"""Keys of `eval` that older gsx did not have, as it looked at models."""
 
 
 def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
@@ -121,9 +123,12 @@ def evaluation_settings(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluated_as(files: RunFiles, config: dict[str, Any]) -> dict[str, Any]:
-    """The settings that a run was evaluated by; older gsx does not tell filter and pixel, which were the run's own."""
+    """The settings that a run was evaluated by; older gsx does not tell filter and pixel, which were the run's own, nor
+    settings that it did not have."""
     own = {key: evaluation_settings(config)[key] for key in ("filter", "pixel")}
-    return own | part(files.evaluation, "settings" if "settings" in files.evaluation else "judged")
+    saved = part(files.evaluation, "settings" if "settings" in files.evaluation else "judged")
+    looked = saved.get("eval")
+    return own | saved | ({"eval": NEWER | looked} if isinstance(looked, dict) else {})
 
 
 def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collection[str]) -> bool:
