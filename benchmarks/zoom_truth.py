@@ -176,13 +176,12 @@ def main(words: Sequence[str]) -> None:
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_rows(given.to)  # what cannot be added to is refused before training
     scenes, stamp = scenes_at_hand(given), (load, shown_command(words, "benchmarks/zoom_truth.py"))
+
+    def measure(scene: str, seed: int) -> None:
+        keep(measured(scene, seed, given), given, machine, stamp)
+
     with ThreadPoolExecutor(given.jobs) as pool:
-        tasks = [
-            pool.submit(lambda *of: keep(measured(*of, given), given, machine, stamp), scene, seed)
-            for seed in given.seeds
-            for scene in scenes
-        ]
-        for task in tasks:
+        for task in [pool.submit(measure, scene, seed) for seed in given.seeds for scene in scenes]:
             task.result()  # raises what it raised
     print(text_table(table([row for row in read_rows(given.to) if row["share"] == f"{given.share:g}"], stamp)))
 
