@@ -12,28 +12,24 @@ import argparse
 import math
 import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-import torch
 
 from gsx.builtin import plugins
 from gsx.core.data.disturbed import chosen, turn_of
 from gsx.core.files import read_json
 from gsx.experiments.runs.photographs import judge_photographs
-from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import read_sections, stamped, text_table, write_results
 from zoom import (
     SUBJECTS,
+    Measure,
     Measured,
     looked_at,
     over_seeds,
-    refuse_unknown,
-    scenes_at_hand,
     shared_arguments,
     steps_among,
     told,
     trained,
+    write_tables,
 )
 
 ZOOMS = ("1", "4")
@@ -180,22 +176,12 @@ def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Photographs at exposures of their own", columns, rows, note
 
 
-WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {"exposure": exposure, "faults": faults}
+WHAT: dict[str, Measure] = {"exposure": exposure, "faults": faults}
 
 
 def main(words: Sequence[str]) -> None:
     """Train and look, and write the tables."""
-    given = arguments(words)
-    machine, load = describe_machine(torch.device("cpu")), told_load()
-    machine |= {"threads": 1} if given.jobs > 1 else {}
-    read_sections(given.to / "captures_cpu.json")  # what cannot be added to is refused before training
-    refuse_unknown(given.what, WHAT)
-    scenes = scenes_at_hand(given)
-    for name in given.what.split(","):
-        title, columns, rows, note = WHAT[name](scenes, given)
-        table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/captures.py"))
-        write_results(given.to, "captures_cpu", machine, {name: table})
-        print(text_table(table))
+    write_tables(words, arguments(words), "captures", WHAT)
 
 
 if __name__ == "__main__":

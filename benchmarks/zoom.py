@@ -212,9 +212,9 @@ def figure(shown: Sequence[dict[str, Any]], factor: str, *keys: str) -> list[flo
     return out
 
 
-def told(values: Sequence[float], form: str) -> str:
+def told(values: Sequence[float], form: str, form_of_half: str = ".2f") -> str:
     """Mean, ± half the range where there are several."""
-    half = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
+    half = f" ± {(max(values) - min(values)) / 2:{form_of_half}}" if len(values) > 1 else ""
     return f"{statistics.mean(values):{form}}{half}"
 
 
@@ -252,6 +252,8 @@ def columns_of(kind: str, competitors: bool) -> list[list[str]]:
 
 Measured = tuple[str, list[list[str]], list[dict[str, Any]], str]
 """Title, columns, rows, a note."""
+Measure = Callable[[Sequence[str], argparse.Namespace], Measured]
+"""What makes a table of scenes and the command line."""
 
 
 def rules(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
@@ -365,7 +367,7 @@ def over_seeds(
         return {scene: [tasks[scene, seed].result() for seed in given.seeds] for scene in scenes}
 
 
-WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
+WHAT: dict[str, Measure] = {
     "rules": rules,
     "compositions": compositions,
     "views": views,
@@ -377,19 +379,27 @@ WHAT: dict[str, Callable[[Sequence[str], argparse.Namespace], Measured]] = {
 }
 
 
+def write_tables(
+    words: Sequence[str], given: argparse.Namespace, name: str, what: Mapping[str, Measure], label: str = ""
+) -> None:
+    """Train and look, and write the tables asked for by --what to NAME_cpu.json (the name of the benchmark); `label` is
+    added to those of the tables."""
+    machine, load = describe_machine(torch.device("cpu")), told_load()
+    machine |= {"threads": 1} if given.jobs > 1 else {}
+    read_sections(given.to / f"{name}_cpu.json")  # what cannot be added to is refused before training
+    refuse_unknown(given.what, what)
+    scenes = scenes_at_hand(given)
+    for kind in given.what.split(","):
+        title, columns, rows, note = what[kind](scenes, given)
+        table = stamped(title, columns, rows, [note], load, shown_command(words, f"benchmarks/{name}.py"))
+        write_results(given.to, f"{name}_cpu", machine, {kind + label: table})
+        print(text_table(table))
+
+
 def main(words: Sequence[str]) -> None:
     """Train and look, and write the tables."""
     given = arguments(words)
-    machine, load = describe_machine(torch.device("cpu")), told_load()
-    machine |= {"threads": 1} if given.jobs > 1 else {}
-    read_sections(given.to / "zoom_cpu.json")  # what cannot be added to is refused before training
-    refuse_unknown(given.what, WHAT)
-    scenes = scenes_at_hand(given)
-    for name in given.what.split(","):
-        title, columns, rows, note = WHAT[name](scenes, given)
-        table = stamped(title, columns, rows, [note], load, shown_command(words, "benchmarks/zoom.py"))
-        write_results(given.to, "zoom_cpu", machine, {name + given.label: table})
-        print(text_table(table))
+    write_tables(words, given, "zoom", WHAT, given.label)
 
 
 if __name__ == "__main__":

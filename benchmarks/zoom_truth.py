@@ -24,7 +24,7 @@ import torch
 from measuring.machine import commit, describe_machine, shown_command, told_load
 from measuring.results import Section, read_sections, stamped, text_table, write_results
 from measuring.runs import gsx
-from zoom import SUBJECTS, scenes_at_hand, shared_arguments
+from zoom import SUBJECTS, scenes_at_hand, shared_arguments, told
 
 FILE, RUNS, TABLE = "zoom_truth_cpu", "runs", "table"
 """Of the results, and its sections."""
@@ -164,9 +164,8 @@ def line_of(share: str, scene: str, name: str, by_seed: dict[tuple[Any, ...], Ro
 
 
 def spread_text(values: Sequence[float], form: str) -> str:
-    """Mean, ± half the range where there are several, both with the digits of the form; nothing of no values."""
-    half = f" ± {(max(values) - min(values)) / 2:{form.removeprefix('+')}}" if len(values) > 1 else ""
-    return f"{statistics.mean(values):{form}}{half}" if values else ""
+    """Mean ± half the range, both with the digits of the form; nothing of no values."""
+    return told(values, form, form.removeprefix("+")) if values else ""
 
 
 def main(words: Sequence[str]) -> None:

@@ -32,6 +32,23 @@ class Disturbable(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Patch:
+    """Something plain in front of a camera."""
+
+    edges: tuple[float, float, float, float]
+    """Left, top, right, bottom, as shares of the frame's sides."""
+    colour: UInt8[Tensor, "3"]
+
+    def over(self, image: UInt8[Tensor, "3 H W"], camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """The image with it: pixels whose centres it covers."""
+        frame, (left, top, right, bottom) = camera.frame, self.edges
+        x = (torch.arange(camera.width) + 0.5 + frame.left) / frame.width
+        y = (torch.arange(camera.height) + 0.5 + frame.top) / frame.height
+        covered = ((y >= top) & (y < bottom))[:, None] & ((x >= left) & (x < right))
+        return torch.where(covered.to(image.device), self.colour.to(image.device)[:, None, None], image)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Worse:
     """A source of a photograph that was taken at another exposure, from elsewhere, with something in the way."""
 
@@ -40,7 +57,7 @@ class Worse:
     """Its pose is that of the photograph, whatever a view says."""
     gains: Float[Tensor, "3"] | None = None
     """Display values are multiplied by them, and saturate."""
-    patch: "Patch | None" = None
+    patch: Patch | None = None
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
@@ -71,23 +88,6 @@ class WorseFile(Worse):
         """The file that the source reads."""
         assert isinstance(self.source, FromFile)
         return self.source.path
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Patch:
-    """Something plain in front of a camera."""
-
-    edges: tuple[float, float, float, float]
-    """Left, top, right, bottom, as shares of the frame's sides."""
-    colour: UInt8[Tensor, "3"]
-
-    def over(self, image: UInt8[Tensor, "3 H W"], camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """The image with it: pixels whose centres it covers."""
-        frame, (left, top, right, bottom) = camera.frame, self.edges
-        x = (torch.arange(camera.width) + 0.5 + frame.left) / frame.width
-        y = (torch.arange(camera.height) + 0.5 + frame.top) / frame.height
-        covered = ((y >= top) & (y < bottom))[:, None] & ((x >= left) & (x < right))
-        return torch.where(covered.to(image.device), self.colour.to(image.device)[:, None, None], image)
 
 
 # -- what one photograph suffers ---------------------------------------------------------------------------------------

@@ -78,14 +78,15 @@ class Pictures:
         """Truth, render and error of a view."""
         if number not in self.shown:
             return
-        truth = view.image()
-        images = {
-            "truth": truth,
-            "render": render,
-            "error": error_map(*(blacked(picture, view.counted()) for picture in (render, truth))),
-        }
-        files = {kind: self.save(f"{self.names[number]}.{kind}", reduced(image)) for kind, image in images.items()}
+        files = self.compared(self.names[number], view, render)
         self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
+
+    def compared(self, name: str, view: View, render: Float[Tensor, "3 H W"]) -> dict[str, str]:
+        """Write truth, render and error of a view; returns their files by kind."""
+        truth = view.image()
+        error = error_map(*(blacked(picture, view.counted()) for picture in (render, truth)))
+        images = {"truth": truth, "render": render, "error": error}
+        return {kind: self.save(f"{name}.{kind}", reduced(image)) for kind, image in images.items()}
 
     def zoomed(self, number: int, zoomed: Zoomed) -> None:
         """The window with most detail: truth, render and the x1 render resized."""

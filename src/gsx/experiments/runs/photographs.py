@@ -1,6 +1,5 @@
 """`gsx photographs RUN`: training photographs by how badly the model shows them, and what is wrong with them."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,14 +20,12 @@ from gsx.core.shapes import Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
-from gsx.experiments.reports.pictures import Pictures, error_map, file_names, forget, reduced
+from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.runs.open import as_trained, open_run, refuse_other
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.rasterizer_path import warm
-
-logger = logging.getLogger(__name__)
 
 FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""
@@ -99,6 +96,7 @@ def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Te
     return run.exposures.applied(image, view.name).clamp(0, 1).cpu()
 
 
+@torch.no_grad()
 def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: int) -> None:
     """index.json with all findings, and pictures of the worst."""
     place = Pictures(run.folder / FOLDER, run.step)
@@ -108,19 +106,11 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
     entries: list[dict[str, Any]] = [asdict(one) for one in findings]
     for entry, name in zip(entries, file_names([one.name for one in shown]), strict=False):
         view = views[entry["name"]]
-        entry["files"] = draw(run, view, place, name, pixels)
+        image = at_exposure(run, view, render(run, view.camera, pixels).image)
+        entry["files"] = place.compared(name, view, image)
         entry["size"] = list(view.camera.size)
     summary = {"step": run.step, "median_psnr": median(one.psnr for one in findings)}
     write_json(place.folder / "index.json", summary | {"views": entries})
-
-
-@torch.no_grad()
-def draw(run: Run, view: View, place: Pictures, name: str, pixels: int) -> dict[str, str]:
-    """Photograph, render and error; their files by kind."""
-    image, truth = at_exposure(run, view, render(run, view.camera, pixels).image), view.image()
-    error = error_map(*(blacked(picture, view.counted()) for picture in (image, truth)))
-    pictures = {"truth": truth, "render": image, "error": error}
-    return {kind: place.save(f"{name}.{kind}", reduced(picture)) for kind, picture in pictures.items()}
 
 
 def lines(findings: Sequence[Finding], worst: int) -> list[str]:
