@@ -6,8 +6,9 @@ FOLDER holds `fox` (COLMAP), `lego` (NeRF-Synthetic), `castle` (photographs alon
 is measured. `growth`: every scene is trained as published, adaptively, and with a budget of as many primitives as
 published ends with, and of fewer, beside published growth held at that cap; the same steps. `compact`: the published
 runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
-numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. Finished runs
-below --runs are not trained again. A quarter of an hour of two cores for a scene, a backbone and a seed.
+numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
+published runs in which learning rates go down to nothing at the end, beside published ones. Finished runs below --runs
+are not trained again. A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
@@ -52,9 +53,10 @@ ZOOMS = ("1", "2", "4")
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, "fox,fox_4,lego,castle,demo", "outputs/capacity")
-    parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence")
+    parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown")
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
+    parser.add_argument("--cooldowns", default="0.2", help="shares of the steps, by commas")
     parser.add_argument("--label", default="", help="of tables over other scenes, seeds or rows: added to their names")
     return parser.parse_args(words)
 
@@ -138,6 +140,40 @@ def measured(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
         row_of(scene, arm, [one[arm] for one in found[scene]], [one["published"] for one in found[scene]])
         for scene in scenes
         for arm in arms
+    ]
+
+
+# -- learning rates at the end -----------------------------------------------------------------------------------------
+
+COOLDOWN_COLUMNS = [[key, "cooldown" if key == "arm" else label] for key, label in COLUMNS]
+COOLDOWN_NOTE = (
+    "`training.cooldown`: over that share of the steps, the last ones, learning rates go down to nothing; 0: as "
+    "published. "
+    "PSNR on held-out views, dB, means over seeds ± half their range; differences and shares seed by seed, times are "
+    "medians. The same steps."
+)
+
+
+def cooled(scene: str, share: float, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+    """Evaluation of a run whose learning rates go down over a share of its steps."""
+    folder = given.runs / f"{backbone}_{scene}_cooldown_{share}_{seed}"
+    wish = [PUBLISHED, f"training.cooldown={share}"]
+    return trained(folder, words_of(wish, scene, backbone, seed, given), given)
+
+
+def cooled_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes, shares = scenes_of(given), [float(share) for share in given.cooldowns.split(",")]
+
+    def look(scene: str, seed: int) -> dict[float, Any]:
+        first = {0.0: evaluation_of("published", scene, backbone, seed, given)}
+        return first | {share: cooled(scene, share, backbone, seed, given) for share in shares}
+
+    found = over_seeds(look, scenes, given)
+    return [
+        row_of(scene, f"{share:g}", [one[share] for one in found[scene]], [one[0.0] for one in found[scene]])
+        for scene in scenes
+        for share in (0.0, *shares)
     ]
 
 
@@ -352,6 +388,9 @@ def main(words: Sequence[str]) -> None:
         if "evidence" in given.what:
             title, rows = f"What adaptive growth of {backbone} asks costs", evidence_rows(backbone, given)
             tables[f"{backbone}_evidence"] = stamped(title, EVIDENCE_COLUMNS, rows, [EVIDENCE_NOTE], load, command)
+        if "cooldown" in given.what:
+            title, rows = f"Learning rates of {backbone} that go down at the end", cooled_rows(backbone, given)
+            tables[f"{backbone}_cooldown"] = stamped(title, COOLDOWN_COLUMNS, rows, [COOLDOWN_NOTE], load, command)
         if "compact" in given.what:
             title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
             tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)

@@ -14,7 +14,7 @@ from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
-from gsx.core.training.evidence import Changes, Removal, removal_changes, some_of, worth_of_rows
+from gsx.core.training.evidence import Removal, some_of, worth_of_rows
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
 from gsx.core.training.schedule import Schedule
 
@@ -172,15 +172,13 @@ def error_exponent(price: float) -> float:
     return price * math.log(10) / (10 * math.log(2))
 
 
-def worth_in_training(
-    model: Backbone[Any], context: BackboneContext, step: int, changes: Changes = removal_changes
-) -> Removal:
-    """What training views lose without each row, or by other changes of it."""
+def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
+    """What training views lose without each row."""
     views = some_of(context.resolution.views(step), LOOKS, context.generator)
     background, form = context.scene.background.to(context.device), context.resolution.forming(step)
 
     def look() -> Removal:
-        return worth_of_rows(model, views, form, background, step, context.generator, changes).to("cpu")
+        return worth_of_rows(model, views, form, background, step, context.generator).to("cpu")
 
     return context.found_by_first(look).to(context.device)
 

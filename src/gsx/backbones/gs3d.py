@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import normalize
 
-from gsx.backbones.capacity import growing_of, worth_in_training
+from gsx.backbones.capacity import LOOKS, growing_of
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
-from gsx.backbones.sh_degrees import hold_bands, judge_degrees
+from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -31,8 +31,9 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
+from gsx.core.training.colour_fits import colour_fits
 from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
-from gsx.core.training.evidence import Look, recolouring_changes
+from gsx.core.training.evidence import some_of
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
 
@@ -156,12 +157,6 @@ class GS3D:
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 
-    @torch.no_grad()
-    def colours_by_degree(self, camera: Camera, step: int) -> Float[Tensor, "D M 3"]:
-        """Colours of what the camera draws, of each degree up to that of the step."""
-        values = self.visibility.shown(self.table, camera, step).values
-        return torch.stack([colours_from(camera, values, degree) for degree in range(self.active_degree(step) + 1)])
-
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """That of density control; 3D-GS has none."""
         return self.control.densification.regulariser(drawn)
@@ -202,12 +197,18 @@ class GS3D:
 
     def judge_degrees(self, step: int) -> dict[str, float]:
         """Keep the bands of colour that training views tell are worth their numbers."""
+        highest, context, price = self.active_degree(step), self.context, self.options.sh_price
+        if not highest:
+            return {}
+        other = sum(value[0].numel() for name, value in self.table.parameters.items() if not name.startswith("sh_"))
+        views = some_of(context.resolution.views(step), LOOKS, context.generator)
 
-        def changes(seen: Look, signs: Tensor) -> Tensor:
-            return recolouring_changes(seen, self.colours_by_degree(seen.camera, step), signs)
+        def look() -> Judged:
+            form, background = context.resolution.forming(step), context.scene.background.to(context.device)
+            fits = colour_fits(self, views, form, background, step, context.generator, highest - 1)
+            return judged(fits, price, numbers_of(highest, other)).to("cpu")
 
-        found = worth_in_training(self, self.context, step, changes)
-        return judge_degrees(self.table, found, self.options.sh_price, step)
+        return lower_degrees(self.table, context.found_by_first(look).to(context.device), step, price)
 
     def means_rate_steps(self) -> int:
         """Step at which the learning rate of the means has come down."""

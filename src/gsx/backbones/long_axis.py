@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import to_look_at
-from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
+from gsx.core.gaussians.merging import covariances, principal_axes
+from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.density import mean_absolute, within_room
@@ -39,12 +39,6 @@ def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
     return [rows | changed | {"means": rows["means"] + side * offset} for side in (1, -1)]
 
 
-def covariances(rows: dict[str, Tensor]) -> Float[Tensor, "N 3 3"]:
-    """Of Gaussians by raw parameters, world units squared."""
-    spread = rotation_matrices(rows["quats"]) * rows["log_scales"].exp()[:, None]
-    return spread @ spread.mT
-
-
 def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Tensor]:
     """One Gaussian for each two: of fresh halves what they were made from, of others what would be split into the like.
 
@@ -53,13 +47,12 @@ def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Ten
     whole = {name: (value + second[name]) / 2 for name, value in first.items() if value.is_floating_point()}
     apart = (first["means"] - second["means"])[:, :, None].double() / 2
     covariance = (covariances(first) + covariances(second)).double() / 2 + apart @ apart.mT
-    variances, axes = torch.linalg.eigh(covariance)  # ascending
-    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
+    variances, quats = principal_axes(covariance)
     grown = variances.new_tensor([ACROSS**2, ACROSS**2, LENGTH**2 + STEP**2])
     opacities = (first["opacity_logits"].sigmoid() + second["opacity_logits"].sigmoid()) / 2 / OPACITY
     changed = {
         "log_scales": ((variances / grown).clamp_min(1e-30).log() / 2).to(whole["log_scales"]),
-        "quats": normalize(quaternions_of(axes), dim=1).to(whole["quats"]),
+        "quats": quats.to(whole["quats"]),
         "opacity_logits": torch.logit(opacities.clamp_max(LARGEST_OPACITY)),
     }
     return first | whole | changed

@@ -1,22 +1,38 @@
 """An SH degree for each Gaussian: as many bands of colour as its pictures need.
 
 A Gaussian with colours of degree 3 is 59 numbers, 45 of them in three bands of which a matt surface needs none. Once,
-late in the run, its colours of every lower degree are put in the place of its own in training views; what the picture
-changes by, squared and summed, is what the bands above are worth (`core.training.evidence`). Against it stands what
+late in the run, the colours of every lower degree that come nearest to its own are found in training views; what these
+change by, squared and summed, is what the bands above are worth (`core.training.colour_fits`). Against it stands what
 their numbers cost, by the price of a doubling of all numbers. The degree at which both together are least is kept.
 """
 
 import logging
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import error_exponent
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.evidence import Removal
+from gsx.core.training.colour_fits import ColourFits, fitted, squared_change, take_coefficients
 from gsx.core.training.parameter_table import ParameterTable, edit
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Judged:
+    """What is to become of the colours of N rows."""
+
+    degrees: Int[Tensor, "N"]
+    coefficients: Float[Tensor, "n 3 N"]
+    """Of the degrees below the highest, less the constant ones as they are; zero above a row's own."""
+    highest: int
+    """Degree that has been learnt."""
+
+    def to(self, device: torch.device | str) -> "Judged":
+        """On a device."""
+        return replace(self, degrees=self.degrees.to(device), coefficients=self.coefficients.to(device))
 
 
 def numbers_of(degree: int, other: int) -> Int[Tensor, "D"]:
@@ -47,14 +63,27 @@ def kept_bands(degrees: Int[Tensor, "N"], count: int) -> Bool[Tensor, "N B"]:
     return band <= degrees[:, None]
 
 
-def judge_degrees(table: ParameterTable, found: Removal, price: float, step: int) -> dict[str, float]:
-    """Lower the degrees of rows by what was found of them; the bands above are zeroed with their moments."""
-    highest, own = len(found.squares) - 1, table["sh_degree"]
-    other = sum(value[0].numel() for name, value in table.parameters.items() if name not in ("sh_dc", "sh_rest"))
-    degrees = least_degrees(found.squares, found.shown, found.error_share, price, numbers_of(highest, other)).to(own)
-    table.columns["sh_degree"] = torch.where(degrees < highest, degrees, own)  # higher ones may not have begun to learn
+def judged(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> Judged:
+    """The degree of each row that costs least, and its colours of that degree."""
+    highest = len(numbers) - 1
+    lower = [fitted(fits, degree) for degree in range(highest)]
+    squares = torch.stack([squared_change(fits, one) for one in lower] + [torch.zeros_like(fits.norms)])
+    share = fits.error / max(1.0, float(fits.shown.sum()))
+    degrees = least_degrees(squares / fits.shown.clamp_min(1), fits.shown, share, price, numbers)
+    coefficients = torch.zeros_like(fits.own)
+    for degree, one in enumerate(lower):
+        coefficients[: len(one)] += one * (degrees == degree)
+    return Judged(degrees=degrees, coefficients=coefficients, highest=highest)
+
+
+def lower_degrees(table: ParameterTable, found: Judged, step: int, price: float) -> dict[str, float]:
+    """Give rows the degrees and colours that were found; the bands above are zeroed with their moments."""
+    own, least = table["sh_degree"], found.degrees.to(table["sh_degree"])
+    lowered = least < found.highest
+    table.columns["sh_degree"] = torch.where(lowered, least, own)  # higher bands may not have begun to learn
+    take_coefficients(table, lowered, found.coefficients)
     clear_bands(table)
-    counts = torch.bincount(table["sh_degree"].long(), minlength=highest + 1).tolist()
+    counts = torch.bincount(table["sh_degree"].long(), minlength=found.highest + 1).tolist()
     told = ", ".join(f"{count} of degree {degree}" for degree, count in enumerate(counts))
     logger.info("step %d: colours are judged at %.2f dB per doubling of numbers: %s", step, price, told)
     return {f"degree_{degree}": count for degree, count in enumerate(counts)}

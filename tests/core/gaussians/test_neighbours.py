@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsx.core.gaussians import neighbours
-from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.core.gaussians.neighbours import mean_square_distance, nearest
 
 
 def brute_force(points: Tensor, count: int = 3) -> Tensor:
@@ -32,6 +32,15 @@ def test_points_on_a_line_worked_by_hand() -> None:
 def test_random_points(count: int) -> None:
     points = cloud(count)
     torch.testing.assert_close(mean_square_distance(points), brute_force(points), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("count", [9, 5000])
+def test_which_points_are_nearest(count: int) -> None:
+    points = cloud(count)
+    squares, which = nearest(points, 4)
+    distances = torch.cdist(points.double(), points.double()).fill_diagonal_(torch.inf)
+    assert torch.equal(which, distances.topk(4, largest=False).indices)
+    torch.testing.assert_close(squares.double(), distances.gather(1, which).square(), rtol=1e-4, atol=1e-9)
 
 
 def test_work_in_chunks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

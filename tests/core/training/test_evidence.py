@@ -14,11 +14,11 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.evidence import (
+    blending_squares,
     difference,
     error_sums,
     look,
     random_signs,
-    recolouring_changes,
     removal_changes,
     squared_changes,
 )
@@ -95,19 +95,17 @@ def test_what_the_picture_loses_without_a_splat() -> None:
         assert float(found[row]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_what_the_picture_changes_by_with_other_colours() -> None:
-    """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
+def test_blending_weights_squared() -> None:
+    """Against renders in which one splat is white and all else black; two pixels, six values, all 64 signs."""
     splats, view = cloud(4), view_of(2, 1)
     seen = look(splats, plain(view.camera), RULES, BACKGROUND)
-    others = torch.stack([1 - splats.colours, splats.colours.roll(1, 1)])
     patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
-    found = torch.stack([recolouring_changes(seen, others, signs).square() for signs in patterns]).mean(0)
-    for other, row in itertools.product(range(2), range(4)):
-        colours = splats.colours.clone()
-        colours[row] = others[other, row]
-        painted = rasterize(replace(splats, colours=colours), view.camera, RULES, background=BACKGROUND).image
-        expected = float((painted - seen.image.detach()).square().sum())
-        assert float(found[other, row]) == pytest.approx(expected, rel=1e-9)
+    found = torch.stack([blending_squares(seen, signs) for signs in patterns]).mean(0)
+    for row in range(4):
+        white = torch.zeros(4, 3, dtype=torch.float64)
+        white[row] = 1
+        weights = rasterize(replace(splats, colours=white), view.camera, RULES).image[0]
+        assert float(found[row]) == pytest.approx(float(weights.square().sum()), rel=1e-9)
 
 
 def test_signs_come_from_the_generator_alone() -> None:

@@ -16,10 +16,12 @@ from gsx.core.training.parameter_table import (
     ParameterTable,
     append_rows,
     gradients,
+    group_named,
     keep_rows,
     named_parameters,
     reset_column,
     restored_table,
+    second_moments,
     shared_colour,
     size_of,
     table_tensors,
@@ -312,6 +314,35 @@ def test_networks_are_moved_saved_and_restored_with_the_rows() -> None:
     assert {name: value.tolist() for name, value in table_tensors(again).items()} == {
         name: value.tolist() for name, value in table_tensors(table).items()
     }
+
+
+def test_steps_are_shorter_by_the_pace_and_rates_stay() -> None:
+    """Adam's steps are proportional to its rates."""
+    moved = {}
+    for pace in (1.0, 0.25):
+        table = ParameterTable({"flat": Parameter(torch.ones(2))}, {}, {}, small_networks())
+        table.set_rate("flat", 0.5)
+        table.networks.set_rate("opacity", 0.5)
+        table.pace = pace
+        before = {name: value.detach().clone() for name, value in named_parameters(table)}
+        for _ in range(2):
+            sum(value.sum() for _, value in named_parameters(table)).backward()
+            take_adam_step(table)
+        moved[pace] = {name: before[name] - value.detach() for name, value in named_parameters(table)}
+        assert table.group("flat")["lr"] == group_named(table.networks.optimiser, "opacity")["lr"] == 0.5
+    for name, value in moved[1.0].items():
+        torch.testing.assert_close(moved[0.25][name], 0.25 * value)
+    torch.testing.assert_close(moved[1.0]["flat"], torch.ones(2))
+
+
+def test_rows_may_begin_with_second_moments() -> None:
+    table = ParameterTable({"flat": Parameter(torch.ones(2, 3)), "still": Parameter(torch.ones(2))})
+    table["flat"].sum().backward()
+    take_adam_step(table)
+    assert list(second_moments(table)) == ["flat"]
+    append_rows(table, {"flat": torch.zeros(1, 3), "still": torch.zeros(1)}, {"flat": torch.full((1, 3), 7.0)})
+    assert second_moments(table)["flat"][2].tolist() == [7, 7, 7]
+    assert not table.optimiser.state[table.parameters["flat"]]["exp_avg"][2].any()
 
 
 def test_shared_colour_is_that_of_the_colour_network_alone() -> None:

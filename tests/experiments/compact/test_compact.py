@@ -21,6 +21,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.compact import compact as compacting
 from gsx.experiments.compact.compact import File, compact
+from gsx.experiments.compact.reduction import Reduction
 from gsx.experiments.compact.shrink import (
     Shrinking,
     ShrinkOptions,
@@ -29,7 +30,6 @@ from gsx.experiments.compact.shrink import (
     figures,
     judges,
     learn_on,
-    without_least,
     worth_of,
 )
 from gsx.experiments.run_folder.files import read_run, state_of
@@ -67,9 +67,9 @@ def test_what_cannot_be_seen_is_worth_least(folder: Path) -> None:
     faint = add_faint(run)
     worth = worth_of(run, run.scene.train, generator())
     assert float(worth[faint].max()) < 1e-9 * float(worth.max())
-    assert int(without_least(worth, 0.5).sum()) == len(faint) // 2
     pictures = [render(run, view.camera).image for view in run.scene.train]
-    keep_rows(run.backbone.table, without_least(worth, 0.5))
+    Reduction(run.backbone.table, worth, None).apply(run.backbone.table, 0.5)
+    assert len(run.backbone.table) == len(faint) // 2
     for picture, view in zip(pictures, run.scene.train, strict=True):
         assert psnr(render(run, view.camera).image, picture) > 60
 
@@ -150,21 +150,40 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(folder: Path) ->
     assert torch.equal(run.backbone.table["means"], before)
 
 
-def test_the_smallest_within_the_budget_is_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drops that grow with the share: 0.3 dB is met up to 60 %, which five halvings find to 1 / 32."""
-    run = opened(folder)
-    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.3, steps=0, tries=5), plugins(), generator())
+def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tries lose half a dB of the share of their rows, and what is given of their degree; nothing is learnt."""
+    rows = len(shrinking.worth)
 
     def judged(share: float, degree: int) -> Try:
-        drop = 0.5 * share + {2: 0.0, 1: 0.01, 0: 0.4}[degree]
-        made = Try(removed=share, degree=degree, primitives=1, megabytes=1.0, psnr={"1": 30.0}, drop=drop)
+        left = round((1 - share) * rows)
+        size = left * shrinking.untouched.megabytes / rows * (14 + 3 * (degree + 1) ** 2 - 3) / (14 + 3 * 9 - 3)
+        drop = 0.5 * share + drops[degree]
+        made = Try(removed=share, degree=degree, primitives=left, megabytes=size, psnr={"1": 30.0}, drop=drop)
         shrinking.tried.append(made)
         return made
 
     monkeypatch.setattr(shrinking, "attempt", judged)
+
+
+@pytest.mark.parametrize(
+    ("drops", "degree", "most"),
+    [
+        ({2: 0.0, 1: 0.4, 0: 0.4}, 2, 0.6),  # no lower degree is within the budget
+        ({2: 0.0, 1: 0.01, 0: 0.4}, 1, 0.58),  # smaller than with all bands beyond a third of the rows
+        ({2: 0.0, 1: 0.0, 0: 0.1}, 0, 0.4),  # 14 numbers of 60 % of the rows, not 23 of 40 %
+    ],
+)
+def test_the_smallest_within_the_budget_is_found(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, drops: dict[int, float], degree: int, most: float
+) -> None:
+    """By drops that grow with the share, of which 0.3 dB are allowed."""
+    shrinking = Shrinking(opened(folder), ShrinkOptions(max_drop=0.3, steps=0, tries=5), plugins(), generator())
+    with_drops(shrinking, drops, monkeypatch)
     best = shrinking.smallest()
     assert [made.removed for made in shrinking.tried[:5]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
-    assert (best.removed, best.degree) == (0.59375, 2)  # a drop of 0.297; degree 1 adds 0.01
+    assert best.degree == degree
+    assert most - 1 / 32 < best.removed <= most
+    assert all(best.megabytes <= made.megabytes or made.drop > 0.3 for made in shrinking.tried)
 
 
 @pytest.mark.parametrize(
@@ -182,13 +201,13 @@ def test_a_model_that_leaves_room_for_a_quantised_file_is_taken_if_its_file_is_s
     rows = len(run.backbone.table)
     shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
     tries = [
-        Try(removed=share, degree=2, primitives=round((1 - share) * rows), megabytes=1.0, psnr={"1": 30.0}, drop=drop)
+        replace(shrinking.untouched, removed=share, megabytes=(1 - share) * shrinking.untouched.megabytes, drop=drop)
         for share, drop in ((0.5, 0.09), (0.25, 0.03), (0.75, 0.4))
     ]
     shrinking.tried += tries
     shrinking.take(tries[0])
 
-    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...]) -> dict[str, File]:
+    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...], degree: int) -> dict[str, File]:
         count = len(run.backbone.table)
         return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, lost), ".sog": File(40 * count, 1.0)}
 
@@ -204,11 +223,11 @@ def test_a_file_that_loses_more_than_it_was_expected_to_is_not_taken(
     run = opened(folder)
     rows = len(run.backbone.table)
     shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
-    best = Try(removed=0.5, degree=2, primitives=rows // 2, megabytes=1.0, psnr={"1": 30.0}, drop=0.09)
+    best = replace(shrinking.untouched, removed=0.5, megabytes=0.5 * shrinking.untouched.megabytes, drop=0.09)
     shrinking.tried.append(best)
     shrinking.take(best)
 
-    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...]) -> dict[str, File]:
+    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...], degree: int) -> dict[str, File]:
         count = len(run.backbone.table)
         return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, 0.05 if count < rows else 0.3)}
 

@@ -1,5 +1,7 @@
 """Nearest neighbours of points, exactly: a grid for the many, direct comparison for the few it cannot settle."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -25,48 +27,63 @@ def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> F
     With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0.
     """
     count = min(neighbours, len(points) - 1)
-    if count == 0:
-        return torch.zeros_like(points[:, 0])
-    nearest = points.new_empty(len(points), count)
+    return nearest(points, count)[0].mean(1) if count else torch.zeros_like(points[:, 0])
+
+
+def nearest(points: Float[Tensor, "P 3"], count: int) -> tuple[Float[Tensor, "P count"], Int[Tensor, "P count"]]:
+    """(squared distances to the nearest other points, ascending; which these are); `count` is 1..P - 1."""
+    squares = points.new_empty(len(points), count)
+    which = torch.empty(len(points), count, dtype=torch.long, device=points.device)
     pending = torch.arange(len(points), device=points.device)
     cell = 0.0
     if len(points) > DIRECT:  # a length that settles the densest: the lowest decile of a sample's distances
         sample = torch.linspace(0, len(points) - 1, SAMPLE, device=points.device).long()
-        cell = float(direct_squares(points, sample, count)[:, -1].quantile(0.1).sqrt()) or 1.0
+        cell = float(directly(points, sample, count)[0][:, -1].quantile(0.1).sqrt()) or 1.0
     while len(pending) > DIRECT:
-        found = torch.cat([near_squares(points, rows, cell, count) for rows in pending.split(BATCH)])
+        found, others = joined([in_cells(points, rows, cell, count) for rows in pending.split(BATCH)])
         settled = found[:, -1] <= cell**2  # whatever lies within one cell's length was among the candidates
-        nearest[pending[settled]] = found[settled]
+        squares[pending[settled]], which[pending[settled]] = found[settled], others[settled]
         pending, cell = pending[~settled], 2 * cell
-    nearest[pending] = direct_squares(points, pending, count)
-    return nearest.mean(1)
+    if len(pending):
+        squares[pending], which[pending] = directly(points, pending, count)
+    return squares, which
 
 
-def direct_squares(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Float[Tensor, "R count"]:
-    """Squared distances of some rows to their nearest other points, ascending."""
+Found = tuple[Float[Tensor, "R count"], Int[Tensor, "R count"]]
+"""Squared distances of rows to their nearest other points, ascending; which these are."""
+
+
+def joined(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Of all rows, from parts of them."""
+    squares, which = zip(*parts, strict=True)
+    return torch.cat(squares), torch.cat(which)
+
+
+def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Found:
+    """By comparison with all points."""
     parts = []
     for part in rows.split(max(1, CHUNK_VALUES // len(points))):
         distance = torch.cdist(points[part], points, compute_mode="donot_use_mm_for_euclid_dist")
         distance[torch.arange(len(part), device=points.device), part] = torch.inf
-        parts.append(distance.topk(count, dim=1, largest=False).values.square())
-    return torch.cat(parts) if parts else points.new_empty(0, count)
+        found = distance.topk(count, dim=1, largest=False)
+        parts.append((found.values.square(), found.indices))
+    return joined(parts)
 
 
-def near_squares(
-    points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, count: int
-) -> Float[Tensor, "R count"]:
-    """The same among points in the 27 cells around each row; inf where there are too few."""
+def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, count: int) -> Found:
+    """Among points in the 27 cells around each row; inf where there are too few."""
     owner, candidate = candidates(points, rows, cell)
     square = (points[rows[owner]] - points[candidate]).square().sum(1)
     by_distance = square.argsort(stable=True)
     order = by_distance[owner[by_distance].argsort(stable=True)]
-    owner, square = owner[order], square[order]
+    owner, candidate, square = owner[order], candidate[order], square[order]
     before = torch.searchsorted(owner, torch.arange(len(rows), device=rows.device))
     rank = torch.arange(len(owner), device=rows.device) - before[owner]
     found = points.new_full((len(rows), count), torch.inf)
+    which = torch.zeros(len(rows), count, dtype=torch.long, device=rows.device)
     kept = rank < count
-    found[owner[kept], rank[kept]] = square[kept]
-    return found
+    found[owner[kept], rank[kept]], which[owner[kept], rank[kept]] = square[kept], candidate[kept]
+    return found, which
 
 
 def candidates(

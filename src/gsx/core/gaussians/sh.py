@@ -70,7 +70,7 @@ def colours_of(
     compiled: bool = False,
 ) -> Float[Tensor, "N 3"]:
     """max(0, 0.5 + SH): colours seen along `offsets` (splat minus camera centre, any length) up to `degree`."""
-    colours = 0.5 + BAND_0 * constant[:, 0]
+    colours = colour_of_constant(constant[:, 0])
     if degree == 0:
         return colours.clamp_min(0)
     count = (degree + 1) ** 2 - 1
@@ -86,3 +86,8 @@ def colours_of(
 def constant_from_colour(colour: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Coefficient of the constant band that shows `colour` (display RGB in [0, 1])."""
     return (colour - 0.5) / BAND_0
+
+
+def colour_of_constant(constant: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """The colour that coefficients of the constant band show by themselves."""
+    return 0.5 + BAND_0 * constant

@@ -5,8 +5,7 @@ Both come from gradients of one render I of colours c_k by blending weights w_k,
 - dI/dc_k = w_k, so that sum_p M w_k is the gradient of sum_p M I with respect to c_k (M = squared error: who draws it);
 - dI/d ln o_k = w_k (c_k - b_k), b_k the colour behind k: just what a pixel loses when k is removed. Its square, summed
   over pixels, is the mean of the square of a gradient with M = random signs (Hutchinson 1989). The squared error grows
-  by that, and by a part linear in the error, which training has brought to nothing in the sum over views. So it does
-  where k has another colour c': by w_k (c' - c_k), squared.
+  by that, and by a part linear in the error, which training has brought to nothing in the sum over views.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -91,12 +90,11 @@ def removal_changes(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, 
     return change
 
 
-def recolouring_changes(
-    seen: Look, others: Float[Tensor, "K M 3"], signs: Float[Tensor, "3 H W"]
-) -> Float[Tensor, "K M"]:
-    """By how much the picture changes with other colours of each of the splats, summed over its values with signs."""
+def blending_squares(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+    """The square of each splat's blending weights summed over pixels with random signs, in the mean over channels. Its
+    mean is the sum over pixels of the squared weights."""
     (gradient,) = torch.autograd.grad(seen.image, [seen.colours], signs, retain_graph=True)
-    return ((others - seen.colours.detach()) * gradient).sum(2)
+    return gradient.square().mean(1)
 
 
 # -- by row of a model's table -----------------------------------------------------------------------------------------
@@ -132,9 +130,9 @@ def drawn_errors(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Removal:
-    """What N rows, or K parts of each, are worth to the pictures of some views."""
+    """What N rows are worth to the pictures of some views."""
 
-    squares: Float[Tensor, "*K N"]
+    squares: Float[Tensor, "N"]
     """Squared changes of the picture without them, in the mean over the views that show the row; 0 where none does."""
     shown: Float[Tensor, "N"]
     """How many views show it."""
@@ -148,8 +146,6 @@ class Removal:
 
 DRAWS = 32
 """Of random signs, at least, over all views."""
-Changes = Callable[[Look, Tensor], Tensor]
-"""(render, signs) -> [*K, M]: by how much the picture changes, as `removal_changes` tells it."""
 
 
 def draws_of_each(views: Sequence[View]) -> int:
@@ -164,14 +160,13 @@ def worth_of_rows(
     background: Float[Tensor, "3"],
     step: int,
     generator: torch.Generator,
-    changes: Changes = removal_changes,
 ) -> Removal:
-    """What the pictures of the views lose without each row, or by other changes of it."""
+    """What the pictures of the views lose without each row."""
     count, draws = len(model.table), draws_of_each(views)
     squares, shown, error = background.new_zeros(count), background.new_zeros(count), 0.0
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)
-        squares = squares + squared_changes(drawn, seen, view.counted(), count, draws, generator, changes)
+        squares += squared_changes(drawn, seen, view.counted(), count, draws, generator)
         shown += by_row(drawn, seen.visible, count) > 0
         error += float(difference(seen.image, view).double().square().sum())
     return Removal(squares=squares / shown.clamp_min(1), shown=shown, error_share=error / max(1.0, float(shown.sum())))
@@ -184,13 +179,12 @@ def squared_changes(
     count: int,
     draws: int,
     generator: torch.Generator,
-    changes: Changes = removal_changes,
-) -> Float[Tensor, "*K N"]:
-    """Squared change of a picture without each row, or by other changes of it, in the mean over draws of signs."""
+) -> Float[Tensor, "N"]:
+    """Squared change of a picture without each row, in the mean over draws of signs."""
     total = seen.log_opacities.new_zeros(count).detach()
     for _ in range(draws):
         signs = random_signs(seen.image.detach(), generator, counted)
-        total = total + by_row(drawn, changes(seen, signs), count).square() / draws
+        total += by_row(drawn, removal_changes(seen, signs), count).square() / draws
     return total
 
 

@@ -1,12 +1,14 @@
 """What a model learns: rows of parameters with their Adam state, edited together, and networks that all rows share.
 
-Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments and
-removed with their moments; a group's step count is never reset (3D-GS). A parameter touched by surgery
-is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the published code.
+Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments, unless
+others are given, and removed with their moments; a group's step count is never reset (3D-GS). A parameter touched by
+surgery is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the
+published code.
 """
 
 from collections import ChainMap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -65,6 +67,8 @@ class ParameterTable:
     networks: Networks | None = None
     record: dict[str, Tensor] = field(default_factory=dict)
     """What density control has found and decided so far, without rows."""
+    pace: float = 1.0
+    """All learning rates are multiplied by it (`training.cooldown`)."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -108,11 +112,14 @@ def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda old: torch.cat([old, new])
 
 
-def append_rows(table: ParameterTable, rows: dict[str, Tensor]) -> None:
-    """Append rows to every parameter and column; `rows` names all of them. Moments and statistics begin with 0."""
+def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping[str, Tensor] | None = None) -> None:
+    """Append rows to every parameter and column; `rows` names all of them. Moments and statistics begin with 0, second
+    moments with `squares` where these are given."""
     count = len(next(iter(rows.values())))
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
+    for name, moments in (squares or {}).items():
+        table.optimiser.state[table.parameters[name]]["exp_avg_sq"][-count:] = moments
     for name, column in table.columns.items():
         table.columns[name] = torch.cat([column, rows[name]])
     for name, sums in table.statistics.items():
@@ -132,6 +139,12 @@ def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
 def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
     """All parameters and columns by name, without gradient: what `append_rows` wants rows of."""
     return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
+
+
+def second_moments(table: ParameterTable) -> dict[str, Tensor]:
+    """Those of Adam by the name of the parameter, of parameters that have learnt."""
+    states = {name: table.optimiser.state.get(parameter) for name, parameter in table.parameters.items()}
+    return {name: state["exp_avg_sq"] for name, state in states.items() if state}
 
 
 def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
@@ -187,11 +200,26 @@ def zero_grad(table: ParameterTable) -> None:
 
 
 def take_adam_step(table: ParameterTable) -> None:
-    """Move everything that has a gradient by the learning rates set; then clear the gradients."""
-    table.optimiser.step()
-    if table.networks is not None:
-        table.networks.optimiser.step()
+    """Move everything that has a gradient by the learning rates set, times the table's pace; then clear the
+    gradients."""
+    networks = [] if table.networks is None else [table.networks.optimiser]
+    for optimiser in [table.optimiser, *networks]:
+        with paced(optimiser, table.pace):
+            optimiser.step()
     zero_grad(table)
+
+
+@contextmanager
+def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
+    """Learning rates are multiplied by that for a while."""
+    rates = [group["lr"] for group in optimiser.param_groups]
+    try:
+        for group, rate in zip(optimiser.param_groups, rates, strict=True):
+            group["lr"] = pace * rate
+        yield
+    finally:
+        for group, rate in zip(optimiser.param_groups, rates, strict=True):
+            group["lr"] = rate
 
 
 def size_of(table: ParameterTable) -> tuple[int, int]:

@@ -49,6 +49,9 @@ class TrainingOptions:
     coarse_until: Share = 0.0
     """Share of the steps after which they are seen as they are."""
     exposure: ExposureOptions = field(default_factory=ExposureOptions)
+    cooldown: Share = 0.0
+    """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
+    published: these stay as they are."""
 
     def __post_init__(self) -> None:
         if self.supersample_from == 1:
@@ -56,6 +59,11 @@ class TrainingOptions:
         if self.coarse & (self.coarse - 1):
             near = 1 << self.coarse.bit_length() - 1
             raise ValueError(f"training.coarse is {self.coarse}; give a power of two, for example {near}")
+
+    def pace(self, step: int, iterations: int) -> float:
+        """What learning rates are multiplied by at a step."""
+        steps = self.cooldown * iterations
+        return min(1.0, max(0.0, (iterations - step + 1) / steps)) if steps >= 1 else 1.0
 
     def resolution(self, scene: Scene, iterations: int) -> Resolution:
         """Of the training views in a run of so many steps."""

@@ -57,6 +57,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
         for seen in step.seen:
             run.backbone.accumulate(seen)
         step.changes.update(run.backbone.densify_and_prune(step.number))
+        run.backbone.table.pace = run.training.pace(step.number, run.iterations)
         run.backbone.update(step.number)
         run.exposures.update(step.number)
     run.step, run.changing = step.number, False

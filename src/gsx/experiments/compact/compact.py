@@ -19,7 +19,16 @@ from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
-from gsx.experiments.compact.shrink import Shrinking, ShrinkOptions, Try, figures, shorten_colours, told
+from gsx.experiments.compact.shrink import (
+    Shrinking,
+    ShrinkOptions,
+    Try,
+    degree_of_run,
+    figures,
+    shorten_colours,
+    told,
+    without_bands,
+)
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
@@ -150,12 +159,12 @@ def for_smallest_file(run: Run, shrinking: Shrinking, best: Try) -> Try:
     if own_columns(run) is not None:
         return best
     with TemporaryDirectory() as scratch:
-        files = written(run, shrinking, Path(scratch), (STANDARD, *FORMATS))
+        files = written(run, shrinking, Path(scratch), (STANDARD, *FORMATS), best.degree)
         most, options = files.pop(STANDARD).bytes, shrinking.options
         if any(best.drop + file.lost <= options.max_drop for file in files.values()):
             return best
         sizes = [
-            (file.bytes / best.primitives * made.primitives, suffix, made)
+            (file.bytes / best.megabytes * made.megabytes, suffix, made)
             for suffix, file in files.items()
             for made in shrinking.within(file.lost)[:1]
         ]
@@ -163,7 +172,7 @@ def for_smallest_file(run: Run, shrinking: Shrinking, best: Try) -> Try:
         for _, suffix, made in expected:
             logger.info("%d primitives instead, so that %s keeps the promise", made.primitives, suffix)
             shrinking.take(made)
-            file = written(run, shrinking, Path(scratch), (suffix,)).get(suffix)
+            file = written(run, shrinking, Path(scratch), (suffix,), made.degree).get(suffix)
             if file is not None and made.drop + file.lost <= options.max_drop and file.bytes < most:
                 return made
         if expected:
@@ -180,13 +189,14 @@ class File:
     """The most that it loses of the model at any zoom, in the views that judge, dB."""
 
 
-def written(run: Run, shrinking: Shrinking, folder: Path, suffixes: Sequence[str]) -> dict[str, File]:
-    """Files of the model in a folder, by suffix; without those that cannot be written."""
+def written(run: Run, shrinking: Shrinking, folder: Path, suffixes: Sequence[str], degree: int) -> dict[str, File]:
+    """Files of the model, with bands up to a degree, in a folder, by suffix; without those that cannot be written."""
     out, own = dict[str, File](), figures(run, shrinking.judging, [float(zoom) for zoom in shrinking.before])
     for suffix in suffixes:
         path = folder / f"point_cloud{suffix}"
         try:
-            export(run, path)
+            with without_bands(run, degree):
+                export(run, path)
             read = figures(run, shrinking.judging, [float(zoom) for zoom in own], read_gaussians(path))
             out[suffix] = File(path.stat().st_size, max(own[zoom] - read[zoom] for zoom in own))
         except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
@@ -201,7 +211,7 @@ def formats(run: Run, shrinking: Shrinking, lost: float, max_drop: float) -> dic
     a standard form."""
     if own_columns(run) is not None:
         return {}
-    files = written(run, shrinking, run.folder, (STANDARD, *FORMATS))
+    files = written(run, shrinking, run.folder, (STANDARD, *FORMATS), degree_of_run(run))
     out: dict[str, dict[str, Any]] = {
         suffix: {"bytes": file.bytes, "drop": lost + file.lost} for suffix, file in files.items()
     }

@@ -1,38 +1,44 @@
 """The smallest model within a quality budget: rows and bands of colour that no picture needs go, others learn on.
 
 What a row is worth is what the pictures of all training views lose without it, at their own size and in windows at
-twice their focal length, where small Gaussians count. How many go is found by bisection: a try removes the least worth,
+twice their focal length, where small Gaussians count. How many go, in the order of `reduction`, is found by bisection,
+for one degree of colour after the other. A try takes the colours of that degree that come nearest to what they were,
 learns on by the rates that training ended with, and is judged by training views that it does not learn from, beside the
 whole model after the same.
 """
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from statistics import fmean
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import TrainingError, first_line
 from gsx.core.gaussians.arrays import degree_of
+from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.gaussians.splat_files import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.evidence import draws_of_each, looked_at, squared_changes
+from gsx.core.training.colour_fits import colour_fits, fitted, take_coefficients
+from gsx.core.training.evidence import Forming, draws_of_each, looked_at, squared_changes
 from gsx.core.training.guard import Guard
-from gsx.core.training.parameter_table import edit, keep_rows, restored_table, size_of, table_tensors
+from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.supersampling import raster_at
 from gsx.core.training.trainer import train_step
+from gsx.experiments.compact.reduction import Reduction
 
 logger = logging.getLogger(__name__)
 
@@ -126,11 +132,14 @@ def pictures_of(view: View) -> list[tuple[Camera, Bool[Tensor, "H W"] | None]]:
     return [(view.camera, counted), (closer, finer[window.pixels])]
 
 
+def forming(run: Run) -> Forming:
+    """How the run's pictures come about."""
+    return partial(raster_at, scene=run.scene, supersample=run.resolution.supersample_at(run.model_step))
+
+
 def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Float[Tensor, "N"]:
     """What pictures lose without each row: squared changes of values, summed over views and windows."""
-    worth = torch.zeros(len(run.backbone.table), device=run.device)
-    supersample = run.resolution.supersample_at(run.model_step)
-    form = partial(raster_at, scene=run.scene, supersample=supersample)
+    worth, form = torch.zeros(len(run.backbone.table), device=run.device), forming(run)
     for view in views:
         for camera, counted in pictures_of(view):
             drawn, seen = looked_at(run.backbone, camera, form, run.background, run.model_step)
@@ -138,11 +147,23 @@ def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Flo
     return worth
 
 
-def without_least(worth: Float[Tensor, "N"], share: float) -> Bool[Tensor, "N"]:
-    """Rows that stay when that share goes."""
-    kept = torch.ones_like(worth, dtype=torch.bool)
-    kept[worth.argsort(stable=True)[: min(len(worth) - 1, round(share * len(worth)))]] = False
-    return kept
+def seen_colours(run: Run, lower: Sequence[Float[Tensor, "n 3 N"]]) -> Float[Tensor, "N 3"] | None:
+    """Colours of rows in the mean over the views that see them; None: they have none of their own."""
+    constant = run.backbone.table.parameters.get("sh_dc")
+    if constant is None:
+        return None
+    return colour_of_constant(constant.detach()[:, 0] + (lower[0][0].T if lower else 0.0))
+
+
+def colours_of_lower_degrees(
+    run: Run, views: Sequence[View], generator: torch.Generator
+) -> list[Float[Tensor, "n 3 N"]]:
+    """For each degree below the model's own the coefficients that change the pictures of views least."""
+    highest, (model, step) = degree_of_run(run), (run.backbone, run.model_step)
+    if highest < 1:
+        return []
+    fits = colour_fits(model, views, forming(run), run.background, step, generator, highest - 1)
+    return [fitted(fits, degree) for degree in range(highest)]
 
 
 # -- tries -------------------------------------------------------------------------------------------------------------
@@ -156,17 +177,23 @@ class Shrinking:
         self.learnt, self.judging = judges(run)
         self.before = figures(run, self.judging, options.zooms)
         self.worth = worth_of(run, run.scene.train, generator)
+        self.colours = colours_of_lower_degrees(run, run.scene.train, generator)
+        self.reduction = Reduction(run.backbone.table, self.worth, seen_colours(run, self.colours))
         self.whole = copied(table_tensors(run.backbone.table))
         learn_on(run, self.learnt, degree_of_run(run), options.steps, plugins)
         self.reference = figures(run, self.judging, options.zooms)
         """Of the whole model, which has learnt on like every try: views that judge are no longer learnt from."""
         self.tried: list[Try] = []
+        degree, (rows, size) = degree_of_run(run), size_of(run.backbone.table)
+        self.untouched = Try(removed=0.0, degree=degree, primitives=rows, megabytes=size / 1e6, psnr=self.before,
+                             drop=0.0)  # fmt: skip
+        """The model as it was."""
 
     def attempt(self, share: float, degree: int) -> Try:
         """Take the share and the bands above a degree away, learn on, judge. What cannot be learnt on drops without
         end."""
         run = self.run
-        self.cut(share)
+        self.cut(share, degree)
         try:
             learn_on(run, self.learnt, degree, self.options.steps, self.plugins)
             found = figures(run, self.judging, self.options.zooms)
@@ -191,44 +218,62 @@ class Shrinking:
         )
         return made
 
-    def cut(self, share: float) -> None:
-        """Give the run the whole model without the share of its rows that is worth least."""
+    def cut(self, share: float, degree: int) -> None:
+        """Give the run the whole model with a share of its rows less, and colours of a degree."""
         backbone = self.run.backbone
         backbone.table = restored_table(backbone.table, copied(self.whole))
-        keep_rows(backbone.table, without_least(self.worth, share))
+        if 0 <= degree < len(self.colours):
+            every = torch.ones_like(self.worth, dtype=torch.bool)
+            take_coefficients(backbone.table, every, self.colours[degree])
+        self.reduction.apply(backbone.table, share)
 
     def allowed(self, made: Try) -> bool:
         """Whether it is within the budget."""
         return made.drop <= self.options.max_drop
 
     def smallest(self) -> Try:
-        """The smallest model within the budget: rows first, then bands; the run holds it, unless it is as it was."""
-        best = Try(removed=0.0, degree=degree_of_run(self.run), primitives=len(self.worth), megabytes=0.0,
-                   psnr=self.before, drop=0.0)  # fmt: skip
-        share, step = 0.5, 0.25
-        for _ in range(self.options.tries):
-            made = self.attempt(share, best.degree)
-            best = made if self.allowed(made) else best
-            share, step = share + (step if self.allowed(made) else -step), step / 2
-        for degree in range(best.degree - 1, -1, -1):
-            made = self.attempt(best.removed, degree)
+        """The smallest model within the budget. The run holds the last try, or is as it was."""
+        degree = degree_of_run(self.run)
+        best = self.fewest_rows(degree, 0.0, 1.0) or self.untouched
+        for lower in range(degree - 1, -1, -1):
+            made = self.attempt(best.removed, lower)
             if not self.allowed(made):
-                break
+                found = self.fewest_rows(lower, self.share_as_small(best, lower), best.removed)
+                if found is None:
+                    break
+                made = found
             best = made
         return best
+
+    def fewest_rows(self, degree: int, least: float, most: float) -> Try | None:
+        """The try of a degree without the largest share of the rows between two, which is found to 2^-tries; None: none
+        is within the budget."""
+        best = None
+        while most - least > 2**-self.options.tries:
+            share = (least + most) / 2
+            made = self.attempt(share, degree)
+            if self.allowed(made):
+                best, least = made, share
+            else:
+                most = share
+        return best
+
+    def share_as_small(self, best: Try, degree: int) -> float:
+        """The share of the rows without which a model of a degree is as small as another."""
+        rows, size = size_of(self.run.backbone.table)
+        of_row = size_with(self.run, degree, size) / 1e6 / rows
+        return max(0.0, 1 - best.megabytes / (of_row * self.untouched.primitives))
 
     def within(self, lost: float) -> list[Try]:
         """The model as it was, and tries that leave room in the budget for so many dB that a file loses, smallest
         first."""
-        whole = Try(removed=0.0, degree=degree_of_run(self.run), primitives=len(self.worth), megabytes=math.inf,
-                    psnr=self.before, drop=0.0)  # fmt: skip
-        fitting = [made for made in [whole, *self.tried] if made.drop + lost <= self.options.max_drop]
-        return sorted(fitting, key=lambda made: (made.primitives, made.megabytes))
+        fitting = [made for made in [self.untouched, *self.tried] if made.drop + lost <= self.options.max_drop]
+        return sorted(fitting, key=lambda made: made.megabytes)
 
     def take(self, best: Try) -> None:
         """Make the run what a try was, learnt from all training views."""
         run = self.run
-        self.cut(best.removed)
+        self.cut(best.removed, best.degree)
         if best.removed or best.degree < degree_of_run(run):
             learn_on(run, run.scene.train, best.degree, self.options.steps, self.plugins)
 
@@ -251,18 +296,28 @@ def size_with(run: Run, degree: int, size: int) -> int:
 
 
 def learn_on(run: Run, views: Sequence[View], degree: int, steps: int, plugins: Plugins) -> None:
-    """So many steps more from some training views, by the rates and rules of the last step; bands above the degree stay
-    zero."""
-    step, seconds, scene, sampler = run.step, run.seconds, run.scene, run.sampler
-    run.scene, run.sampler = replace(scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
-    try:
+    """So many steps more from some training views, by the rules of the last step, with learning rates that go down to
+    nothing from what they were before any cooldown; bands above the degree stay zero."""
+    with extended(run, views, steps), plugins.listening([Guard()]):
         cut_bands(run, degree)
-        with plugins.listening([Guard()]):
-            for _ in range(steps):
-                train_step(run, plugins)
-                cut_bands(run, degree)
+        for _ in range(steps):
+            train_step(run, plugins)
+            cut_bands(run, degree)
+
+
+@contextmanager
+def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
+    """The run as one that ends so many steps later, with these training views; afterwards nothing has been counted."""
+    names = ("step", "iterations", "seconds", "scene", "sampler", "training")
+    before = {name: getattr(run, name) for name in names}
+    run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
+    run.iterations = run.step + steps
+    run.training = replace(run.training, cooldown=steps / run.iterations)
+    try:
+        yield
     finally:
-        run.step, run.seconds, run.scene, run.sampler = step, seconds, scene, sampler
+        for name, value in before.items():
+            setattr(run, name, value)
 
 
 @torch.no_grad()
@@ -276,6 +331,20 @@ def shorten_colours(run: Run, degree: int) -> None:
     """Drop the bands above a degree, with their moments, from the table; what draws it has to be built for that."""
     if "sh_rest" in run.backbone.table.parameters:
         edit(run.backbone.table, "sh_rest", *[lambda rows: rows[:, : BANDS[degree]]] * 2)
+
+
+@contextmanager
+def without_bands(run: Run, degree: int) -> Iterator[None]:
+    """Hold the bands above a degree back, for a while in which nothing is drawn or learnt."""
+    parameters = run.backbone.table.parameters
+    whole = parameters.get("sh_rest")
+    if whole is not None:
+        parameters["sh_rest"] = Parameter(whole.detach()[:, : BANDS[degree]])
+    try:
+        yield
+    finally:
+        if whole is not None:
+            parameters["sh_rest"] = whole
 
 
 def told(tries: Sequence[Try]) -> list[dict[str, object]]:

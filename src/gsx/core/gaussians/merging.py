@@ -1,0 +1,115 @@
+"""Two Gaussians made one: moments are kept, and by how much the field that they are changes with that.
+
+A Gaussian weighs as much as its opacity times its surface: what a viewer sees of it, not its volume (splat-transform,
+`--decimate-uniform`; NanoGS weighs volumes). The merged one has the means, covariances and colours of both by weight,
+with what the distance of the means adds to the covariance, and the opacity that keeps the weight.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
+from gsx.core.shapes import Float, Int
+
+Rows = Mapping[str, Tensor]
+"""Raw parameters of Gaussians by name, and whatever else belongs to them."""
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits")
+"""That rows have to have for merging."""
+POWER = 1.6075
+"""Of Thomsen's formula for the surface of an ellipsoid, which is off by at most 1.1 %."""
+LEAST_VARIANCE = 1e-30
+LEAST_RATIO = 1e-9
+"""Of the variance across a flat Gaussian to all of it, in integrals over space."""
+LARGEST_OPACITY = 1 - 1e-4
+
+
+def covariances(rows: Rows) -> Float[Tensor, "N 3 3"]:
+    """Of Gaussians by raw parameters, world units squared."""
+    spread = rotation_matrices(rows["quats"]) * rows["log_scales"].exp()[:, None]
+    return spread @ spread.mT
+
+
+def principal_axes(covariance: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
+    """(variances along the axes, ascending; unit quaternions of the axes)."""
+    variances, axes = torch.linalg.eigh(covariance)
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
+    return variances, normalize(quaternions_of(axes), dim=1)
+
+
+def surfaces(scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    """Of ellipsoids with these half axes (Thomsen's formula)."""
+    a, b, c = (scales.double() ** POWER).unbind(1)
+    return 4 * math.pi * ((a * b + a * c + b * c) / 3) ** (1 / POWER)
+
+
+def weights_of(rows: Rows) -> Float[Tensor, "N"]:
+    """Opacities times surfaces."""
+    return rows["opacity_logits"].double().sigmoid() * surfaces(rows["log_scales"].double().exp())
+
+
+def merged(rows: Rows, first: Int[Tensor, "P"], second: Int[Tensor, "P"]) -> dict[str, Tensor]:
+    """One row for each pair of rows: parameters and other numbers by weight, whole numbers of the first."""
+    weights = weights_of(rows)
+    total = weights[first] + weights[second]
+    share = weights[first] / total.clamp_min(torch.finfo(total.dtype).tiny)
+
+    def mean(value: Tensor) -> Tensor:
+        of_row = share.view(-1, *[1] * (value.dim() - 1))
+        return of_row * value[first].double() + (1 - of_row) * value[second].double()
+
+    out = {name: mean(value) if value.is_floating_point() else value[first] for name, value in rows.items()}
+    apart = (rows["means"][first].double() - rows["means"][second].double())[:, :, None]
+    between = (share * (1 - share))[:, None, None] * apart @ apart.mT
+    variances, quats = principal_axes(mean(covariances({name: rows[name].double() for name in PARAMETERS})) + between)
+    scales = variances.clamp_min(LEAST_VARIANCE).sqrt()
+    opacities = (total / surfaces(scales)).clamp_max(LARGEST_OPACITY)
+    out |= {"log_scales": scales.log(), "quats": quats, "opacity_logits": torch.logit(opacities, eps=1e-12)}
+    return {name: value.to(rows[name]) for name, value in out.items()}
+
+
+# -- what changes ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Densities:
+    """N densities opacity * colour * exp(-x^T covariance^-1 x / 2), float64."""
+
+    means: Float[Tensor, "N 3"]
+    covariances: Float[Tensor, "N 3 3"]
+    amplitudes: Float[Tensor, "N C"]
+
+    def at(self, index: Int[Tensor, "P"]) -> "Densities":
+        """Some of them."""
+        return Densities(**{name: value[index] for name, value in vars(self).items()})
+
+
+def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
+    """Of Gaussians with these colours. That something is there counts as a colour of 1: the dark covers, too."""
+    opacities = rows["opacity_logits"].double().sigmoid()[:, None]
+    seen = torch.cat([colours.double(), torch.ones_like(opacities)], 1)
+    double = {name: rows[name].double() for name in PARAMETERS}
+    spread = covariances(double)
+    least = LEAST_RATIO * spread.diagonal(dim1=1, dim2=2).sum(1) + LEAST_VARIANCE
+    solid = spread + least[:, None, None] * torch.eye(3, dtype=spread.dtype, device=spread.device)
+    return Densities(means=double["means"], covariances=solid, amplitudes=opacities * seen)
+
+
+def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:
+    """Integrals of one density times the other over space, summed over colours: (2 pi)^1.5 |A|^.5 |B|^.5 |A + B|^-.5
+    exp(-d^T (A + B)^-1 d / 2), d the distance of the means."""
+    both, apart = a.covariances + b.covariances, (a.means - b.means)[:, :, None]
+    exponent = (apart.mT @ torch.linalg.solve(both, apart))[:, 0, 0]
+    volumes = (torch.linalg.det(a.covariances) * torch.linalg.det(b.covariances) / torch.linalg.det(both)).sqrt()
+    return (a.amplitudes * b.amplitudes).sum(1) * (2 * math.pi) ** 1.5 * volumes * torch.exp(-exponent / 2)
+
+
+def changes(a: Densities, b: Densities, whole: Densities) -> Float[Tensor, "P"]:
+    """Integral of the squared difference of a + b and `whole`, as a share of that of (a + b)^2."""
+    before = products(a, a) + products(b, b) + 2 * products(a, b)
+    difference = before + products(whole, whole) - 2 * products(a, whole) - 2 * products(b, whole)
+    return difference.clamp_min(0) / before.clamp_min(torch.finfo(before.dtype).tiny)
