@@ -154,11 +154,11 @@ def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytes
     """Tries lose half a dB of the share of their rows, and what is given of their degree; nothing is learnt."""
     rows = len(shrinking.worth)
 
-    def judged(share: float, degree: int) -> Try:
+    def judged(share: float, degree: int, merging: bool) -> Try:
         left = round((1 - share) * rows)
         size = left * shrinking.untouched.megabytes / rows * (14 + 3 * (degree + 1) ** 2 - 3) / (14 + 3 * 9 - 3)
-        drop = 0.5 * share + drops[degree]
-        made = Try(removed=share, degree=degree, primitives=left, megabytes=size, psnr={"1": 30.0}, drop=drop)
+        drop = 0.5 * share + drops[degree] + (0.01 if merging else 0.0)
+        made = replace(shrinking.untouched, removed=share, degree=degree, merging=merging, megabytes=size, drop=drop)
         shrinking.tried.append(made)
         return made
 
@@ -180,8 +180,9 @@ def test_the_smallest_within_the_budget_is_found(
     shrinking = Shrinking(opened(folder), ShrinkOptions(max_drop=0.3, steps=0, tries=5), plugins(), generator())
     with_drops(shrinking, drops, monkeypatch)
     best = shrinking.smallest()
-    assert [made.removed for made in shrinking.tried[:5]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
-    assert best.degree == degree
+    assert [made.removed for made in shrinking.tried[2:7]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
+    assert [made.merging for made in shrinking.tried[:3]] == [True, False, False]
+    assert (best.degree, best.merging) == (degree, False)
     assert most - 1 / 32 < best.removed <= most
     assert all(best.megabytes <= made.megabytes or made.drop > 0.3 for made in shrinking.tried)
 

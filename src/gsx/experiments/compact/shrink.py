@@ -74,6 +74,8 @@ class Try:
     """Share of the rows that went."""
     degree: int
     """Highest degree of colour that is left; -1: the model has no bands of its own."""
+    merging: bool
+    """Whether rows could be merged with neighbours."""
     primitives: int
     megabytes: float
     psnr: dict[str, float]
@@ -178,22 +180,29 @@ class Shrinking:
         self.before = figures(run, self.judging, options.zooms)
         self.worth = worth_of(run, run.scene.train, generator)
         self.colours = colours_of_lower_degrees(run, run.scene.train, generator)
-        self.reduction = Reduction(run.backbone.table, self.worth, seen_colours(run, self.colours))
+        seen = seen_colours(run, self.colours)
+        self.reductions = {
+            way: Reduction(run.backbone.table, self.worth, seen if way else None) for way in (True, False)
+        }
+        """The order of rows by whether they may be merged."""
         self.whole = copied(table_tensors(run.backbone.table))
         learn_on(run, self.learnt, degree_of_run(run), options.steps, plugins)
         self.reference = figures(run, self.judging, options.zooms)
         """Of the whole model, which has learnt on like every try: views that judge are no longer learnt from."""
         self.tried: list[Try] = []
         degree, (rows, size) = degree_of_run(run), size_of(run.backbone.table)
-        self.untouched = Try(removed=0.0, degree=degree, primitives=rows, megabytes=size / 1e6, psnr=self.before,
-                             drop=0.0)  # fmt: skip
+        self.untouched = Try(removed=0.0, degree=degree, merging=False, primitives=rows, megabytes=size / 1e6,
+                             psnr=self.before, drop=0.0)  # fmt: skip
         """The model as it was."""
 
-    def attempt(self, share: float, degree: int) -> Try:
-        """Take the share and the bands above a degree away, learn on, judge. What cannot be learnt on drops without
-        end."""
+    def attempt(self, share: float, degree: int, merging: bool) -> Try:
+        """Take the share and the bands above a degree away, learn on, judge, unless that has been tried. What cannot be
+        learnt on drops without end."""
+        for made in self.tried:
+            if (made.removed, made.degree, made.merging) == (share, degree, merging):
+                return made
         run = self.run
-        self.cut(share, degree)
+        self.cut(share, degree, merging)
         try:
             learn_on(run, self.learnt, degree, self.options.steps, self.plugins)
             found = figures(run, self.judging, self.options.zooms)
@@ -205,6 +214,7 @@ class Shrinking:
         made = Try(
             removed=share,
             degree=degree,
+            merging=merging,
             primitives=rows,
             megabytes=size_with(run, degree, size) / 1e6,
             psnr=found,
@@ -213,45 +223,61 @@ class Shrinking:
         self.tried.append(made)
         told = ", ".join(f"x{zoom} {value:.2f}" for zoom, value in found.items())
         logger.info(
-            "%d primitives (%.0f %% less), degree %d: %s dB, a drop of %.2f: %s",
-            *(rows, 100 * share, degree, told, drop, "kept" if self.allowed(made) else "too much"),
+            "%d primitives (%.0f %% less%s), degree %d: %s dB, a drop of %.2f: %s",
+            *(
+                rows,
+                100 * share,
+                ", merging" if merging else "",
+                degree,
+                told,
+                drop,
+                "kept" if self.allowed(made) else "too much",
+            ),
         )
         return made
 
-    def cut(self, share: float, degree: int) -> None:
-        """Give the run the whole model with a share of its rows less, and colours of a degree."""
+    def cut(self, share: float, degree: int, merging: bool) -> None:
+        """Give the run the whole model with a share of its rows less, merged or not, and colours of a degree."""
         backbone = self.run.backbone
         backbone.table = restored_table(backbone.table, copied(self.whole))
         if 0 <= degree < len(self.colours):
             every = torch.ones_like(self.worth, dtype=torch.bool)
             take_coefficients(backbone.table, every, self.colours[degree])
-        self.reduction.apply(backbone.table, share)
+        self.reductions[merging].apply(backbone.table, share)
 
     def allowed(self, made: Try) -> bool:
         """Whether it is within the budget."""
         return made.drop <= self.options.max_drop
 
     def smallest(self) -> Try:
-        """The smallest model within the budget. The run holds the last try, or is as it was."""
-        degree = degree_of_run(self.run)
-        best = self.fewest_rows(degree, 0.0, 1.0) or self.untouched
+        """The smallest model within the budget. The run holds one of the tries, or is as it was."""
+        degree, merging = degree_of_run(self.run), self.merging_loses_less()
+        best = self.fewest_rows(degree, 0.0, 1.0, merging) or self.untouched
         for lower in range(degree - 1, -1, -1):
-            made = self.attempt(best.removed, lower)
+            made = self.attempt(best.removed, lower, merging)
             if not self.allowed(made):
-                found = self.fewest_rows(lower, self.share_as_small(best, lower), best.removed)
+                found = self.fewest_rows(lower, self.share_as_small(best, lower), best.removed, merging)
                 if found is None:
                     break
                 made = found
             best = made
         return best
 
-    def fewest_rows(self, degree: int, least: float, most: float) -> Try | None:
+    def merging_loses_less(self) -> bool:
+        """Whether less is lost where half of the rows are merged than where they are removed. Merged ones draw what
+        both drew, and learn less from there on: that pays where a model has no rows to spare."""
+        if not self.reductions[True].rows:
+            return False
+        merged, removed = (self.attempt(0.5, degree_of_run(self.run), way) for way in (True, False))
+        return merged.drop < removed.drop
+
+    def fewest_rows(self, degree: int, least: float, most: float, merging: bool) -> Try | None:
         """The try of a degree without the largest share of the rows between two, which is found to 2^-tries; None: none
         is within the budget."""
         best = None
         while most - least > 2**-self.options.tries:
             share = (least + most) / 2
-            made = self.attempt(share, degree)
+            made = self.attempt(share, degree, merging)
             if self.allowed(made):
                 best, least = made, share
             else:
@@ -273,7 +299,7 @@ class Shrinking:
     def take(self, best: Try) -> None:
         """Make the run what a try was, learnt from all training views."""
         run = self.run
-        self.cut(best.removed, best.degree)
+        self.cut(best.removed, best.degree, best.merging)
         if best.removed or best.degree < degree_of_run(run):
             learn_on(run, run.scene.train, best.degree, self.options.steps, self.plugins)
 
