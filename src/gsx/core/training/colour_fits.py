@@ -55,11 +55,6 @@ class ColourFits:
     error: float
     """Squared error of the views."""
 
-    def to(self, device: torch.device | str) -> "ColourFits":
-        """On a device."""
-        tensors = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return ColourFits(**tensors, error=self.error)
-
 
 def colour_fits(
     model: Backbone[Any],

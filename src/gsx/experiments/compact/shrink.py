@@ -254,14 +254,21 @@ class Shrinking:
         degree, merging = degree_of_run(self.run), self.merging_loses_less()
         best = self.fewest_rows(degree, 0.0, 1.0, merging) or self.untouched
         for lower in range(degree - 1, -1, -1):
-            made = self.attempt(best.removed, lower, merging)
-            if not self.allowed(made):
-                found = self.fewest_rows(lower, self.share_as_small(best, lower), best.removed, merging)
-                if found is None:
-                    break
-                made = found
-            best = made
+            found = self.smaller(best, lower, merging)
+            if found is None:
+                break
+            best = found
         return best
+
+    def smaller(self, best: Try, degree: int, merging: bool) -> Try | None:
+        """A try of a lower degree that is within the budget and smaller than another; None: none is."""
+        made = self.attempt(best.removed, degree, merging)
+        if self.allowed(made):
+            return made
+        least = self.share_as_small(best, degree)
+        if not self.allowed(self.attempt(least, degree, merging)):  # with fewer rows still less
+            return None
+        return self.fewest_rows(degree, least, best.removed, merging)
 
     def merging_loses_less(self) -> bool:
         """Whether less is lost where half of the rows are merged than where they are removed. Merged ones draw what
