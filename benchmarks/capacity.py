@@ -7,8 +7,9 @@ is measured. `growth`: every scene is trained as published, adaptively, and with
 published ends with, and of fewer, beside published growth held at that cap; the same steps. `compact`: the published
 runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
 numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
-published runs in which learning rates go down to nothing at the end, beside published ones. Finished runs below --runs
-are not trained again. A quarter of an hour of two cores for a scene, a backbone and a seed.
+published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`: longer runs that
+leave out steps which gain too little, beside such that take them all. Finished runs below --runs are not trained
+again. A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from gsx.core.files import read_json
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from measuring.runs import gsx, train
-from zoom import over_seeds, shared_arguments, told
+from zoom import over_seeds, shared_arguments, steps_among, told
 
 RESULTS = Path(__file__).parent / "results"
 SUBJECTS = {
@@ -53,9 +54,12 @@ ZOOMS = ("1", "2", "4")
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, "fox,fox_4,lego,castle,demo", "outputs/capacity")
-    parser.add_argument("--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown")
+    parser.add_argument(
+        "--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown, plateau"
+    )
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
+    parser.add_argument("--prices", default="1", help="of a doubling of the steps, dB, by commas")
     parser.add_argument("--cooldowns", default="0.2", help="shares of the steps, by commas")
     parser.add_argument("--label", default="", help="of tables over other scenes, seeds or rows: added to their names")
     return parser.parse_args(words)
@@ -175,6 +179,48 @@ def cooled_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]
         for scene in scenes
         for share in (0.0, *shares)
     ]
+
+
+# -- steps that gain too little ----------------------------------------------------------------------------------------
+
+TIMES_AS_MANY = 3
+"""Steps of these runs, over those of the others."""
+PLATEAU_COLUMNS = [
+    *([key, "price" if key == "arm" else label.replace("published", "all steps")] for key, label in COLUMNS[:-2]),
+    *(["left", "steps left out"], ["seconds", "training s"], ["times", "of all steps"]),
+]
+PLATEAU_NOTE = (
+    "`training.plateau.price`: dB that a doubling of the steps has to bring in validation windows, or the run goes on "
+    f"with its last fifth; 0: all steps are taken. {TIMES_AS_MANY} times the steps of the other tables. PSNR on held-"
+    "out views, dB, means over seeds ± half their range; differences and shares seed by seed, times are medians."
+)
+
+
+def patient(scene: str, price: float, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+    """Evaluation of a longer run, with how many steps it has left out."""
+    folder = given.runs / f"{backbone}_{scene}_plateau_{price:g}_{seed}"
+    words = words_of([PUBLISHED, f"training.plateau.price={price:g}"], scene, backbone, seed, given)
+    steps = TIMES_AS_MANY * steps_among(words)
+    words = [word for word in words if not word.startswith("iterations=")]
+    found = trained(folder, [*words, f"iterations={steps}"], given)
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return found | {"left": sum(line.get("steps_left_out", 0) for line in lines) / steps}
+
+
+def patient_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes, prices = scenes_of(given), [0.0, *(float(price) for price in given.prices.split(","))]
+
+    def look(scene: str, seed: int) -> dict[float, Any]:
+        return {price: patient(scene, price, backbone, seed, given) for price in prices}
+
+    found, rows = over_seeds(look, scenes, given), []
+    for scene in scenes:
+        for price in prices:
+            own, first = ([one[which] for one in found[scene]] for which in (price, 0.0))
+            row = row_of(scene, f"{price:g}", own, first)
+            rows.append(row | {"left": f"{statistics.mean(run['left'] for run in own):.2f}"})
+    return rows
 
 
 # -- bands of colour ---------------------------------------------------------------------------------------------------
@@ -391,6 +437,9 @@ def main(words: Sequence[str]) -> None:
         if "cooldown" in given.what:
             title, rows = f"Learning rates of {backbone} that go down at the end", cooled_rows(backbone, given)
             tables[f"{backbone}_cooldown"] = stamped(title, COOLDOWN_COLUMNS, rows, [COOLDOWN_NOTE], load, command)
+        if "plateau" in given.what:
+            title, rows = f"Steps of {backbone} that gain too little", patient_rows(backbone, given)
+            tables[f"{backbone}_plateau"] = stamped(title, PLATEAU_COLUMNS, rows, [PLATEAU_NOTE], load, command)
         if "compact" in given.what:
             title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
             tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)

@@ -14,7 +14,7 @@ from test_anchors import small_anchors
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
-from gsx.backbones.adaptive import Adaptive, AdaptiveOptions, decibels, part_of
+from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Budget, BudgetOptions, Growing
 from gsx.backbones.gs3d import gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
@@ -24,6 +24,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
+from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
@@ -280,6 +281,19 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
     done = judge.judge(model, lambda table: None, 14900)
     assert done["removed"] >= 20
     assert len(model.table) == 40 - done["removed"] > 0
+    assert bool((model.table["opacity_logits"] > -15).all())
+
+
+def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an error, a share of it would be a price that nothing is below."""
+    monkeypatch.setattr("gsx.core.training.evidence.difference", lambda image, view: torch.zeros_like(image))
+    scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    with torch.no_grad():
+        model.table["opacity_logits"][:20] = -1
+        model.table["opacity_logits"][20:] = -15
+        model.table["log_scales"].fill_(-1.5)
+    assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())
 
 

@@ -14,25 +14,21 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from gsx.backbones.capacity import Growing, Undone, error_exponent, worth_in_training
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
-from gsx.core.seeds import derived_seed
-from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import window_errors
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
+from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
 logger = logging.getLogger(__name__)
 
 SLOWER, FASTER = 0.5, 1.5
 """By how much the rate of growth changes from one event to the next, at most."""
-ROUNDING = 1 / (12 * 255**2)
-"""Squared error of a photograph's own rounding to 8 bits: what lies below it is no evidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,11 +86,7 @@ class Adaptive:
     def windows(self, step: int) -> dict[View, Window]:
         """The windows that count in no loss at a step: those of the interval between events that it belongs to."""
         views, interval = self.context.resolution.views(step), (step - 1) // self.growing.every
-        generator = torch.Generator().manual_seed(derived_seed("withheld", interval))
-        order = torch.randperm(len(views), generator=generator)[: self.options.views].tolist()
-        corners = torch.rand(len(order), 2, generator=generator).tolist()
-        chosen = zip([views[index] for index in order], corners, strict=True)
-        return {view: part_of(view, self.options.window, *corner) for view, corner in chosen}
+        return validation_windows(views, self.options.views, self.options.window, "withheld", interval)
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """That of the interval which the step belongs to, while there is something to judge."""
@@ -123,7 +115,7 @@ class Adaptive:
             return {}
         windows = self.windows(step)
         form = self.context.resolution.forming(step)
-        floor = ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows.values()])
+        floor = rounding_in(windows.values())
 
         def look() -> tuple[float, float]:
             both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))
@@ -144,11 +136,11 @@ class Adaptive:
         """Remove rows without which the error of the training views would grow by less than their share of the price.
 
         A view that shows N rows may lose lambda / (N ln 2) dB with one of them, lambda being the price: lambda ln 10 /
-        (10 N ln 2) of its squared error, as that will be in the end. Rows are judged in the mean over the views that
-        show them.
+        (10 N ln 2) of its squared error, as that will be in the end, with that of the photograph's rounding. Rows
+        are judged in the mean over the views that show them.
         """
         found = worth_in_training(model, self.context, step)
-        lasting = self.options.discount * found.error_share
+        lasting = self.options.discount * found.error_share + found.rounding_share
         least = error_exponent(self.options.price) * lasting
         doomed = (found.shown > 0) & (found.squares < least)
         if bool(doomed.all()):
@@ -188,17 +180,3 @@ class Adaptive:
     def plan(self) -> dict[str, Any]:
         """The price."""
         return {"capacity": {"price_db_per_doubling": self.options.price, "events": self.growing.events()}}
-
-
-def part_of(view: View, share: float, right: float, down: float) -> Window:
-    """A window with that share of a view's sides; where it lies, from 0 (left, top) to 1."""
-    width, height = (max(1, round(share * side)) for side in view.camera.size)
-    left, top = round(right * (view.camera.width - width)), round(down * (view.camera.height - height))
-    return Window(left, top, width, height)
-
-
-def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:
-    """(gain in dB from the squared errors `had` to `has`, summed over windows; its standard error over the windows)."""
-    gain = 10 * math.log10(float(had.sum() / has.sum()))
-    spread = float((had - has).std(correction=1)) * math.sqrt(len(has)) if len(has) > 1 else math.inf
-    return gain, 10 / math.log(10) * spread / float(had.sum())

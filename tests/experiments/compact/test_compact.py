@@ -1,6 +1,7 @@
 """gsx compact: what pictures do not need goes, what is promised is kept, a run folder comes out."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from gsx.experiments.compact.shrink import (
     Shrinking,
     ShrinkOptions,
     Try,
+    above_rounding,
     closer_window,
     figures,
     judges,
@@ -235,6 +237,12 @@ def test_a_file_that_loses_more_than_it_was_expected_to_is_not_taken(
     monkeypatch.setattr(compacting, "written", sizes)
     assert compacting.for_smallest_file(run, shrinking, best) == best
     assert len(run.backbone.table) == rows // 2
+
+
+@pytest.mark.parametrize(("found", "told"), [(30.0, 29.994), (math.inf, 58.923), (58.923, 55.912)])
+def test_figures_tell_nothing_that_photographs_cannot(found: float, told: float) -> None:
+    """Rounding to 8 bits is off by 1/255/sqrt(12) in the mean."""
+    assert above_rounding(found) == pytest.approx(told, abs=0.002)
 
 
 def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:

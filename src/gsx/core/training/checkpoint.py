@@ -21,7 +21,7 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 SCHEMA = 1
-GENERATOR, EXPOSURE = "run.generator", "exposure."
+GENERATOR, EXPOSURE, PLATEAU = "run.generator", "exposure.", "plateau."
 LONGEST = 1e12
 """Seconds that no training takes."""
 
@@ -42,7 +42,8 @@ def write(run: Run, folder: Path) -> Path:
     from safetensors.torch import save as to_bytes
 
     of_exposures = {EXPOSURE + name: value for name, value in run.exposures.tensors().items()}
-    held = table_tensors(run.backbone.table) | of_exposures
+    of_plateau = {PLATEAU + name: value for name, value in run.plateau.tensors().items()}
+    held = table_tensors(run.backbone.table) | of_exposures | of_plateau
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in held.items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
@@ -163,6 +164,11 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]
     raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
 
 
+def taken_out(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those whose names begin so, without that beginning; they are in the others no more."""
+    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
+
+
 def restore(run: Run, training: bool = False) -> None:
     """Bring a freshly built run to the state of its newest checkpoint.
 
@@ -179,8 +185,8 @@ def restore(run: Run, training: bool = False) -> None:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
-    of_exposures = [name for name in tensors if name.startswith(EXPOSURE)]
-    run.exposures.restore({name.removeprefix(EXPOSURE): tensors.pop(name) for name in of_exposures})
+    run.exposures.restore(taken_out(tensors, EXPOSURE))
+    run.plateau.restore(taken_out(tensors, PLATEAU))
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

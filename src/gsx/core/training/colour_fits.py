@@ -29,6 +29,7 @@ from gsx.core.training.evidence import (
     draws_of_each,
     looked_at,
     random_signs,
+    rounding_of,
 )
 from gsx.core.training.parameter_table import ParameterTable
 
@@ -53,7 +54,7 @@ class ColourFits:
     shown: Float[Tensor, "N"]
     """How many views show the row."""
     error: float
-    """Squared error of the views."""
+    """Squared error of the views, with that of the rounding of their photographs."""
 
 
 def colour_fits(
@@ -79,7 +80,7 @@ def colour_fits(
         products += by_row(drawn, weighted[:, None] * colours, count)
         norms += by_row(drawn, weights * colours.square().sum(0), count)
         shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view).double().square().sum())
+        error += float(difference(seen.image, view).double().square().sum()) + rounding_of(view)
     return ColourFits(grams=grams, products=products, norms=norms, own=own, shown=shown, error=error)
 
 

@@ -26,6 +26,8 @@ from gsx.core.training.backbone import Backbone, Drawn
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.supersampling import FinerRaster
 
+ROUNDING = 1 / (12 * 255**2)
+"""Squared error of a value that is rounded to 8 bits: what lies below it is no evidence."""
 Forming = Callable[[Camera], FinerRaster]
 """How a camera's picture comes about at a step (`training.supersample`)."""
 
@@ -63,6 +65,12 @@ def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background:
 def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
     """A render less the photograph of its view; 0 where that does not count."""
     return blacked(image.detach() - view.image().to(image), view.counted())
+
+
+def rounding_of(view: View) -> float:
+    """Squared error of a photograph's rounding to 8 bits, summed over the values that count."""
+    counted = view.counted()
+    return 3 * ROUNDING * (view.camera.width * view.camera.height if counted is None else int(counted.sum()))
 
 
 def error_sums(seen: Look, off: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
@@ -138,6 +146,8 @@ class Removal:
     """How many views show it."""
     error_share: float
     """Squared error of the views over the rows that they show, summed over views."""
+    rounding_share: float
+    """The like of photographs' own rounding: what no model can do better than."""
 
     def to(self, device: torch.device | str) -> "Removal":
         """On a device."""
@@ -163,13 +173,16 @@ def worth_of_rows(
 ) -> Removal:
     """What the pictures of the views lose without each row."""
     count, draws = len(model.table), draws_of_each(views)
-    squares, shown, error = background.new_zeros(count), background.new_zeros(count), 0.0
+    squares, shown, error, rounding = background.new_zeros(count), background.new_zeros(count), 0.0, 0.0
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)
         squares += squared_changes(drawn, seen, view.counted(), count, draws, generator)
         shown += by_row(drawn, seen.visible, count) > 0
         error += float(difference(seen.image, view).double().square().sum())
-    return Removal(squares=squares / shown.clamp_min(1), shown=shown, error_share=error / max(1.0, float(shown.sum())))
+        rounding += rounding_of(view)
+    all_shown = max(1.0, float(shown.sum()))
+    shares = {"error_share": error / all_shown, "rounding_share": rounding / all_shown}
+    return Removal(squares=squares / shown.clamp_min(1), shown=shown, **shares)
 
 
 def squared_changes(

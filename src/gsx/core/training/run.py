@@ -22,6 +22,7 @@ from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
+from gsx.core.training.plateau import Plateau, PlateauOptions
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
 
@@ -52,6 +53,7 @@ class TrainingOptions:
     cooldown: Share = 0.0
     """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
     published: these stay as they are."""
+    plateau: PlateauOptions = field(default_factory=PlateauOptions)
 
     def __post_init__(self) -> None:
         if self.supersample_from == 1:
@@ -179,11 +181,13 @@ class Run:
     """How many bytes photographs may take on the device (`core.training.photographs`)."""
     photographs: Photographs = field(init=False)
     exposures: Exposures = field(init=False)
+    plateau: Plateau = field(init=False)
 
     def __post_init__(self) -> None:
         self.photographs = Photographs(self.device, self.photograph_bytes)
         names = [view.name for view in self.scene.train]
         self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
+        self.plateau = Plateau(self.training.plateau, self.iterations, len(names))
 
     @property
     def complete(self) -> bool:

@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
+from gsx.core.data.window import Window
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
@@ -19,6 +20,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
+from gsx.core.training.evidence import window_errors
 from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
@@ -46,6 +48,7 @@ def train(run: Run, plugins: Plugins) -> None:
 def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
     told = judge_exposures(run) if run.exposures.due(run.step + 1) else {}
+    told |= judge_steps(run)
     with taken_or_not(run):
         step = backward(run)
         step.changes.update(told)
@@ -75,6 +78,33 @@ def judge_exposures(run: Run) -> dict[str, float]:
     logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
     seconds = round(time.perf_counter() - begun, 3)
     return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
+
+
+def judge_steps(run: Run) -> dict[str, float]:
+    """Find whether the last steps have gained what steps are to gain, where that is due; if not, all up to the last
+    part of the run are left out. For the line of the next step."""
+    plateau, done = run.plateau, run.step
+    told, begins = dict[str, float](), plateau.begins_after(done)
+    if plateau.judged_after(done):
+        windows = plateau.windows(run.resolution.views(done))
+        told = plateau.judge(list(windows.values()), errors_in(run, windows, done), done)
+        plateau.end()
+        if plateau.reached:
+            run.step = plateau.last - 1
+            logger.info("step %d: the run goes on with step %d", done, plateau.last)
+            return told | {"steps_left_out": run.step - done}
+    if begins:
+        plateau.begin(done)
+        plateau.before = errors_in(run, plateau.windows(run.resolution.views(done + 1)), done + 1)
+    return told
+
+
+def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tensor, "W"]:
+    """Squared error in each validation window by the rules of a step, the same on all ranks."""
+    model, form = run.backbone, run.resolution.forming(step)
+    return run.ranks.broadcast(
+        lambda: window_errors(model, model.table, windows, form, run.background, max(1, run.step)).cpu()
+    )
 
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:
@@ -163,13 +193,17 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
 
 
 def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | None:
-    """Pixels that count: all but those masked, and those of a window that the backbone keeps to judge by."""
+    """Pixels that count: all but those masked, and those of windows that are kept to judge by: the backbone's own, and
+    those that judge the steps."""
     counted = view.counted()
-    window = run.backbone.validation_window(view, number) if isinstance(run.backbone, Validating) else None
-    if window is None:
+    withheld = [run.backbone.validation_window(view, number)] if isinstance(run.backbone, Validating) else []
+    withheld.append(run.plateau.window(run.resolution.views(number), view, number))
+    windows = [window for window in withheld if window is not None]
+    if not windows:
         return counted
     left = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
-    left[window.pixels] = False
+    for window in windows:
+        left[window.pixels] = False
     return left
 
 

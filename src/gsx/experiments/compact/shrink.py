@@ -31,7 +31,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.colour_fits import colour_fits, fitted, take_coefficients
-from gsx.core.training.evidence import Forming, draws_of_each, looked_at, squared_changes
+from gsx.core.training.evidence import ROUNDING, Forming, draws_of_each, looked_at, squared_changes
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
@@ -98,13 +98,20 @@ def judges(run: Run) -> tuple[list[View], list[View]]:
 def figures(
     run: Run, views: Sequence[View], zooms: Sequence[float], gaussians: Gaussians | None = None
 ) -> dict[str, float]:
-    """Mean PSNR over views by zoom, dB; zooms without truth are left out. gaussians: drawn in place of the model."""
+    """Mean PSNR over views by zoom, dB, no higher than photographs of 8 bits tell; zooms without truth are left out.
+    gaussians: drawn in place of the model."""
     out = {}
     for factor in zooms:
         closer = [zoomed for view in views if (zoomed := view.zoom(factor)) is not None]
         if closer:
-            out[f"{factor:g}"] = fmean(psnr(shown(run, v, gaussians), v.image(), v.counted()) for v in closer)
+            values = [psnr(shown(run, v, gaussians), v.image(), v.counted()) for v in closer]
+            out[f"{factor:g}"] = fmean(above_rounding(value) for value in values)
     return out
+
+
+def above_rounding(decibels: float) -> float:
+    """PSNR with the rounding of the photograph to 8 bits added to the squared error: 58.9 dB at most."""
+    return -10 * math.log10(10 ** (-decibels / 10) + ROUNDING)
 
 
 def shown(run: Run, view: View, gaussians: Gaussians | None) -> Float[Tensor, "3 H W"]:

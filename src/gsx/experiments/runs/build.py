@@ -229,7 +229,7 @@ def regenerator_of(role: str, settings: Settings) -> Regenerator:
 
 
 def plan_of(run: Run) -> dict[str, Any]:
-    """The rescaled schedules of the backbone and of the augmenters."""
+    """The rescaled schedules of the backbone, of the loop and of the augmenters."""
     names = run.config.get("augmenter") or {}
     own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
-    return own | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}
+    return own | run.plateau.plan() | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}
