@@ -170,8 +170,7 @@ def cooled_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]
     scenes, shares = scenes_of(given), [float(share) for share in given.cooldowns.split(",")]
 
     def look(scene: str, seed: int) -> dict[float, Any]:
-        first = {0.0: evaluation_of("published", scene, backbone, seed, given)}
-        return first | {share: cooled(scene, share, backbone, seed, given) for share in shares}
+        return {share: cooled(scene, share, backbone, seed, given) for share in (0.0, *shares)}
 
     found = over_seeds(look, scenes, given)
     return [

@@ -146,7 +146,7 @@ class PseudoDetails:
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
-        fresh = run.step == event
+        fresh = run.step == event or begins_late(run, event)
         made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
             run.ranks.all_gather(None)  # the others wait for the file
@@ -154,7 +154,7 @@ class PseudoDetails:
 
     def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
         """The pseudo views of an event that begins with this step, made and written to its file."""
-        steps = min(self.span, run.iterations - event)
+        steps = min(event + self.span, run.iterations) - run.step
         views, facts = self.made(run, event, {view, *run.sampler.taken} | run.sampler.coming(steps - 1))
         self.store.write(run, event, views, facts)
         return views
@@ -177,11 +177,13 @@ class PseudoDetails:
             for factor in self.options.coarser
         ]
         facts: dict[str, Any] = {
+            **self.regenerator.tally.account(
+                run.step
+            ),  # the step before which they are made: late, where it was left out
             "event": event,
             "iterations": self.context.iterations,
             "made": len(views),
             "learnt": learnt,
-            **self.regenerator.tally.account(event),
         }
         counted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
         kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
@@ -202,3 +204,9 @@ def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
     for view in views:
         found.setdefault(view.parent, []).append(view)
     return found
+
+
+def begins_late(run: Run, event: int) -> bool:
+    """Whether the first step of an event was left out (`core.training.plateau`), and the first one taken is next."""
+    left_out = run.plateau.left_out
+    return event + 1 in left_out and run.step + 1 == left_out.stop

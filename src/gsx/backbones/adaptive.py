@@ -115,7 +115,7 @@ class Adaptive:
             return {}
         windows = self.windows(step)
         form = self.context.resolution.forming(step)
-        floor = rounding_in(windows.values())
+        floor = rounding_in(windows)
 
         def look() -> tuple[float, float]:
             both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))

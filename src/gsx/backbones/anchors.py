@@ -178,6 +178,10 @@ class Anchors:
         """When anchors grow and go."""
         return growing_of(self.options.growth, self.schedule)
 
+    def settles(self) -> list[int]:
+        """When growth ends."""
+        return [self.growing().stop]
+
     def validation_window(self, view: View, step: int) -> Window | None:
         """What capacity is judged by."""
         return self.capacity.validation_window(self.table, view, step)

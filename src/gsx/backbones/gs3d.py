@@ -191,6 +191,10 @@ class GS3D:
             done |= self.judge_degrees(step)
         return done
 
+    def settles(self) -> list[int]:
+        """When density control ends, and colours are judged."""
+        return [self.control.ends(), self.sh_step()]
+
     def sh_step(self) -> int:
         """Step at which SH degrees are judged; 0: at none."""
         return round(self.options.sh_judged * self.schedule.iterations)

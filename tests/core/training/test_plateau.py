@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_scene import small_scene, spread
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
@@ -15,10 +16,14 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
+from gsx.core.training.validation import rounding_in
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 
 WORDS = (
+    "backbone.density.stop=6000",
     "iterations=40",
     "training.plateau.start=0.25",
     "rasterizer=eager",
@@ -34,39 +39,75 @@ def steps_of(folder: Path) -> list[int]:
     return [json.loads(line)["step"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+def plateau_of(price: float, passing: int, **more: int) -> Plateau:
+    return Plateau(PlateauOptions(price=price), iterations=1000, passing=passing, **more)
+
+
+def begun(price: float, before: list[float], step: int = 500) -> Plateau:
+    """125 views; windows began with these errors."""
+    plateau = plateau_of(price, 125)
+    plateau.begin(step, torch.tensor(before, dtype=torch.float64))
+    return plateau
+
+
+def windows_of(*sides: int) -> dict[View, Window]:
+    views = small_scene(spread(1), views=len(sides)).train
+    return {view: Window(0, 0, side, side) for view, side in zip(views, sides, strict=True)}
+
+
 def test_when_steps_are_judged() -> None:
     """A tenth of the steps so far or a pass over the views, whatever is more; while there are steps to leave out."""
-    plateau = Plateau(PlateauOptions(price=1.0), iterations=1000, passing=52)
+    plateau = plateau_of(1.0, 52)
     assert [step for step in range(1000) if plateau.begins_after(step)] == [500]
-    plateau.begin(500)
+    plateau.begin(500, torch.zeros(1))
     assert [step for step in range(1000) if plateau.judged_after(step)] == [552]
     assert plateau.begins_after(552)
-    plateau.begin(552)
-    assert plateau.ends(552) == 608
-    plateau.begin(700)
+    plateau.begin(700, torch.zeros(1))
+    assert [step for step in range(1000) if plateau.judged_after(step)] == [770]
     assert not plateau.begins_after(770)  # its windows would be judged after step 847
-    assert Plateau(PlateauOptions(), iterations=1000, passing=52).begins_after(500) is False
+    assert not any(plateau_of(0.0, 52).begins_after(step) for step in range(1000))
 
 
-def test_gain_by_hand() -> None:
-    """Half the error by a quarter more steps: 3.01 dB by 0.32 doublings."""
-    plateau = Plateau(PlateauOptions(price=9.5), iterations=1000, passing=125)
-    plateau.begin(500)
-    plateau.before = torch.tensor([6e6, 2e6], dtype=torch.float64)
-    windows = [Window(0, 0, 10, 10)] * 2
-    told = plateau.judge(windows, torch.tensor([3e6, 1e6], dtype=torch.float64), 625)
-    assert told["step_gain"] == pytest.approx(10 * math.log10(2) / math.log2(1.25))
-    assert plateau.reached  # 9.35 dB
-    plateau.options = PlateauOptions(price=9.0)
-    assert not plateau.reached
+def test_nothing_that_is_due_once_is_left_out() -> None:
+    plateau = plateau_of(1.0, 52, settled=625)
+    assert [step for step in range(1000) if plateau.begins_after(step)] == [625]
+
+
+def test_windows_of_another_schedule_are_not_judged() -> None:
+    """The run has become longer since: they began before density control ends now."""
+    plateau = plateau_of(1.0, 52)
+    plateau.begin(500, torch.zeros(1))
+    plateau.iterations = 2000
+    assert not any(plateau.judged_after(step) for step in range(2000))
+    assert [step for step in range(2000) if plateau.begins_after(step)] == [1000]
+
+
+@pytest.mark.parametrize(("price", "left_out"), [(9.5, range(626, 800)), (9.0, range(0))])
+def test_gain_by_hand(price: float, left_out: range) -> None:
+    """Half the error by a quarter more steps: 3.01 dB by 0.32 doublings, 9.35 dB a doubling."""
+    plateau = begun(price, [6e6, 2e6])
+    plateau.judge(windows_of(10, 10), torch.tensor([3e6, 1e6], dtype=torch.float64), 625)
+    assert plateau.found[0, :2].tolist() == pytest.approx([625, 10 * math.log10(2) / math.log2(1.25)])
+    assert plateau.left_out == left_out
+    told = {"step_gain": float(plateau.found[0, 1]), "step_price": price}
+    assert plateau.told_at(626) == told
+    assert plateau.told_at(800) == (told | {"steps_left_out": 174} if left_out else {})
+    assert plateau.told_at(627) == {}
 
 
 def test_errors_below_the_rounding_of_photographs_are_no_gain() -> None:
-    plateau = Plateau(PlateauOptions(price=0.1), iterations=1000, passing=125)
-    plateau.begin(500)
-    plateau.before = torch.tensor([1e-9], dtype=torch.float64)
-    plateau.judge([Window(0, 0, 100, 100)], torch.tensor([1e-12], dtype=torch.float64), 1000)
-    assert plateau.reached
+    plateau = begun(0.1, [1e-9])
+    plateau.judge(windows_of(16), torch.tensor([1e-12], dtype=torch.float64), 625)
+    assert plateau.left_out
+
+
+def test_rounding_counts_where_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three values a pixel, each off by 1 / 255 / sqrt(12) in the mean; ten pixels of the second view do not count."""
+    windows = windows_of(10, 8)
+    masked, counted = list(windows)[1], torch.ones(16, 24, dtype=torch.bool)
+    counted[0, :10] = False
+    monkeypatch.setattr(View, "counted", lambda self: counted if self is masked else None)
+    assert rounding_in(windows).tolist() == pytest.approx([300 / 12 / 255**2, 3 * (64 - 8) / 12 / 255**2])
 
 
 def test_steps_that_gain_too_little_are_left_out(tmp_path: Path) -> None:
@@ -74,6 +115,36 @@ def test_steps_that_gain_too_little_are_left_out(tmp_path: Path) -> None:
     assert steps_of(tmp_path / "run") == [*range(1, 17), *range(32, 41)]
     assert run.plateau.found[:, 0].tolist() == [16]
     assert run.curves[16]["steps_left_out"] == 15
+
+
+@pytest.mark.parametrize(
+    ("more", "first"),
+    [
+        ((), 20),  # published density control ends with half of the steps
+        (("backbone.density.stop=6000",), 10),
+        (("backbone.density.stop=6000", "backbone.sh_judged=0.7"), 28),
+        (("backbone.density.stop=6000", "backbone.sh_judged=0.8"), 10),  # done with the first step that is taken again
+        (("backbone.density.stop=6000", "training.exposure.when=always", "training.exposure.start=0.5"), 21),
+        (("backbone.density.stop=6000", "training.supersample=2", "training.supersample_from=0.6"), 24),
+        (("backbone.density.stop=6000", "training.coarse=2", "training.coarse_until=0.3"), 12),
+    ],
+)
+def test_steps_are_judged_when_all_else_is_settled(more: tuple[str, ...], first: int, tmp_path: Path) -> None:
+    words = [word for word in WORDS if not word.startswith("backbone.density")]
+    settings = tiny_settings(tmp_path, *words, "training.plateau.price=1", *more)
+    run = build(settings, load_scene(settings), tmp_path, training=True)
+    assert run.plateau.first == first
+
+
+def test_pseudo_details_whose_event_was_left_out_begin_late(tmp_path: Path) -> None:
+    """Windows of eight steps begin after steps 21, 28 and 36: of the second, step 32 is the first that is taken."""
+    timing = [f"augmenter.upscale.timing.{word}" for word in ("start=21000", "every=7500", "span=7500")]
+    words = (*LEAVES_OUT, "augmenter=upscale", "regenerator/upscale=lanczos", *timing)
+    run = tiny_run(tmp_path / "run", words)
+    assert steps_of(tmp_path / "run") == [*range(1, 17), *range(32, 41)]
+    events = {line["step"]: line["pseudo"]["upscale"]["event"] for line in run.curves if "pseudo" in line}
+    assert events == {32: 31, 37: 36}
+    assert all("upscale" in line["terms"] for line in run.curves if line["step"] >= 32)
 
 
 def test_every_step_is_taken_that_gains_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +158,7 @@ def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.M
     """Photographs white in them train to the same bits as long as they stay; where they are seen again, to others."""
     words, photograph = (*WORDS, "training.plateau.price=1e-6"), Photographs.of
     plain = tiny_run(tmp_path / "plain", words, stop_after=16)
-    own = {view.name: window for view, window in plain.plateau.windows(plain.scene.train).items()}
+    own = {view.name: window for view, window in plain.plateau.windows(plain.scene.train, 10).items()}
     assert len(own) == 6
     taken = list[int]()
 

@@ -157,6 +157,15 @@ class Planned(Protocol):
 
 
 @runtime_checkable
+class Settling(Protocol):
+    """A backbone that does things once, which a run that leaves out steps is not to pass by."""
+
+    def settles(self) -> Sequence[int]:
+        """Steps at which something is done once, or after which something is done no more."""
+        ...
+
+
+@runtime_checkable
 class Validating(Protocol):
     """A backbone that keeps parts of training views from being learnt for a while, to judge by them."""
 

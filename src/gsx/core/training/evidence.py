@@ -206,6 +206,15 @@ def some_of(views: Sequence[View], count: int, generator: torch.Generator) -> li
     return [views[index] for index in torch.randperm(len(views), generator=generator)[:count].tolist()]
 
 
+Exposed = Callable[[Float[Tensor, "3 H W"], str], Float[Tensor, "3 H W"]]
+"""A render as the photograph of that name would have it (`core.training.exposure`)."""
+
+
+def as_it_is(image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
+    """For photographs of one exposure."""
+    return image
+
+
 @torch.no_grad()
 def window_errors(
     model: Backbone[Any],
@@ -214,22 +223,32 @@ def window_errors(
     form: Forming,
     background: Float[Tensor, "3"],
     step: int,
+    exposed: Exposed = as_it_is,
 ) -> Float[Tensor, "W"]:
     """Squared error in windows of views, each summed over its values, of the model as it would be with that table."""
     own, model.table = model.table, table
     try:
-        errors = [window_error(model, view, window, form, background, step) for view, window in windows.items()]
+        errors = [
+            window_error(model, view, window, form, background, step, exposed) for view, window in windows.items()
+        ]
     finally:
         model.table = own
     return torch.stack(errors)
 
 
 def window_error(
-    model: Backbone[Any], view: View, window: Window, form: Forming, background: Float[Tensor, "3"], step: int
+    model: Backbone[Any],
+    view: View,
+    window: Window,
+    form: Forming,
+    background: Float[Tensor, "3"],
+    step: int,
+    exposed: Exposed,
 ) -> Float[Tensor, ""]:
     """Squared error in a window of a view."""
     splats = model.draw(form(view.camera).drawn_for, step).splats
     raster, counted = form(window.of(view.camera)), view.counted()
-    shown = raster.reduced(rasterize(splats, raster.camera, model.raster, background=background).image)
+    rendering = rasterize(splats, raster.camera, model.raster, background=background)
+    shown = exposed(raster.reduced(rendering.image), view.name)
     off = shown - window.cut(view.image()).to(shown)
     return blacked(off, None if counted is None else counted[window.pixels]).double().square().sum()

@@ -105,10 +105,14 @@ class Exposures:
     shown: set[int] = field(default_factory=set)
     """Photographs of the step under way."""
 
+    @property
+    def first(self) -> int:
+        """The step before which they are judged."""
+        return max(1, round(self.options.start * self.iterations)) + 1
+
     def due(self, number: int) -> bool:
-        """Whether this step is the one before which they are judged."""
-        first = max(1, round(self.options.start * self.iterations)) + 1
-        return self.options.when != "never" and self.matrices is None and number == first
+        """Whether they are judged before this step."""
+        return self.options.when != "never" and self.matrices is None and number == self.first
 
     def judge(self, pairs: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> float:
         """Begin with the gains of (render, photograph, which pixels count) of each photograph in order, if they are

@@ -9,7 +9,7 @@ and places with every such tenth. Test views play no part.
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -24,8 +24,8 @@ from gsx.core.training.validation import decibels, rounding_in, validation_windo
 
 logger = logging.getLogger(__name__)
 
-GROWN = 1.1
-"""Times as many steps lie at the end of what is judged as at its beginning, or a pass over the views does."""
+ONE_IN = 10
+"""Of so many steps another is taken before they are judged, if that is more than a pass over the views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,67 +59,77 @@ class Plateau:
     iterations: int
     passing: int
     """Steps of a pass over the training views."""
+    settled: int = 0
+    """Step after which nothing is due once that a run must not leave out."""
     begun: int = 0
     """Step after which the windows of the moment began; 0: there are none."""
     before: Float[Tensor, "W"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     """Squared error in each of them at that time."""
     found: Float[Tensor, "T 3"] = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
     """Step, gain in dB per doubling of the steps, and its standard error, of each judgement."""
+    left_out: range = range(0)
+    """Numbers of the steps that were left out."""
 
     @property
     def first(self) -> int:
         """Step after which the first windows begin."""
-        return max(1, round(self.options.start * self.iterations))
+        return max(1, round(self.options.start * self.iterations), self.settled)
 
     @property
     def last(self) -> int:
         """Step that is taken next where the others before it are left out."""
-        return round(self.options.to * self.iterations)
+        return last_part(self.options, self.iterations)
 
     def ends(self, begun: int) -> int:
         """Step after which windows that began after a step are judged."""
-        return begun + max(math.ceil((GROWN - 1) * begun), self.passing)
+        return begun + max(math.ceil(begun / ONE_IN), self.passing)
+
+    @property
+    def open(self) -> bool:
+        """Whether there are windows, which this run is to judge: not those of a schedule that was another."""
+        return self.options.price > 0 and self.begun >= self.first
 
     def judged_after(self, step: int) -> bool:
         """Whether the windows of the moment are judged after this step."""
-        return self.begun > 0 and step == self.ends(self.begun)
+        return self.open and step == self.ends(self.begun)
 
     def begins_after(self, step: int) -> bool:
         """Whether windows begin after this step: there are to be steps left that can be left out."""
-        due = self.options.price > 0 and step == (self.ends(self.begun) if self.begun else self.first)
-        return due and self.ends(step) < self.last
+        due = self.options.price > 0 and step == (self.ends(self.begun) if self.open else self.first)
+        return due and self.ends(step) + 1 < self.last
 
-    def windows(self, views: Sequence[View]) -> dict[View, Window]:
-        """Those of the moment."""
-        return validation_windows(views, self.options.views, self.options.window, "plateau", self.begun)
+    def windows(self, views: Sequence[View], begun: int) -> dict[View, Window]:
+        """Those that begin after a step."""
+        return validation_windows(views, self.options.views, self.options.window, "plateau", begun)
 
     def window(self, views: Sequence[View], view: View, step: int) -> Window | None:
         """The window of a view that counts in no loss at a step."""
-        if not (self.begun and self.begun < step <= self.ends(self.begun)):
+        if not (self.open and self.begun < step <= self.ends(self.begun)):
             return None
-        return {other.name: window for other, window in self.windows(views).items()}.get(view.name)
+        return {other.name: window for other, window in self.windows(views, self.begun).items()}.get(view.name)
 
-    def judge(self, windows: Sequence[Window], after: Float[Tensor, "W"], step: int) -> dict[str, float]:
-        """Find what the steps since the windows began have gained; for the line of the step."""
+    def judge(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
+        """Find what the steps since the windows began have gained. There are no windows then."""
         floor, doublings = rounding_in(windows), math.log2(step / self.begun)
         gain, error = (value / doublings for value in decibels(after + floor, self.before + floor))
         self.found = torch.cat([self.found, torch.tensor([[step, gain, error]], dtype=torch.float64)])
         told = step, gain, error, self.options.price, step - self.begun
         logger.info("step %d: %.2f +- %.2f dB per doubling of the steps, price %.2f, by the last %d", *told)
-        return {"step_gain": gain, "step_price": self.options.price}
-
-    @property
-    def reached(self) -> bool:
-        """Whether the last steps that were judged have gained less than their price."""
-        return len(self.found) > 0 and float(self.found[-1, 1]) < self.options.price
-
-    def begin(self, step: int) -> None:
-        """Windows begin after this step; what they show is not known yet."""
-        self.begun = step
-
-    def end(self) -> None:
-        """There are no windows any more."""
         self.begun, self.before = 0, self.before[:0]
+        if gain < self.options.price:
+            self.left_out = range(step + 1, self.last)
+            logger.info("step %d: the run goes on with step %d", step, self.last)
+
+    def begin(self, step: int, before: Float[Tensor, "W"]) -> None:
+        """Windows begin after this step, with these errors."""
+        self.begun, self.before = step, before
+
+    def told_at(self, number: int) -> dict[str, float]:
+        """What was found, and left out, before a step; for its line."""
+        if not len(self.found) or number not in (int(self.found[-1, 0]) + 1, self.left_out.stop):
+            return {}
+        told = {"step_gain": float(self.found[-1, 1]), "step_price": self.options.price}
+        return told | ({"steps_left_out": len(self.left_out)} if number == self.left_out.stop else {})
 
     def plan(self) -> dict[str, Any]:
         """When steps may be left out, for the log and the report; nothing where none may."""
@@ -131,9 +141,16 @@ class Plateau:
         """What a checkpoint holds; nothing where no step has been judged, nor is."""
         if not (self.begun or len(self.found)):
             return {}
-        return {"begun": torch.tensor(self.begun), "before": self.before, "found": self.found}
+        numbers = torch.tensor([self.begun, self.left_out.start, self.left_out.stop])
+        return {"numbers": numbers, "before": self.before, "found": self.found}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors."""
         if tensors:
-            self.begun, self.before, self.found = int(tensors["begun"]), tensors["before"], tensors["found"]
+            self.begun, start, stop = tensors["numbers"].tolist()
+            self.before, self.found, self.left_out = tensors["before"], tensors["found"], range(start, stop)
+
+
+def last_part(options: PlateauOptions, iterations: int) -> int:
+    """First step of the part of a run that is never left out."""
+    return round(options.to * iterations)

@@ -17,12 +17,12 @@ from gsx.core.ranges import Interval, Range, Share
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, Observation
+from gsx.core.training.backbone import Backbone, Observation, Settling
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
-from gsx.core.training.plateau import Plateau, PlateauOptions
+from gsx.core.training.plateau import Plateau, PlateauOptions, last_part
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
 
@@ -187,7 +187,8 @@ class Run:
         self.photographs = Photographs(self.device, self.photograph_bytes)
         names = [view.name for view in self.scene.train]
         self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
-        self.plateau = Plateau(self.training.plateau, self.iterations, len(names))
+        passing = -(-len(names) // self.training.batch)
+        self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 
     @property
     def complete(self) -> bool:
@@ -245,3 +246,11 @@ class Step:
         """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
         own = psnr(self.rendering.image.detach().clamp(0, 1), self.target, self.counted)
         return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))
+
+
+def settled_after(run: Run) -> int:
+    """Step after which nothing is due once before the last part of the run: of its exposures, of the resolution that it
+    renders at, of its backbone."""
+    own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
+    steps = [run.exposures.first, run.resolution.coarse_until, run.resolution.finer_after, *own]
+    return max((step for step in steps if step < last_part(run.training.plateau, run.iterations)), default=0)

@@ -47,8 +47,9 @@ def train(run: Run, plugins: Plugins) -> None:
 
 def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
-    told = judge_exposures(run) if run.exposures.due(run.step + 1) else {}
-    told |= judge_steps(run)
+    judge_steps(run)
+    told = run.plateau.told_at(run.step + 1)
+    told |= judge_exposures(run) if run.exposures.due(run.step + 1) else {}
     with taken_or_not(run):
         step = backward(run)
         step.changes.update(told)
@@ -80,31 +81,32 @@ def judge_exposures(run: Run) -> dict[str, float]:
     return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
 
 
-def judge_steps(run: Run) -> dict[str, float]:
+def judge_steps(run: Run) -> None:
     """Find whether the last steps have gained what steps are to gain, where that is due; if not, all up to the last
-    part of the run are left out. For the line of the next step."""
-    plateau, done = run.plateau, run.step
-    told, begins = dict[str, float](), plateau.begins_after(done)
-    if plateau.judged_after(done):
-        windows = plateau.windows(run.resolution.views(done))
-        told = plateau.judge(list(windows.values()), errors_in(run, windows, done), done)
-        plateau.end()
-        if plateau.reached:
+    part of the run are left out."""
+    plateau, done, views = run.plateau, run.step, run.resolution.views
+    judged = plateau.windows(views(done), plateau.begun) if plateau.judged_after(done) else None
+    begun = plateau.windows(views(done + 1), done) if plateau.begins_after(done) else None
+    after, before = errors_in(run, judged or {}, done), errors_in(run, begun or {}, done + 1)  # then nothing can fail
+    if judged:
+        plateau.judge(judged, after, done)
+        if plateau.left_out:
             run.step = plateau.last - 1
-            logger.info("step %d: the run goes on with step %d", done, plateau.last)
-            return told | {"steps_left_out": run.step - done}
-    if begins:
-        plateau.begin(done)
-        plateau.before = errors_in(run, plateau.windows(run.resolution.views(done + 1)), done + 1)
-    return told
+            return
+    if begun:
+        plateau.begin(done, before)
 
 
 def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tensor, "W"]:
     """Squared error in each validation window by the rules of a step, the same on all ranks."""
-    model, form = run.backbone, run.resolution.forming(step)
-    return run.ranks.broadcast(
-        lambda: window_errors(model, model.table, windows, form, run.background, max(1, run.step)).cpu()
-    )
+    if not windows:
+        return torch.zeros(0, dtype=torch.float64)
+    model, form, exposed = run.backbone, run.resolution.forming(step), run.exposures.applied
+
+    def look() -> Tensor:
+        return window_errors(model, model.table, windows, form, run.background, max(1, run.step), exposed).cpu()
+
+    return run.ranks.broadcast(look)
 
 
 def veto(run: Run, step: Step, plugins: Plugins) -> str:

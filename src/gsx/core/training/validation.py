@@ -1,7 +1,7 @@
 """Windows of training views that count in no loss for a while, and what steps or primitives have gained in them."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -32,9 +32,15 @@ def part_of(view: View, share: float, right: float, down: float) -> Window:
     return Window(left, top, width, height)
 
 
-def rounding_in(windows: Iterable[Window]) -> Float[Tensor, "W"]:
-    """Squared error of photographs' rounding to 8 bits in each window, summed over its values."""
-    return ROUNDING * torch.tensor([3.0 * window.width * window.height for window in windows])
+def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
+    """Squared error of photographs' rounding to 8 bits in each window, summed over the values that count."""
+    return 3 * ROUNDING * torch.tensor([float(pixels_in(view, window)) for view, window in windows.items()])
+
+
+def pixels_in(view: View, window: Window) -> int:
+    """How many pixels of a window of a view count."""
+    counted = view.counted()
+    return window.width * window.height if counted is None else int(counted[window.pixels].sum())
 
 
 def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:

@@ -116,12 +116,19 @@ def report_context(run: RunFiles) -> dict[str, Any]:
     }
 
 
+def steps_of(run: RunFiles) -> str:
+    """How many of the steps were taken, and how many a plateau has left out of them."""
+    left_out = sum(int(line["steps_left_out"]) for line in run.lines if is_number(line.get("steps_left_out")))
+    told = f", {left_out:,} of them left out (training.plateau)" if left_out else ""
+    return f"{run.step:,} of {run.iterations:,}{told}"
+
+
 def facts(run: RunFiles) -> list[tuple[str, str]]:
     """What was trained, on what, in name and value."""
     scene, environment = part(run.environment, "scene"), run.environment
     size = part(run.evaluation, "protocol").get("size")
     rows = [
-        ("steps", f"{run.step:,} of {run.iterations:,}"),
+        ("steps", steps_of(run)),
         ("training views", fixed(scene.get("train_views"), 0)),
         ("test views", fixed(scene.get("test_views"), 0)),
         ("size", f"{size[0]} × {size[1]} px" if size else NONE),

@@ -83,24 +83,25 @@ class Progress:
 
     def __init__(self) -> None:
         self.output = Line()
-        self.done = (0, 0.0)
+        self.taken, self.shown = 0, 0.0
+        """Steps since the line was shown, and the seconds that had been trained for by then."""
         self.averages: dict[str, float] = {}
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
         """Speed is measured from here on."""
-        self.done = (run.step, run.seconds)
+        self.shown = run.seconds
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: Step) -> None:
         """Show the line when it is time."""
+        self.taken += 1
         if not self.output.due() and not run.complete:
             return
         self.average("loss", float(step.loss))
         self.average("psnr", step.psnr())
-        steps, seconds = run.step - self.done[0], run.seconds - self.done[1]
-        self.average("speed", steps / max(seconds, 1e-9))
-        self.done = (run.step, run.seconds)
+        self.average("speed", self.taken / max(run.seconds - self.shown, 1e-9))
+        self.taken, self.shown = 0, run.seconds
         self.output.show(self.line(run))
 
     @hookimpl
