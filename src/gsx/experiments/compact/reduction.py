@@ -3,6 +3,7 @@
 Pictures lose what a row is worth where it goes. Where two become one they lose that share of what both are worth by
 which the field of both changes (`core.gaussians.merging`): little where they lie on each other and agree in colour,
 however much they are worth. Rows take part once in a round, of which none takes more than a quarter of what is left.
+A 3D filter is part of what is drawn: rows are merged with it, and it is taken off what they become.
 """
 
 import math
@@ -10,9 +11,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from gsx.core.gaussians.merging import PARAMETERS, Rows, changes, densities, merged
 from gsx.core.gaussians.neighbours import nearest
+from gsx.core.gaussians.smoothing import logit_of_log, smoothed, unsmoothed
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import (
     ParameterTable,
@@ -48,6 +51,7 @@ class Reduction:
         """`worth`: what pictures lose without each row; `colours`: as they see them, where rows can be merged."""
         rows = detached_rows(table)
         able = colours is not None and all(name in rows for name in PARAMETERS)
+        rows = {name: value.clone() for name, value in (as_drawn(rows) if able else rows).items()}
         needed = {name: value for name, value in rows.items() if name in PARAMETERS or not value.is_floating_point()}
         self.rows: dict[str, Tensor] = {**needed, "colours": colours} if able and colours is not None else {}
         self.worth, self.count = worth, len(worth)
@@ -76,6 +80,26 @@ class Reduction:
         self.worth = torch.cat([self.worth[kept], self.worth[first] + self.worth[second]])
 
 
+def as_drawn(rows: Rows) -> dict[str, Tensor]:
+    """Rows with what a 3D filter adds to scales and takes from opacities, where there is one."""
+    if "filter" not in rows:
+        return dict(rows)
+    scales, log_opacities = smoothed(
+        rows["log_scales"].double().exp(), logsigmoid(rows["opacity_logits"].double()), rows["filter"].double()
+    )
+    drawn = {"log_scales": scales.log(), "opacity_logits": logit_of_log(log_opacities)}
+    return dict(rows) | {name: value.to(rows[name]) for name, value in drawn.items()}
+
+
+def as_stored(rows: Rows) -> dict[str, Tensor]:
+    """Rows that are drawn so, the filter taken off them, as far as it can be."""
+    if "filter" not in rows:
+        return dict(rows)
+    stored = unsmoothed(*(rows[name].double() for name in ("log_scales", "opacity_logits", "filter")))
+    named = zip(("log_scales", "opacity_logits"), stored, strict=True)
+    return dict(rows) | {name: value.to(rows[name]) for name, value in named}
+
+
 def survivors(count: int, gone: Int[Tensor, "K"], into: Int[Tensor, "K"]) -> Bool[Tensor, "N"]:
     """Rows that have no part in it."""
     kept = torch.ones(count, dtype=torch.bool, device=gone.device)
@@ -89,7 +113,7 @@ def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor
     second moments of both; as zeros they would let the first steps be far too long."""
     pairs = into >= 0
     first, second = gone[pairs], into[pairs]
-    new = merged(detached_rows(table), first, second) if len(first) else {}
+    new = as_stored(merged(as_drawn(detached_rows(table)), first, second)) if len(first) else {}
     moments = {name: value[first] + value[second] for name, value in second_moments(table).items()}
     for name in ORDERLESS:
         if name in moments:
