@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Budget, BudgetOptions, Growing
-from gsx.backbones.gs3d import gs3d
+from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.builtin import plugins
 from gsx.core.data.scene import Scene, View
@@ -268,14 +268,20 @@ def test_the_rate_follows_the_gain(had: float, price: float, rate: float, monkey
     assert model.table.record["trials"][0, :3].tolist() == [700, 50, 25]
 
 
-def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
-    """Half of the Gaussians are too faint to be seen: they go, and of the others those that make a difference stay."""
+def half_of_it_faint() -> tuple[Scene, GS3D]:
+    """40 Gaussians before a grey background, of which half are too faint to be seen."""
     scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
     model = small_gs3d(scene, options=options_of("adaptive"))
     with torch.no_grad():
         model.table["opacity_logits"][:20] = -1
         model.table["opacity_logits"][20:] = -15
         model.table["log_scales"].fill_(-1.5)
+    return scene, model
+
+
+def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
+    """What is too faint to be seen goes, and of the others those that make a difference stay."""
+    scene, model = half_of_it_faint()
     judge = adaptive(scene, price=0.2)
     assert judge.judge(model, lambda table: None, 700) == {}
     done = judge.judge(model, lambda table: None, 14900)
@@ -287,12 +293,7 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
 def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an error, a share of it would be a price that nothing is below."""
     monkeypatch.setattr("gsx.core.training.evidence.difference", lambda image, view: torch.zeros_like(image))
-    scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
-    model = small_gs3d(scene, options=options_of("adaptive"))
-    with torch.no_grad():
-        model.table["opacity_logits"][:20] = -1
-        model.table["opacity_logits"][20:] = -15
-        model.table["log_scales"].fill_(-1.5)
+    scene, model = half_of_it_faint()
     assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())
 
