@@ -5,11 +5,12 @@
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. Tables (--what): `rules`: each scene is trained by plain 3D-GS, once a seed, and drawn
 by every rule for zoomed cameras. `compositions`: each is trained by mip_splatting and by its preset for zooming in.
-`views`: by the preset with `backbone.mip.views=2`. `parts`: by parts of the preset. `levels`: by Octree-GS with its
-preset for zooming in. `pictures`: by the preset with pseudo details, enlarged or true, in half of the run; `trusted`:
-by such that narrow the 3D filter. `afar`: what compositions draw from four times as far as photographs were taken, by
-each way of looking. Finished runs below --runs are not trained again. Some hours on two cores. What
-`gsx +experiment=zoom_truth` finds is measured by benchmarks/zoom_truth.py.
+`cooled`: by the preset, and by it with learning rates that stay. `views`: by the preset with `backbone.mip.views=2`.
+`parts`: by parts of the preset. `levels`: by Octree-GS with its preset for zooming in. `pictures`: by the preset with
+pseudo details, enlarged or true, in half of the run; `trusted`: by such that narrow the 3D filter. `afar`: what
+compositions draw from four times as far as photographs were taken, by each way of looking. Finished runs below --runs
+are not trained again. Some hours on two cores. What `gsx +experiment=zoom_truth` finds is measured by
+benchmarks/zoom_truth.py.
 """
 
 import argparse
@@ -56,6 +57,8 @@ COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 VIEWS = {"mip_splatting": MIP, "preset=zoom, views=2": (*ZOOM, "backbone.mip.views=2")}
 """With a narrower 3D filter where many views sample a place."""
+COOLED = {"preset=zoom, rates held": (*ZOOM, "training.cooldown=0"), "preset=zoom": ZOOM}
+"""With learning rates that stay, and that go down at the end."""
 PARTS = {
     "mip_splatting": MIP,
     "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
@@ -282,6 +285,11 @@ def views(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Several views in the 3D filter", *compared(VIEWS, scenes, given)
 
 
+def cooled(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """The preset with learning rates that stay, and that go down at the end."""
+    return "Learning rates of preset=zoom that go down at the end", *compared(COOLED, scenes, given)
+
+
 def parts(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """What each part of the preset does."""
     return "Parts of preset=zoom", *compared(PARTS, scenes, given)
@@ -370,6 +378,7 @@ def over_seeds(
 WHAT: dict[str, Measure] = {
     "rules": rules,
     "compositions": compositions,
+    "cooled": cooled,
     "views": views,
     "parts": parts,
     "levels": levels,
