@@ -13,7 +13,6 @@ again. A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
-import json
 import shutil
 import statistics
 import sys
@@ -29,6 +28,7 @@ from gsx.api import train as train_here
 from gsx.backbones import adaptive, capacity, long_axis
 from gsx.backbones.sh_degrees import numbers_of
 from gsx.core.files import read_json
+from gsx.experiments.runs.progress import read_curves
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from measuring.runs import gsx, train
@@ -202,7 +202,7 @@ def patient(scene: str, price: float, backbone: str, seed: int, given: argparse.
     steps = TIMES_AS_MANY * steps_among(words)
     words = [word for word in words if not word.startswith("iterations=")]
     found = trained(folder, [*words, f"iterations={steps}"], given)
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = read_curves(folder)
     return found | {"left": sum(line.get("steps_left_out", 0) for line in lines) / steps}
 
 
@@ -252,7 +252,7 @@ def judged_evaluation(scene: str, price: float, backbone: str, seed: int, given:
     folder = given.runs / f"{backbone}_{scene}_bands_{price}_{seed}"
     wish = [ADAPTIVE, f"backbone.sh_judged={BANDS_FROM}", f"backbone.sh_price={price}"]
     found = trained(folder, words_of(wish, scene, backbone, seed, given), given)
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = read_curves(folder)
     told_of = next(line for line in lines if "degree_0" in line)
     return found | {"degrees": [told_of[f"degree_{degree}"] for degree in range(4)], "spz": spz_bytes(folder)}
 

@@ -8,7 +8,6 @@ views show none (`scene.fill`); and adaptive growth for about as long as publish
 """
 
 import argparse
-import json
 import statistics
 import sys
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from typing import Any
 import torch
 
 from capacity import ADAPTIVE, PUBLISHED, SUBJECTS, ZOOMS, row_of, scenes_of, trained, words_of
+from gsx.experiments.runs.progress import read_curves
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from zoom import over_seeds, shared_arguments, steps_among, told
@@ -64,7 +64,7 @@ def evaluation_of(scene: str, arm: str, seed: int, given: argparse.Namespace) ->
 
 def seen_in_training(folder: Path) -> float:
     """Mean PSNR of training views over the last tenth of the steps, dB."""
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = read_curves(folder)
     values = [line["psnr"] for line in lines if "psnr" in line and line["step"] > 0.9 * lines[-1]["step"]]
     return statistics.mean(values)
 

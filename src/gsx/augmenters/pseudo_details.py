@@ -146,7 +146,8 @@ class PseudoDetails:
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
-        fresh = run.step == event or begins_late(run, event)
+        left_out = run.plateau.left_out
+        fresh = all(number in left_out for number in range(event + 1, run.step + 1))  # no step of it was taken yet
         made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
             run.ranks.all_gather(None)  # the others wait for the file
@@ -177,9 +178,7 @@ class PseudoDetails:
             for factor in self.options.coarser
         ]
         facts: dict[str, Any] = {
-            **self.regenerator.tally.account(
-                run.step
-            ),  # the step before which they are made: late, where it was left out
+            **self.regenerator.tally.account(run.step),  # after which they are made: late, where steps were left out
             "event": event,
             "iterations": self.context.iterations,
             "made": len(views),
@@ -204,9 +203,3 @@ def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
     for view in views:
         found.setdefault(view.parent, []).append(view)
     return found
-
-
-def begins_late(run: Run, event: int) -> bool:
-    """Whether the first step of an event was left out (`core.training.plateau`), and the first one taken is next."""
-    left_out = run.plateau.left_out
-    return event + 1 in left_out and run.step + 1 == left_out.stop

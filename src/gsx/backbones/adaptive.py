@@ -92,8 +92,7 @@ class Adaptive:
         """That of the interval which the step belongs to, while there is something to judge."""
         if not self.growing.start < step < self.growing.stop or self.ended(table):
             return None
-        named = {other.name: window for other, window in self.windows(step).items()}
-        return named.get(view.name)
+        return self.windows(step).get(view)
 
     # -- what is found -------------------------------------------------------------------------------------------
 

@@ -25,11 +25,19 @@ def smoothed(
     return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
 
 
+def smoothed_raw(
+    log_scales: Float[Tensor, "N 3"], opacity_logits: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Log-scales and logits of what `smoothed` makes of those given."""
+    scales, log_opacities = smoothed(log_scales.exp(), logsigmoid(opacity_logits), sizes)
+    return scales.log(), logit_of_log(log_opacities)
+
+
 def unsmoothed(
     log_scales: Float[Tensor, "N 3"], opacity_logits: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Log-scales and logits that `smoothed` makes into those given, as far as there are any: scales at least a tenth of
-    the filter, which would have no gradient at 0, and opacities below 1."""
+    """Log-scales and logits that `smoothed_raw` makes into those given, as far as there are any: scales at least a
+    tenth of the filter, which would have no gradient at 0, and opacities below 1."""
     scales, sizes = log_scales.exp(), sizes[:, None]
     narrow = (scales.square() - sizes.square()).clamp_min(0).sqrt().maximum(LEAST_BEFORE * sizes)
     log_opacities = logsigmoid(opacity_logits) + (scales.maximum(sizes) / narrow).log().sum(1)

@@ -16,7 +16,7 @@ from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_comp
 from gsx.core.gaussians.glb import decode_glb, encode_glb
 from gsx.core.gaussians.ply import read_ply, write_ply, write_whole
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
-from gsx.core.gaussians.smoothing import logit_of_log, smoothed
+from gsx.core.gaussians.smoothing import smoothed_raw
 from gsx.core.gaussians.sog import decode_sog, encode_sog, sog_is_antialiased
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.gaussians.spz import decode_spz, encode_spz, is_antialiased
@@ -135,10 +135,8 @@ def read_standard(path: Path) -> Gaussians:
         "sh_rest": higher_bands(columns, path),
     }
     if "filter_3D" in columns:
-        scales, log_opacities = smoothed(
-            raw["log_scales"].exp(), logsigmoid(raw["opacity_logits"]), columns["filter_3D"]
-        )
-        raw |= {"log_scales": scales.log(), "opacity_logits": logit_of_log(log_opacities)}
+        drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], columns["filter_3D"])
+        raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
     return Gaussians(**finite_rows(raw, path))
 
 

@@ -67,10 +67,10 @@ def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H 
     return blacked(image.detach() - view.image().to(image), view.counted())
 
 
-def rounding_of(view: View) -> float:
-    """Squared error of a photograph's rounding to 8 bits, summed over the values that count."""
-    counted = view.counted()
-    return 3 * ROUNDING * (view.camera.width * view.camera.height if counted is None else int(counted.sum()))
+def rounding_of(view: View, window: Window | None = None) -> float:
+    """Squared error of a photograph's rounding to 8 bits, summed over the values that count, of all or of a window."""
+    part, counted = window or Window(0, 0, *view.camera.size), view.counted()
+    return 3 * ROUNDING * (part.width * part.height if counted is None else int(counted[part.pixels].sum()))
 
 
 def error_sums(seen: Look, off: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:

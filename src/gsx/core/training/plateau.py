@@ -50,6 +50,10 @@ class PlateauOptions:
                 "above 0, the first one smaller"
             )
 
+    def last_part(self, iterations: int) -> int:
+        """First step of the part of a run of so many steps that is never left out."""
+        return round(self.to * iterations)
+
 
 @dataclass(eq=False)
 class Plateau:
@@ -78,7 +82,7 @@ class Plateau:
     @property
     def last(self) -> int:
         """Step that is taken next where the others before it are left out."""
-        return last_part(self.options, self.iterations)
+        return self.options.last_part(self.iterations)
 
     def ends(self, begun: int) -> int:
         """Step after which windows that began after a step are judged."""
@@ -106,7 +110,7 @@ class Plateau:
         """The window of a view that counts in no loss at a step."""
         if not (self.open and self.begun < step <= self.ends(self.begun)):
             return None
-        return {other.name: window for other, window in self.windows(views, self.begun).items()}.get(view.name)
+        return self.windows(views, self.begun).get(view)
 
     def judge(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
         """Find what the steps since the windows began have gained. There are no windows then."""
@@ -149,8 +153,3 @@ class Plateau:
         if tensors:
             self.begun, start, stop = tensors["numbers"].tolist()
             self.before, self.found, self.left_out = tensors["before"], tensors["found"], range(start, stop)
-
-
-def last_part(options: PlateauOptions, iterations: int) -> int:
-    """First step of the part of a run that is never left out."""
-    return round(options.to * iterations)

@@ -22,7 +22,7 @@ from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
-from gsx.core.training.plateau import Plateau, PlateauOptions, last_part
+from gsx.core.training.plateau import Plateau, PlateauOptions
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
 
@@ -253,4 +253,5 @@ def settled_after(run: Run) -> int:
     renders at, of its backbone."""
     own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
     steps = [run.exposures.first, run.resolution.coarse_until, run.resolution.finer_after, *own]
-    return max((step for step in steps if step < last_part(run.training.plateau, run.iterations)), default=0)
+    last = run.training.plateau.last_part(run.iterations)
+    return max((step for step in steps if step < last), default=0)

@@ -104,7 +104,7 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     model, form, exposed = run.backbone, run.resolution.forming(step), run.exposures.applied
 
     def look() -> Tensor:
-        return window_errors(model, model.table, windows, form, run.background, max(1, run.step), exposed).cpu()
+        return window_errors(model, model.table, windows, form, run.background, run.model_step, exposed).cpu()
 
     return run.ranks.broadcast(look)
 

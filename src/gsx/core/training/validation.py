@@ -10,7 +10,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
-from gsx.core.training.evidence import ROUNDING
+from gsx.core.training.evidence import rounding_of
 
 
 def validation_windows(
@@ -34,13 +34,7 @@ def part_of(view: View, share: float, right: float, down: float) -> Window:
 
 def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
     """Squared error of photographs' rounding to 8 bits in each window, summed over the values that count."""
-    return 3 * ROUNDING * torch.tensor([float(pixels_in(view, window)) for view, window in windows.items()])
-
-
-def pixels_in(view: View, window: Window) -> int:
-    """How many pixels of a window of a view count."""
-    counted = view.counted()
-    return window.width * window.height if counted is None else int(counted[window.pixels].sum())
+    return torch.tensor([rounding_of(view, window) for view, window in windows.items()])
 
 
 def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:

@@ -7,15 +7,15 @@ A 3D filter is part of what is drawn: rows are merged with it, and it is taken o
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 
 from gsx.core.gaussians.merging import PARAMETERS, Rows, changes, densities, merged
 from gsx.core.gaussians.neighbours import nearest
-from gsx.core.gaussians.smoothing import logit_of_log, smoothed, unsmoothed
+from gsx.core.gaussians.smoothing import smoothed_raw, unsmoothed
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import (
     ParameterTable,
@@ -51,9 +51,11 @@ class Reduction:
         """`worth`: what pictures lose without each row; `colours`: as they see them, where rows can be merged."""
         rows = detached_rows(table)
         able = colours is not None and all(name in rows for name in PARAMETERS)
-        rows = {name: value.clone() for name, value in (as_drawn(rows) if able else rows).items()}
-        needed = {name: value for name, value in rows.items() if name in PARAMETERS or not value.is_floating_point()}
-        self.rows: dict[str, Tensor] = {**needed, "colours": colours} if able and colours is not None else {}
+        self.rows: dict[str, Tensor] = {}
+        if able and colours is not None:
+            drawn = with_filter(rows, smoothed_raw)
+            needed = (name for name, value in drawn.items() if name in PARAMETERS or not value.is_floating_point())
+            self.rows = {name: drawn[name].clone() for name in needed} | {"colours": colours}
         self.worth, self.count = worth, len(worth)
         self.rounds: list[Round] = []
 
@@ -80,24 +82,14 @@ class Reduction:
         self.worth = torch.cat([self.worth[kept], self.worth[first] + self.worth[second]])
 
 
-def as_drawn(rows: Rows) -> dict[str, Tensor]:
-    """Rows with what a 3D filter adds to scales and takes from opacities, where there is one."""
+def with_filter(rows: Rows, change: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """Rows whose scales and opacities a change by their 3D filter has made others, where there is one: put on them
+    (`smoothed_raw`), or taken off as far as it can be (`unsmoothed`)."""
     if "filter" not in rows:
         return dict(rows)
-    scales, log_opacities = smoothed(
-        rows["log_scales"].double().exp(), logsigmoid(rows["opacity_logits"].double()), rows["filter"].double()
-    )
-    drawn = {"log_scales": scales.log(), "opacity_logits": logit_of_log(log_opacities)}
-    return dict(rows) | {name: value.to(rows[name]) for name, value in drawn.items()}
-
-
-def as_stored(rows: Rows) -> dict[str, Tensor]:
-    """Rows that are drawn so, the filter taken off them, as far as it can be."""
-    if "filter" not in rows:
-        return dict(rows)
-    stored = unsmoothed(*(rows[name].double() for name in ("log_scales", "opacity_logits", "filter")))
-    named = zip(("log_scales", "opacity_logits"), stored, strict=True)
-    return dict(rows) | {name: value.to(rows[name]) for name, value in named}
+    names = ("log_scales", "opacity_logits")
+    changed = change(*(rows[name].double() for name in (*names, "filter")))
+    return dict(rows) | {name: value.to(rows[name]) for name, value in zip(names, changed, strict=True)}
 
 
 def survivors(count: int, gone: Int[Tensor, "K"], into: Int[Tensor, "K"]) -> Bool[Tensor, "N"]:
@@ -113,7 +105,8 @@ def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor
     second moments of both; as zeros they would let the first steps be far too long."""
     pairs = into >= 0
     first, second = gone[pairs], into[pairs]
-    new = as_stored(merged(as_drawn(detached_rows(table)), first, second)) if len(first) else {}
+    drawn = with_filter(detached_rows(table), smoothed_raw)
+    new = with_filter(merged(drawn, first, second), unsmoothed) if len(first) else {}
     moments = {name: value[first] + value[second] for name, value in second_moments(table).items()}
     for name in ORDERLESS:
         if name in moments:
