@@ -1,10 +1,12 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--what exposure,faults] [--only demo,fox] [--seeds 0,1] [--share 0.4]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,poses,faults] [--only demo,fox] [--seeds 0,1]
+                                  [--share 0.4]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
-`training.exposure.when=auto`, beside the scene as it is, with it. `faults`: a tenth of the photographs are made worse,
+`training.exposure.when=auto`, beside the scene as it is, with it. `poses`: training cameras turned by half a pixel and
+by two, with and without `training.poses.when=auto`, likewise. `faults`: a tenth of the photographs are made worse,
 and what `gsx photographs` names is counted. Finished runs below --runs are not trained again.
 """
 
@@ -37,6 +39,16 @@ OWN = ("backbone=mip_splatting", "backbone.rates.shortened=0.4")
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
+CORRECTED = ("training.poses.when=auto",)
+HALF, TWO = ("scene.disturb.pose=0.5",), ("scene.disturb.pose=2",)
+POSE_ARMS = {
+    "as it is, auto": CORRECTED,
+    "0.5 px": HALF,
+    "0.5 px, auto": (*HALF, *CORRECTED),
+    "2 px": TWO,
+    "2 px, auto": (*TWO, *CORRECTED),
+}
+"""The same of poses."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -53,7 +65,7 @@ FAULTS = {
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/captures")
-    parser.add_argument("--what", default="exposure,faults", help="tables, by commas")
+    parser.add_argument("--what", default="exposure,poses,faults", help="tables, by commas")
     parser.add_argument("--share", type=float, default=1.0, help="of the steps")
     return parser.parse_args(words)
 
@@ -176,7 +188,65 @@ def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Photographs at exposures of their own", columns, rows, note
 
 
-WHAT: dict[str, Measure] = {"exposure": exposure, "faults": faults}
+# -- poses -------------------------------------------------------------------------------------------------------------
+
+
+def posed(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Figures of a run by both protocols of poses, and what it found of them."""
+    steps = round(given.share * steps_among(SUBJECTS[scene]))
+    words = [*OWN, *POSE_ARMS[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    folder = trained(scene, seed, given, words, f"poses {arm}")
+    evaluation = read_json(folder / "evaluation.json")
+    return {
+        "given": evaluation["zoom"],
+        "aligned": looked_at(folder, "aligned", ["eval.poses=aligned"]),
+        "poses": evaluation.get("poses", {}),
+        "seconds": evaluation["train_seconds"],
+    }
+
+
+def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+    """Figures of one arm over seeds."""
+    found = by_arm[arm]
+    row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
+    asked = [one["poses"] for one in found if one["poses"]]
+    row["spread"] = told([one["spread"] for one in asked], ".2f") if asked else ""
+    row["corrected"] = f"{sum(one['corrected'] > 0 for one in asked)} of {len(found)}" if asked else ""
+    cost = [100 * one["poses"]["seconds"] / one["seconds"] for one in found if one["poses"]]
+    row["cost"] = f"{statistics.mean(cost):.0f}" if cost else ""
+    for zoom in ZOOMS:
+        row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
+        if arm.endswith("px, auto"):
+            arms = (by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm))
+            best, worst, mended = (psnr_of(one, "aligned", zoom) for one in arms)
+            row[f"back{zoom}"] = told([(m - w) / (b - w) for b, w, m in zip(best, worst, mended, strict=True)], ".2f")
+    return row | {f"x{zoom}": told(psnr_of(found, "given", zoom), ".2f") for zoom in ZOOMS}
+
+
+def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
+    """PSNR by a protocol with each seed."""
+    return [one[protocol][zoom]["psnr"] for one in found]
+
+
+def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Poses that are wrong, and what mends them."""
+    found = over_seeds(lambda scene, seed: {arm: posed(scene, seed, arm, given) for arm in POSE_ARMS}, scenes, given)
+    rows = []
+    for scene in scenes:
+        by_arm = {arm: [one[arm] for one in found[scene]] for arm in POSE_ARMS}
+        rows += [pose_row(scene, arm, by_arm) for arm in POSE_ARMS]
+    columns = [["scene", "scene"], ["name", "training poses"], ["seeds", "seeds"], ["spread", "spread found, px"]]
+    columns += [["corrected", "corrected"], ["cost", "% of training"], ["aligned1", "x1"], ["aligned4", "x4"]]
+    columns += [["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as given"], ["x4", "x4 as given"]]
+    note = (
+        f"{given.share:g} of the steps; training cameras turned by so many px along each axis (standard deviation); "
+        "PSNR on held-out views whose poses are right, of right halves from poses aligned by the left (as given: of "
+        "whole views from the scene's poses); means over seeds ± half their range."
+    )
+    return "Poses that are wrong", columns, rows, note
+
+
+WHAT: dict[str, Measure] = {"exposure": exposure, "poses": poses, "faults": faults}
 
 
 def main(words: Sequence[str]) -> None:

@@ -74,7 +74,7 @@ class Redrawer:
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
         run.refuse_if_stopping()
-        view = run.scene.train[spec.parent]
+        view = run.photographed[spec.parent]
         image = render(run, spec.seen).image if spec.outer is None else photographed(run, view, spec.outer, spec.seen)
         return Request(
             image=image,
@@ -130,7 +130,7 @@ class Redrawer:
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
         """The training camera at a fraction of its size, without what fills no block at the right and below."""
         run.refuse_if_stopping()
-        view = run.scene.train[parent]
+        view = run.photographed[parent]
         width, height = view.camera.size
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
@@ -159,7 +159,7 @@ class Redrawer:
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
-            photographs = [view.camera for view in run.scene.train]
+            photographs = [view.camera for view in run.photographed]
             drawn = partial(splats_for, run)
             pixel_weight = pixel_weight * weights(drawn, spec.camera, photographs, spec.parent, run.raster).cpu()
         if options.gate > 0 and request.photo and spec.scale > 1:

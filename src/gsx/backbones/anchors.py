@@ -90,7 +90,6 @@ class Anchors:
         self.network_rates, self.extent, self.resolution = network_rates, scene.extent, context.resolution
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
-        self.views = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = context.schedule(options.published_iterations)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, options.growth.stop)
         self.raster = self.filter.rules(context.raster)
@@ -121,6 +120,16 @@ class Anchors:
         anchors = self.visible(camera, step)
         return DrawnAnchors(decoded=self.representation.decode(self.table, anchors, self.filter), anchors=anchors)
 
+    def photograph_of(self, camera: Camera, step: int) -> int:
+        """Which training view a camera is: as the scene has it, or as the step does, coarser or of a corrected pose;
+        -1: none."""
+        views = self.resolution
+        for seen in (views.scene.train, views.posed(views.scene.train), views.views(step)):
+            for number, view in enumerate(seen):
+                if view.camera is camera:
+                    return number
+        return -1
+
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
         """Anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
         rows, weights = self.grid.visible(self.table, camera, step)
@@ -133,7 +142,7 @@ class Anchors:
             rows=rows,
             weights=weights[rows],
             camera=camera,
-            view=self.views.get(camera, -1),
+            view=self.photograph_of(camera, step),
             sh_degree=degree,
             compiled=goes_compiled(self.raster, weights.device.type),
         )

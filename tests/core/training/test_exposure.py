@@ -22,8 +22,9 @@ from gsx.core.training.exposure import (
     shared_spread,
     transformed,
 )
+from gsx.core.training.poses import PoseOptions
 from gsx.core.training.run import TrainingOptions
-from gsx.experiments.runs.build import refuse_shared_exposures
+from gsx.experiments.runs.build import refuse_shared
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -160,9 +161,13 @@ def test_the_matrix_fits_what_counts() -> None:
 def test_several_processes_are_refused() -> None:
     training = TrainingOptions(ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=1,
                                checkpoints_kept=1, test_points=0, exposure=options())  # fmt: skip
-    refuse_shared_exposures(training, Ranks())
-    with pytest.raises(ConfigError, match="set it to never"):
-        refuse_shared_exposures(training, Ranks(size=2))
+    refuse_shared(training, Ranks())
+    with pytest.raises(ConfigError, match=r"training\.exposure\.when is 'auto'.* set it to never"):
+        refuse_shared(training, Ranks(size=2))
+    wrong = replace(training, exposure=options(when="never"), poses=PoseOptions(when="always"))
+    refuse_shared(wrong, Ranks())
+    with pytest.raises(ConfigError, match=r"training\.poses\.when is 'always'"):
+        refuse_shared(wrong, Ranks(size=2))
 
 
 DISTURBED = ("scene.disturb.exposure=0.3", "training.exposure.when=auto", "iterations=12")

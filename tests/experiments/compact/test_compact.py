@@ -16,10 +16,11 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply
+from gsx.core.plugins import hookimpl
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render
-from gsx.core.training.run import Run
+from gsx.core.training.run import Run, Step
 from gsx.experiments.compact import compact as compacting
 from gsx.experiments.compact.compact import File, compact
 from gsx.experiments.compact.reduction import Reduction
@@ -139,6 +140,23 @@ def test_learning_on_moves_no_rate_and_counts_no_step(folder: Path) -> None:
     assert run.backbone.table["sh_rest"][:, :3].any()
     rates = run.backbone.options.rates
     assert run.backbone.table.group("means")["lr"] == pytest.approx(rates.means_last * run.scene.extent)
+
+
+def test_it_learns_on_from_the_views_that_are_not_judged_by(folder: Path) -> None:
+    run, seen = opened(folder), list[str]()
+
+    class Watching:
+        @hookimpl
+        def gsx_gradients_ready(self, run: Run, step: Step) -> None:
+            seen.append(step.view.name)
+
+    learnt, judged = judges(run)
+    loaded, resolution = plugins(), run.resolution
+    with loaded.listening([Watching()]):
+        learn_on(run, learnt, 1, 2 * len(learnt), loaded)
+    assert sorted(set(seen)) == sorted(view.name for view in learnt)
+    assert not set(seen) & {view.name for view in judged}
+    assert run.resolution is resolution
 
 
 def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(folder: Path) -> None:

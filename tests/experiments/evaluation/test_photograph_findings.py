@@ -13,9 +13,13 @@ from torch import Tensor
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.resize import to_uint8
+from gsx.core.quality.alignment import Motion, moved, rotation_by
+from gsx.core.quality.shifts import shift_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
+from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.lpips import LpipsOptions
+from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.photographs import different, findings_of, lines
@@ -103,7 +107,9 @@ def test_what_is_said_of_photographs_against_the_others() -> None:
     assert [name for name, told in said.items() if told] == ["dark", "warm", "moved", "blurred", "passer-by"]
     assert said["dark"] == ["0.50 stops darker than the others: training.exposure.when=auto learns exposures"]
     assert said["warm"][0].startswith("its colours are balanced otherwise, channels by up to 0.60 stops")
-    assert said["moved"][0].startswith("it lies 2.5 px beside the model's render (+1.5 across, -2.0 down)")
+    beside = "it lies 2.5 px beside the model's render (+1.5 across, -2.0 down): "
+    assert said["moved"] == [beside + "training.poses.when=always corrects poses"]
+    assert remarks_on(findings, "never", False, True)[8] == [beside + "even with its pose corrected"]
     assert "0.40 of its neighbours' fine contrast" in said["blurred"][0]
     assert said["passer-by"][0].startswith("80% of its error lies in 5% of it")
     assert remarks_on(findings, "auto", True)[6] == ["0.50 stops darker than the others: its exposure was learnt"]
@@ -141,8 +147,8 @@ def test_the_photographs_that_a_model_did_not_take_are_named(run: Run) -> None:
     """All are what the model shows, but for three: at half the light, 2 px to the right, with something white in it."""
     pictures, views = {}, run.scene.train
     for number, view in enumerate(views):
-        moved = replace(view.camera, cx=view.camera.cx + 2) if number == 3 else view.camera
-        pictures[view.name] = render(run, moved, PIXELS).image.detach().clamp(0, 1) * (0.5 if number == 1 else 1)
+        camera = replace(view.camera, cx=view.camera.cx + 2) if number == 3 else view.camera
+        pictures[view.name] = render(run, camera, PIXELS).image.detach().clamp(0, 1) * (0.5 if number == 1 else 1)
     pictures[views[5].name][:, 8:16, 16:24] = 1.0
     scene = run.scene
     run.scene = replace(scene, train=[replace(view, source=Taken(pictures[view.name])) for view in views])
@@ -150,15 +156,46 @@ def test_the_photographs_that_a_model_did_not_take_are_named(run: Run) -> None:
         found = {one.name: one for one in findings_of(run, PIXELS)}
     finally:
         run.scene = scene
-    dark, moved, covered = (found[views[number].name] for number in (1, 3, 5))
-    assert {name for name, one in found.items() if one.remarks} == {dark.name, moved.name, covered.name}
+    dark, shifted, covered = (found[views[number].name] for number in (1, 3, 5))
+    assert {name for name, one in found.items() if one.remarks} == {dark.name, shifted.name, covered.name}
     assert dark.gains == pytest.approx((-1, -1, -1), abs=0.05)
-    assert moved.shift == pytest.approx((2, 0), abs=0.1)
-    assert (dark.remarks[0][:24], moved.remarks[0][:16]) == ("1.00 stops darker than t", "it lies 2.0 px b")
+    assert shifted.shift == pytest.approx((2, 0), abs=0.1)
+    assert (dark.remarks[0][:24], shifted.remarks[0][:16]) == ("1.00 stops darker than t", "it lies 2.0 px b")
     assert "of its error lies in" in covered.remarks[0]
     assert covered.concentrated > 0.95
     names = [one.name for one in found.values()]
-    assert set(names[:3]) == {dark.name, moved.name, covered.name}
+    assert set(names[:3]) == {dark.name, shifted.name, covered.name}
+
+
+def test_a_test_view_is_drawn_where_its_left_half_was_taken(run: Run) -> None:
+    """A photograph of the model itself, taken from a camera that is turned by 6 px: its right half is met from there.
+    What lies in the left half alone decides where that is."""
+    view = replace(run.scene.test[0], camera=run.scene.test[0].camera.zoom(4))
+    turn = torch.tensor([2.0, 6.0, 1.0], dtype=torch.float64) / view.camera.focal
+    taken = moved(view.camera, Motion(rotation=rotation_by(turn), move=torch.zeros(3, dtype=torch.float64)))
+    picture = render(run, taken, PIXELS).image.clamp(0, 1)
+    scene, lpips = run.scene, LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
+    options = EvalOptions(zoom=[1], quantise=True, ssim="inria", tile_pixels=PIXELS, lpips=lpips)
+    run.scene = replace(scene, test=[replace(view, source=Taken(picture))])
+    try:
+        given = Evaluator(run, options).evaluate()
+        aligned = Evaluator(run, replace(options, poses="aligned")).evaluate()
+        beside = picture.clone()
+        beside[..., view.camera.width // 2 :] = 0.5
+        found = [
+            Evaluator(run, replace(options, poses="aligned")).drawn_from(replace(view, source=Taken(shown)))
+            for shown in (picture, beside)
+        ]
+    finally:
+        run.scene = scene
+    assert aligned["psnr"] > given["psnr"] + 3
+    assert torch.equal(found[0].rotation, found[1].rotation)
+    assert torch.equal(found[0].translation, found[1].translation)
+    assert not torch.equal(found[0].rotation, view.camera.rotation)
+    assert "left half" in aligned["protocol"]["poses"]
+    assert aligned["protocol"]["hash"] != given["protocol"]["hash"]
+    with pytest.raises(ValueError, match="choose from given, aligned"):
+        replace(options, poses="found")
 
 
 def test_findings_lie_in_the_run_and_in_its_report(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

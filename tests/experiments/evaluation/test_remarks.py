@@ -14,6 +14,8 @@ LINES = [
     {"step": 10},
     {"step": 20, "withheld": 3},
     {"step": 21, "pseudo": {"up": {"event": 20, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {}}}},
+    {"step": 9, "pose_spread": 0.72, "poses": 40, "pose_motion": 0.61, "pose_seconds": 1.5},
+    {"step": 30, "poses": 40, "pose_motion": 0.2, "pose_seconds": 1.0},
     {"step": 25, "exposure_spread": 0.1854, "exposures": 40, "exposure_seconds": 0.5},
     {"step": 30, "withheld": 5},
     {"step": 41, "pseudo": {
@@ -33,6 +35,7 @@ def test_a_whole_run_is_summed_up_by_hand() -> None:
     }
     assert found["pseudo"]["boot"] == {"asked": {"1": 8}, "dropped": {"1": 0.0}, "warned": {}}
     assert found["exposures"] == {"step": 25, "spread": 0.1854, "learnt": 40, "seconds": 0.5}
+    assert found["poses"] == {"step": 9, "spread": 0.72, "corrected": 40, "motions": [0.61, 0.2], "seconds": 2.5}
     assert gathered(LINES[:1]) == {}
 
 
@@ -44,7 +47,10 @@ def test_in_words() -> None:
         "renders leave out 2.5 splats a view, whose values cannot be drawn",
         "exposures of photographs are spread by 18.5%, each has its own from step 25 on: the model has that of the "
         "mean photograph; eval.colours=fitted looks past that",
+        "training photographs lay 0.72 px beside the model, their poses are corrected from step 9 on: those of test "
+        "views are the scene's; eval.poses=aligned looks past that",
     ]
+    assert remarks_of({"poses": {"step": 9, "spread": 0.1, "corrected": 0}}) == []
     assert remarks_of({"exposures": {"step": 25, "spread": 0.001, "learnt": 0}}) == []
     assert remarks_of({"psnr": 30.0, "left_out": 0.0}) == []
 

@@ -195,12 +195,14 @@ def test_a_folder_named_by_a_number_is_a_folder() -> None:
 def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> None:
     config = compose(["backbone=mip_splatting", "augmenter=upscale"], plugins()).resolved
     del config["eval"]["colours"], config["training"]["exposure"], config["backbone"]["mip"]["views"]
+    del config["eval"]["poses"], config["training"]["poses"]
     del config["scene"]["disturb"], config["augmenter"]["upscale"]["weight_map"]
     write_config(tmp_path / "config.yaml", config)
     words = ["eval.colours=fitted", "training.exposure.when=always", "backbone.mip.views=2", "scene.disturb.pose=2"]
-    words += ["augmenter.upscale.weight_map=none"]
+    words += ["augmenter.upscale.weight_map=none", "eval.poses=aligned", "training.poses.when=auto"]
     settings = read_config(tmp_path / "config.yaml", plugins(), words)
     assert (settings.evaluation.colours, settings.training.exposure.when) == ("fitted", "always")
+    assert (settings.evaluation.poses, settings.training.poses.when) == ("aligned", "auto")
     assert settings.backbone.options.mip.views == 2
     assert settings.resolved["eval"]["colours"] == "fitted"
     with pytest.raises(ConfigError, match=r"Did you mean 'eval.colours'"):

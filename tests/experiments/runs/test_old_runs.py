@@ -101,7 +101,7 @@ def test_figures_by_another_filter_are_not_those_of_the_composition(tmp_path: Pa
     (tmp_path / "environment.json").write_text('{"scene": {"stamp": ""}}')
     leave_results(tmp_path)
     own = evaluation_settings(made.resolved)
-    older = {key: value for key, value in own["eval"].items() if key not in ("supersample", "colours")}
+    older = {key: value for key, value in own["eval"].items() if key not in ("supersample", "colours", "poses")}
     cases = [
         ({"settings": own | {"eval": older}}, True),
         ({"settings": own | {"eval": older | {"colours": "fitted"}}}, False),

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import FromFile, ImageSource, Masked, Scene, View
+from gsx.core.data.taken import as_taken
 from gsx.core.errors import ConfigError
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float, UInt8
@@ -50,33 +51,27 @@ class Patch:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Worse:
-    """A source of a photograph that was taken at another exposure, from elsewhere, with something in the way."""
+    """A source of a photograph that was taken at another exposure, with something in the way."""
 
     source: ImageSource
-    taken: Camera
-    """Its pose is that of the photograph, whatever a view says."""
     gains: Float[Tensor, "3"] | None = None
     """Display values are multiplied by them, and saturate."""
     patch: Patch | None = None
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
-        image = self.source.image(self.really(camera))
+        image = self.source.image(camera)
         if self.gains is not None:
             image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
         return image if self.patch is None else self.patch.over(image, camera)
 
-    def really(self, camera: Camera) -> Camera:
-        """The camera where it stood."""
-        return replace(camera, rotation=self.taken.rotation, translation=self.taken.translation)
-
     def max_zoom(self, camera: Camera) -> float:
         """That of the source."""
-        return self.source.max_zoom(self.really(camera))
+        return self.source.max_zoom(camera)
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """That of the source."""
-        return self.source.counted(self.really(camera)) if isinstance(self.source, Masked) else None
+        return self.source.counted(camera) if isinstance(self.source, Masked) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -142,8 +137,7 @@ def worse(view: View, by: Mapping[str, float]) -> View:
     exposure, pose, covered = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered"))
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
-        source=view.source,
-        taken=view.camera,
+        source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
         patch=patch_of(view.name, covered) if covered else None,
     )

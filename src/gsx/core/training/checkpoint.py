@@ -21,7 +21,7 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 SCHEMA = 1
-GENERATOR, EXPOSURE, PLATEAU = "run.generator", "exposure.", "plateau."
+GENERATOR, EXPOSURE, PLATEAU, POSES = "run.generator", "exposure.", "plateau.", "poses."
 LONGEST = 1e12
 """Seconds that no training takes."""
 
@@ -43,7 +43,8 @@ def write(run: Run, folder: Path) -> Path:
 
     of_exposures = {EXPOSURE + name: value for name, value in run.exposures.tensors().items()}
     of_plateau = {PLATEAU + name: value for name, value in run.plateau.tensors().items()}
-    held = table_tensors(run.backbone.table) | of_exposures | of_plateau
+    of_poses = {POSES + name: value for name, value in run.poses.tensors().items()}
+    held = table_tensors(run.backbone.table) | of_exposures | of_plateau | of_poses
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in held.items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
@@ -187,6 +188,7 @@ def restore(run: Run, training: bool = False) -> None:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
     run.exposures.restore(taken_out(tensors, EXPOSURE))
     run.plateau.restore(taken_out(tensors, PLATEAU))
+    run.poses.restore(taken_out(tensors, POSES))
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

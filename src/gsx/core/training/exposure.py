@@ -74,9 +74,9 @@ def of_halves(image: Tensor, photograph: Tensor, counted: Bool[Tensor, "H W"] | 
     )
 
 
-def shared_spread(left: Float[Tensor, "N 3"], right: Float[Tensor, "N 3"]) -> float:
-    """Standard deviation of log gains over photographs, without the noise in which halves of one differ: the root of
-    the covariance of their halves, in the mean over channels; 0 where that is negative, or nothing is told."""
+def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> float:
+    """Standard deviation of what is told of photographs, in the mean over channels, without the noise in which halves
+    of one differ: the root of the covariance of their halves; 0 where that is negative, or nothing is told."""
     known = (left.isfinite() & right.isfinite()).all(1)
     if int(known.sum()) < FEWEST_VIEWS:
         return 0.0

@@ -10,7 +10,7 @@ def regenerator_context(run: Run, seed: int) -> RegeneratorContext:
     assert run.held_out is not None
     held_out = run.held_out
     return RegeneratorContext(
-        views=run.scene.train,
+        views=run.photographed,
         reduction=run.scene.reduction,
         render=lambda camera: render(run, camera).image,
         held_out=lambda share: held_out(share, seed),

@@ -31,16 +31,22 @@ def render_gaussians(
 
 @torch.no_grad()
 def render(
-    run: Run, camera: Camera, pixels: int = TILE_PIXELS, supersample: int = 0, splats: Splats | None = None
+    run: Run,
+    camera: Camera,
+    pixels: int = TILE_PIXELS,
+    supersample: int = 0,
+    splats: Splats | None = None,
+    depth: bool = False,
 ) -> TiledRendering:
     """The model after the run's steps, over the scene's background; colours clamped to [0, 1].
 
     Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
     `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
+    `depth`: with that, as finely as it was rendered.
     """
     times = supersample or times_as_fine(camera, run.scene.train, run.resolution.supersample_at(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
-    tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, pixels=pixels)
+    tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, depth=depth, pixels=pixels)
     image, alpha = (raster.reduced(part) for part in (tiled.image, tiled.alpha[None]))
     return replace(tiled, image=image.clamp_(0, 1), alpha=alpha[0])

@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.shapes import Bool, UInt8
+from gsx.core.training.poses import Poses
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
 
@@ -78,6 +79,8 @@ class Resolution:
     """Last step before that."""
     coarse_views: dict[int, Sequence[View]] = field(default_factory=dict)
     """Those that were asked for, by how many times as coarse they are."""
+    poses: Poses = field(default_factory=Poses)
+    """Where photographs were taken: where their views say, unless that is corrected."""
     closer: dict[str, Sequence[PseudoView]] = field(default_factory=dict)
     """Pseudo views that are trained on at the moment, by augmenter."""
 
@@ -93,13 +96,17 @@ class Resolution:
         return self.supersample if step > self.finer_after else 1
 
     def views(self, step: int) -> Sequence[View]:
-        """The training views, as a step sees them."""
+        """The training views, as a step sees them, by the poses of the moment."""
         times = self.coarse_at(step)
         if times == 1:
-            return self.scene.train
+            return self.posed(self.scene.train)
         if times not in self.coarse_views:
             self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
-        return self.coarse_views[times]
+        return self.posed(self.coarse_views[times])
+
+    def posed(self, views: Sequence[View]) -> Sequence[View]:
+        """Training views, in order, by the poses of the moment."""
+        return self.poses.views(views)
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

@@ -23,6 +23,7 @@ from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
+from gsx.core.training.poses import PoseOptions, Poses
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.resolution import Resolution
 
@@ -50,6 +51,7 @@ class TrainingOptions:
     coarse_until: Share = 0.0
     """Share of the steps after which they are seen as they are."""
     exposure: ExposureOptions = field(default_factory=ExposureOptions)
+    poses: PoseOptions = field(default_factory=PoseOptions)
     cooldown: Share = 0.0
     """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
     published: these stay as they are."""
@@ -75,6 +77,7 @@ class TrainingOptions:
             coarse_until=round(self.coarse_until * iterations) if self.coarse > 1 else 0,
             supersample=self.supersample,
             finer_after=round(self.supersample_from * iterations) if self.supersample > 1 else 0,
+            poses=Poses(self.poses, [view.camera for view in scene.train], iterations),
         )
 
 
@@ -191,6 +194,16 @@ class Run:
         self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 
     @property
+    def poses(self) -> Poses:
+        """Of the training photographs."""
+        return self.resolution.poses
+
+    @property
+    def photographed(self) -> Sequence[View]:
+        """The training views at their own resolution, by the poses of the moment."""
+        return self.resolution.posed(self.scene.train)
+
+    @property
     def complete(self) -> bool:
         """All iterations are done."""
         return self.step >= self.iterations
@@ -249,9 +262,15 @@ class Step:
 
 
 def settled_after(run: Run) -> int:
-    """Step after which nothing is due once before the last part of the run: of its exposures, of the resolution that it
-    renders at, of its backbone."""
+    """Step after which nothing is due once before the last part of the run: of its exposures and poses, of the
+    resolution that it renders at, of its backbone."""
     own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
-    steps = [run.exposures.first, run.resolution.coarse_until, run.resolution.finer_after, *own]
+    steps = [
+        run.exposures.first,
+        *run.poses.steps(),
+        run.resolution.coarse_until,
+        run.resolution.finer_after,
+        *own,
+    ]
     last = run.training.plateau.last_part(run.iterations)
     return max((step for step in steps if step < last), default=0)

@@ -34,6 +34,7 @@ from gsx.core.training.colour_fits import colour_fits, fitted, take_coefficients
 from gsx.core.training.evidence import ROUNDING, Forming, draws_of_each, looked_at, squared_changes
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
+from gsx.core.training.poses import Poses
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.supersampling import raster_at
@@ -86,7 +87,7 @@ class Try:
 
 def judges(run: Run) -> tuple[list[View], list[View]]:
     """(training views to learn from, training views to judge by), the latter spread over the order."""
-    views = run.scene.train
+    views = run.photographed
     count = max(FEWEST, len(views) // ONE_IN)
     if len(views) <= count:
         return list(views), list(views)
@@ -185,8 +186,8 @@ class Shrinking:
         self.run, self.options, self.plugins = run, options, plugins
         self.learnt, self.judging = judges(run)
         self.before = figures(run, self.judging, options.zooms)
-        self.worth = worth_of(run, run.scene.train, generator)
-        self.colours = colours_of_lower_degrees(run, run.scene.train, generator)
+        self.worth = worth_of(run, run.photographed, generator)
+        self.colours = colours_of_lower_degrees(run, run.photographed, generator)
         seen = seen_colours(run, self.colours)
         self.reductions = {
             way: Reduction(run.backbone.table, self.worth, seen if way else None) for way in (True, False)
@@ -315,7 +316,7 @@ class Shrinking:
         run = self.run
         self.cut(best.removed, best.degree, best.merging)
         if best.removed or best.degree < degree_of_run(run):
-            learn_on(run, run.scene.train, best.degree, self.options.steps, self.plugins)
+            learn_on(run, run.photographed, best.degree, self.options.steps, self.plugins)
 
 
 def copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -348,10 +349,11 @@ def learn_on(run: Run, views: Sequence[View], degree: int, steps: int, plugins: 
 @contextmanager
 def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
     """The run as one that ends so many steps later, with these training views; afterwards nothing has been counted."""
-    names = ("step", "iterations", "seconds", "scene", "sampler", "training")
+    names = ("step", "iterations", "seconds", "scene", "sampler", "training", "resolution")
     before = {name: getattr(run, name) for name in names}
     run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
     run.iterations = run.step + steps
+    run.resolution = replace(run.resolution, scene=run.scene, coarse_views={}, poses=Poses())
     run.training = replace(run.training, cooldown=steps / run.iterations)
     try:
         yield

@@ -11,15 +11,17 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
+from gsx.core.quality.alignment import aligned
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
@@ -34,7 +36,9 @@ from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
 
-COLOURS = ("rendered", "fitted")
+COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
+ALIGNED = 2
+"""How often a pose is moved to where its photograph was taken, each time by a new render."""
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
 
@@ -53,6 +57,9 @@ class EvalOptions:
     colours: str = "rendered"
     """rendered: as the model shows them; fitted: by one matrix of colours a view, which its left half is fitted by and
     its right half judged."""
+    poses: str = "given"
+    """given: views are drawn where the scene says; aligned: where the model says that they were taken, told from their
+    left halves, and their right halves are judged."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 
@@ -61,8 +68,15 @@ class EvalOptions:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
         if self.colours not in COLOURS:
             raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
+        if self.poses not in POSES:
+            raise ValueError(f"eval.poses is '{self.poses}'; choose from {', '.join(POSES)}")
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
+
+    @property
+    def right_halves(self) -> bool:
+        """Whether left halves tell something of views, and right halves alone are judged."""
+        return self.colours == "fitted" or self.poses == "aligned"
 
 
 def peak_memory_mb(device: torch.device) -> float | None:
@@ -95,6 +109,8 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
         protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
     if options.colours == "fitted":
         protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
+    if options.poses == "aligned":
+        protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
     text = json.dumps(protocol, sort_keys=True, default=str)
     # which zooms were looked at changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
@@ -165,6 +181,16 @@ def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[T
     return out
 
 
+def aligned_to(run: Run, view: View) -> Camera:
+    """Where the model says that a view was taken, told from its left half."""
+    left, camera = half(view, view.counted(), right=False), view.camera
+    for _ in range(ALIGNED):
+        shown = render(run, camera, supersample=1, depth=True)
+        assert shown.depth is not None
+        camera = aligned(camera, shown.image, shown.depth, shown.alpha, view.image(), left, given=view.camera)
+    return camera
+
+
 class Evaluator:
     """Measures one run by one protocol; each view is rendered once at each zoom."""
 
@@ -177,6 +203,8 @@ class Evaluator:
         """Those renders, as bytes where they are quantised."""
         self.matrices: dict[str, Float[Tensor, "3 4"]] = {}
         """Of colours, by name of the view, where they are fitted."""
+        self.cameras: dict[str, Camera] = {}
+        """Where views were taken, by name, where poses are aligned."""
 
     def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """The picture as metrics see it."""
@@ -193,7 +221,16 @@ class Evaluator:
 
     def judged(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
         """Which pixels of a view are judged, of those that count; None: all."""
-        return counted if self.options.colours == "rendered" else half(view, counted, right=True)
+        return half(view, counted, right=True) if self.options.right_halves else counted
+
+    def drawn_from(self, view: View) -> Camera:
+        """The camera that a view is drawn from."""
+        if self.options.poses == "given":
+            return view.camera
+        if view.name not in self.cameras:
+            self.cameras[view.name] = aligned_to(self.run, view)
+        own = self.cameras[view.name]
+        return replace(view.camera, rotation=own.rotation, translation=own.translation)
 
     def rendered(self, view: View, factor: float = 1) -> TiledRendering:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
@@ -201,10 +238,11 @@ class Evaluator:
         times = self.options.supersample
         if factor < 1 and not times and self.run.resolution.supersample_at(self.run.model_step) > 1:
             times = math.ceil(self.run.resolution.supersample_at(self.run.model_step) / factor)
-        return render(self.run, view.camera, self.options.tile_pixels, times)
+        return render(self.run, self.drawn_from(view), self.options.tile_pixels, times)
 
     def view(self, view: View) -> dict[str, Any]:
         """Figures of one view at the training resolution."""
+        self.drawn_from(view)  # what finds it is not part of the time of a render
         begun = time.perf_counter()
         tiled = self.rendered(view)
         self.times.append(time.perf_counter() - begun)
@@ -223,7 +261,7 @@ class Evaluator:
 
     def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
         """The part of a picture that is judged, for metrics that know no mask."""
-        return image if self.options.colours == "rendered" else image[..., image.shape[2] // 2 :]
+        return image[..., image.shape[2] // 2 :] if self.options.right_halves else image
 
     def whole(self, view: View) -> Float[Tensor, "3 H W"]:
         """The render of a view that was measured."""

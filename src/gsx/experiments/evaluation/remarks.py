@@ -48,7 +48,7 @@ class CapNotice:
 
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, pictures of `pseudo` views, and
-    exposures of photographs.
+    exposures and poses of photographs.
 
     Only what there is.
     """
@@ -57,7 +57,7 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     cap = {"step": held[0]["step"], "primitives": sum(line["withheld"] for line in held)} if held else {}
     told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
     pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
-    found = {"withheld": cap, "pseudo": pseudo, "exposures": judged_exposures(lines)}
+    found = {"withheld": cap, "pseudo": pseudo, "exposures": judged_exposures(lines), "poses": judged_poses(lines)}
     return {key: value for key, value in found.items() if value}
 
 
@@ -68,6 +68,17 @@ def judged_exposures(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             told = {"spread": "exposure_spread", "learnt": "exposures", "seconds": "exposure_seconds"}
             return {"step": line["step"]} | {name: line[key] for name, key in told.items()}
     return {}
+
+
+def judged_poses(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """At which step poses were judged, px by which photographs lay beside, of how many poses were corrected, by how
+    many px each time, and seconds of it all."""
+    told = [line for line in lines if "pose_seconds" in line]
+    if not told:
+        return {}
+    first = {"step": told[0]["step"], "spread": told[0]["pose_spread"], "corrected": told[0]["poses"]}
+    motions = [line["pose_motion"] for line in told if "pose_motion" in line]
+    return first | {"motions": motions, "seconds": sum(line["pose_seconds"] for line in told)}
 
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -91,7 +102,7 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
-    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks)
+    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks, pose_remarks)
     return [remark for kind in kinds for remark in kind(evaluation)]
 
 
@@ -121,6 +132,16 @@ def exposure_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"exposures of photographs are spread by {found['spread']:.1%}, each has its own from step "
             f"{found['step']:,} on: the model has that of the mean photograph; eval.colours=fitted looks past that"
+        )
+
+
+def pose_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Poses that were corrected: test views have those of the scene."""
+    found = evaluation.get("poses") or {}
+    if found.get("corrected"):
+        yield (
+            f"training photographs lay {found['spread']:.2f} px beside the model, their poses are corrected from step "
+            f"{found['step']:,} on: those of test views are the scene's; eval.poses=aligned looks past that"
         )
 
 

@@ -70,13 +70,14 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
-def refuse_shared_exposures(training: TrainingOptions, ranks: Ranks) -> None:
-    """Raise ConfigError where processes would have to learn exposures together."""
-    if ranks.size > 1 and training.exposure.when != "never":
-        raise ConfigError(
-            f"training.exposure.when is '{training.exposure.when}', which is for one process, and {ranks.size} train "
-            "together: set it to never, or start gsx without torchrun"
-        )
+def refuse_shared(training: TrainingOptions, ranks: Ranks) -> None:
+    """Raise ConfigError where processes would have to learn exposures or poses together."""
+    for key, when in {"exposure": training.exposure.when, "poses": training.poses.when}.items():
+        if ranks.size > 1 and when != "never":
+            raise ConfigError(
+                f"training.{key}.when is '{when}', which is for one process, and {ranks.size} train together: set it "
+                "to never, or start gsx without torchrun"
+            )
 
 
 ALONE = Ranks()
@@ -119,7 +120,7 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
-        refuse_shared_exposures(settings.training, ranks)
+        refuse_shared(settings.training, ranks)
     prepare_process(device, training)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)

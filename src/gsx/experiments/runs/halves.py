@@ -23,6 +23,7 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
 from gsx.core.training.guard import Guard
+from gsx.core.training.poses import PoseOptions
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
@@ -58,7 +59,7 @@ def held_out_renders(run: Run, anew: Anew, share: float, seed: int) -> list[Floa
 def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
     """The renders of both models."""
     logger.info("two models of half of the training views each are trained for %d steps", steps)
-    begun, views = time.perf_counter(), run.scene.train
+    begun, views = time.perf_counter(), run.photographed
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
         model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
@@ -70,8 +71,8 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
 
 def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
-    views = [view for number, view in enumerate(run.scene.train) if number % HALVES != half]
-    scene = replace(run.scene, train=views, test=[])
+    views = [view for number, view in enumerate(run.photographed) if number % HALVES != half]
+    scene, training = replace(run.scene, train=views, test=[]), replace(run.training, poses=PoseOptions())
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
     backbone = anew(scene, steps, generator)
@@ -81,8 +82,8 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         scene=scene,
         backbone=backbone,
         raster=backbone.raster,
-        training=run.training,
-        resolution=run.training.resolution(scene, steps),
+        training=training,
+        resolution=training.resolution(scene, steps),
         iterations=steps,
         device=run.device,
         generator=generator,

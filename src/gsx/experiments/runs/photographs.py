@@ -16,10 +16,11 @@ from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.quality.sharpness import sharpness
+from gsx.core.quality.shifts import shift_of
 from gsx.core.shapes import Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on, shift_of
+from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.claims import claimed
@@ -52,13 +53,14 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Of every training photograph, worst first."""
-    views = different(run.scene.train)
+    views = different(run.photographed)
     progress, known = Countdown("looking at photographs", len(views)), sharpness_of(views)
     found = []
     for view in views:
         found.append(finding(run, view, known.get(view.name), pixels))
         progress.advance(1, view.name)
-    told = remarks_on(found, run.training.exposure.when, run.exposures.matrices is not None)
+    learnt, corrected = run.exposures.matrices is not None, run.poses.matrices is not None
+    told = remarks_on(found, run.training.exposure.when, learnt, corrected)
     return sorted((replace(one, remarks=said) for one, said in zip(found, told, strict=True)), key=lambda one: one.psnr)
 
 
@@ -102,7 +104,7 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
     place = Pictures(run.folder / FOLDER, run.step)
     place.folder.mkdir(parents=True, exist_ok=True)
     forget(place.folder)
-    views, shown = {view.name: view for view in run.scene.train}, findings[:worst]
+    views, shown = {view.name: view for view in run.photographed}, findings[:worst]
     entries: list[dict[str, Any]] = [asdict(one) for one in findings]
     for entry, name in zip(entries, file_names([one.name for one in shown]), strict=False):
         view = views[entry["name"]]

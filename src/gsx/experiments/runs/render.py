@@ -28,7 +28,7 @@ def view_named(run: Run, name: str) -> View:
     Raises:
         InputError: there is none; the nearest name is given.
     """
-    views = {view.name: view for view in [*run.scene.test, *run.scene.train]}
+    views = {view.name: view for view in [*run.scene.test, *run.photographed]}
     if name not in views:
         raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{nearest(name, list(views))}")
     return views[name]

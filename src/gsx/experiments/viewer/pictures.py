@@ -94,7 +94,7 @@ class RunModel:
 
     def views(self) -> dict[str, View]:
         """Training and test views by name."""
-        return {view.name: view for view in (*self.run.scene.test, *self.run.scene.train)}
+        return {view.name: view for view in (*self.run.scene.test, *self.run.photographed)}
 
 
 @dataclass(eq=False)

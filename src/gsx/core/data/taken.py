@@ -1,0 +1,46 @@
+"""Photographs that stay as they were taken when the pose of their view is said to be another."""
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import FromFile, ImageSource, Masked, View
+from gsx.core.shapes import Bool, UInt8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Taken:
+    """A source that is asked for what was seen from one pose, whatever a view says."""
+
+    source: ImageSource
+    taken: Camera
+    """Its pose is that of the photograph."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """What was photographed."""
+        return self.source.image(self.really(camera))
+
+    def really(self, camera: Camera) -> Camera:
+        """The camera where it stood."""
+        return replace(camera, rotation=self.taken.rotation, translation=self.taken.translation)
+
+    def max_zoom(self, camera: Camera) -> float:
+        """That of the source."""
+        return self.source.max_zoom(self.really(camera))
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """That of the source."""
+        return self.source.counted(self.really(camera)) if isinstance(self.source, Masked) else None
+
+
+def as_taken(view: View) -> ImageSource:
+    """The source of a view, for views of other poses: a file does not know its pose, and what is computed does."""
+    fixed = isinstance(view.source, FromFile | Taken)
+    return view.source if fixed else Taken(source=view.source, taken=view.camera)
+
+
+def posed(view: View, camera: Camera) -> View:
+    """The view with the pose of a camera; its photograph stays."""
+    own = replace(view.camera, rotation=camera.rotation, translation=camera.translation)
+    return replace(view, camera=own, source=as_taken(view))
