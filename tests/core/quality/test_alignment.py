@@ -101,6 +101,16 @@ def test_a_plain_picture_moves_nothing_and_no_depth_tells_nothing() -> None:
     assert aligned(AT_ORIGIN, image, 0 * depth, torch.zeros_like(depth), other, None) is AT_ORIGIN
 
 
+def test_what_pictures_do_not_tell_goes_back_to_the_given_pose() -> None:
+    astray = elsewhere((2.0, -1.0, 0.5), (0.05, 0.0, -0.02))
+    plain, depth = torch.full((3, HEIGHT, WIDTH), 0.5), picture(AT_ORIGIN)[1]
+    back = aligned(astray, plain, depth, torch.ones_like(depth), plain, None, given=AT_ORIGIN)
+    angle, distance = off(back, AT_ORIGIN)
+    assert angle < 0.05
+    assert distance < 0.001
+    assert off(astray, AT_ORIGIN)[1] > 0.04
+
+
 def test_depth_is_that_of_what_covers_a_pixel() -> None:
     """The rasterizer sums depth by weights that add up to alpha."""
     taken, (image, depth) = elsewhere((0.0, 0.0, 0.0), (0.06, -0.04, 0.08)), picture(AT_ORIGIN)
