@@ -123,10 +123,11 @@ class Anchors:
     def photograph_of(self, camera: Camera, step: int) -> int:
         """Which training view a camera is: as the scene has it, or as the step does, coarser or of a corrected pose;
         -1: none."""
-        views = self.resolution
-        for seen in (views.scene.train, views.posed(views.scene.train), views.views(step)):
-            for number, view in enumerate(seen):
-                if view.camera is camera:
+        resolution = self.resolution
+        seen = (resolution.posed(resolution.scene.train), resolution.views(step))
+        for cameras in (self.cameras, *([view.camera for view in views] for views in seen)):
+            for number, own in enumerate(cameras):
+                if own is camera:
                     return number
         return -1
 
