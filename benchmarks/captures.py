@@ -98,20 +98,20 @@ def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     row["learnt"] = f"{sum(one['exposures'].get('learnt', 0) > 0 for one in found)} of {len(found)}"
     row["asking"] = f"{100 * statistics.mean(one['asking'] for one in found):.1f}" if spreads else ""
     for zoom in ZOOMS:
-        row[f"fitted{zoom}"] = told(fitted(found, zoom), ".2f")
+        row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
         if arm == "disturbed, auto":
-            row[f"back{zoom}"] = told(shares_won(by_arm, zoom), ".2f")
-    return row | {f"x{zoom}": told([one["rendered"][zoom]["psnr"] for one in found], ".2f") for zoom in ZOOMS}
+            row[f"back{zoom}"] = told(shares_won([by_arm[name] for name in ARMS], "fitted", zoom), ".2f")
+    return row | {f"x{zoom}": told(psnr_of(found, "rendered", zoom), ".2f") for zoom in ZOOMS}
 
 
-def fitted(found: Found, zoom: str) -> list[float]:
-    """PSNR in fitted colours with each seed."""
-    return [one["fitted"][zoom]["psnr"] for one in found]
+def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
+    """PSNR by a protocol with each seed."""
+    return [one[protocol][zoom]["psnr"] for one in found]
 
 
-def shares_won(by_arm: Mapping[str, Found], zoom: str) -> list[float]:
-    """Of what the disturbance cost, with each seed."""
-    best, worst, mended = (fitted(by_arm[arm], zoom) for arm in ARMS)
+def shares_won(arms: Sequence[Found], protocol: str, zoom: str) -> list[float]:
+    """Of what the disturbance cost, with each seed; `arms`: without it, with it, with it and what mends it."""
+    best, worst, mended = (psnr_of(found, protocol, zoom) for found in arms)
     return [(m - w) / (b - w) for b, w, m in zip(best, worst, mended, strict=True)]
 
 
@@ -217,15 +217,9 @@ def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
     for zoom in ZOOMS:
         row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
         if arm.endswith("px, auto"):
-            arms = (by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm))
-            best, worst, mended = (psnr_of(one, "aligned", zoom) for one in arms)
-            row[f"back{zoom}"] = told([(m - w) / (b - w) for b, w, m in zip(best, worst, mended, strict=True)], ".2f")
+            arms = [by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm)]
+            row[f"back{zoom}"] = told(shares_won(arms, "aligned", zoom), ".2f")
     return row | {f"x{zoom}": told(psnr_of(found, "given", zoom), ".2f") for zoom in ZOOMS}
-
-
-def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
-    """PSNR by a protocol with each seed."""
-    return [one[protocol][zoom]["psnr"] for one in found]
 
 
 def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:

@@ -90,6 +90,7 @@ class Anchors:
         self.network_rates, self.extent, self.resolution = network_rates, scene.extent, context.resolution
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
+        self.views = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = context.schedule(options.published_iterations)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, options.growth.stop)
         self.raster = self.filter.rules(context.raster)
@@ -123,13 +124,12 @@ class Anchors:
     def photograph_of(self, camera: Camera, step: int) -> int:
         """Which training view a camera is: as the scene has it, or as the step does, coarser or of a corrected pose;
         -1: none."""
+        if camera in self.views:
+            return self.views[camera]
         resolution = self.resolution
-        seen = (resolution.posed(resolution.scene.train), resolution.views(step))
-        for cameras in (self.cameras, *([view.camera for view in views] for views in seen)):
-            for number, own in enumerate(cameras):
-                if own is camera:
-                    return number
-        return -1
+        seen = (resolution.poses.views(resolution.scene.train), resolution.views(step))
+        numbered = (pair for views in seen for pair in enumerate(views))
+        return next((number for number, view in numbered if view.camera is camera), -1)
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
         """Anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""

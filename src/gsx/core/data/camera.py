@@ -78,6 +78,10 @@ class Camera:
         """The larger focal length, px."""
         return max(self.fx, self.fy)
 
+    def with_pose_of(self, other: "Camera") -> "Camera":
+        """This camera where the other one stands, looking where that looks."""
+        return replace(self, rotation=other.rotation, translation=other.translation)
+
     def draws_as(self, other: "Camera") -> bool:
         """Whether both draw the same picture, bit for bit."""
         numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")

@@ -19,19 +19,15 @@ class Taken:
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
-        return self.source.image(self.really(camera))
-
-    def really(self, camera: Camera) -> Camera:
-        """The camera where it stood."""
-        return replace(camera, rotation=self.taken.rotation, translation=self.taken.translation)
+        return self.source.image(camera.with_pose_of(self.taken))
 
     def max_zoom(self, camera: Camera) -> float:
         """That of the source."""
-        return self.source.max_zoom(self.really(camera))
+        return self.source.max_zoom(camera.with_pose_of(self.taken))
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """That of the source."""
-        return self.source.counted(self.really(camera)) if isinstance(self.source, Masked) else None
+        return self.source.counted(camera.with_pose_of(self.taken)) if isinstance(self.source, Masked) else None
 
 
 def as_taken(view: View) -> ImageSource:
@@ -42,5 +38,4 @@ def as_taken(view: View) -> ImageSource:
 
 def posed(view: View, camera: Camera) -> View:
     """The view with the pose of a camera; its photograph stays."""
-    own = replace(view.camera, rotation=camera.rotation, translation=camera.translation)
-    return replace(view, camera=own, source=as_taken(view))
+    return replace(view, camera=view.camera.with_pose_of(camera), source=as_taken(view))

@@ -55,6 +55,12 @@ def product(a: Float[Tensor, "4"], b: Float[Tensor, "N 4"]) -> Float[Tensor, "N 
     return b @ left.T
 
 
+def cross_matrix(a: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The matrix that makes b into a x b."""
+    zero, (x, y, z) = a.new_zeros(()), a.unbind()
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+
+
 def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The smallest rotation that takes unit vector a to unit vector b, float64."""
     a, b = a.double(), b.double()
@@ -63,6 +69,5 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
         axis = torch.linalg.cross(a, torch.eye(3, dtype=torch.float64)[int(a.abs().argmin())])
         axis = axis / axis.norm()
         return 2 * torch.outer(axis, axis) - torch.eye(3, dtype=torch.float64)
-    x, y, z = axis.tolist()
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    skew = cross_matrix(axis)
     return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)

@@ -9,12 +9,15 @@ a distant wall) are held by a prior.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.masks import grown
+from gsx.core.gaussians.turned import cross_matrix
 from gsx.core.quality.shifts import ALIKE, BORDER, LEAST, SMALLEST, by_medians, central, grey, robust
 from gsx.core.shapes import Bool, Float
 
@@ -59,8 +62,7 @@ STILL = Motion(rotation=torch.eye(3, dtype=torch.float64), move=torch.zeros(3, d
 
 def rotation_by(turn: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The rotation about a vector by its length, rad."""
-    zero, (x, y, z) = turn.new_zeros(()), turn.unbind()
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+    return torch.linalg.matrix_exp(cross_matrix(turn))
 
 
 def motion_to(camera: Camera, other: Camera) -> Motion:
@@ -109,15 +111,16 @@ class Shown:
         counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
         return Shown(camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted, given=self.given)
 
+    @cached_property
+    def masked(self) -> Float[Tensor, "1 H W"] | None:
+        """1 near pixels of the photograph that do not count, else 0; None: all count."""
+        return None if self.counted is None else grown(~self.counted[None], BORDER).double()
+
     def seen(self, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor, "2 P"], Bool[Tensor, "P"]]:
         """(where points of a camera's frame are seen, px; which of them, before the camera, and not near a border of
         the photograph or what does not count of it)."""
         pixels, told = seen_at(self.camera, points)
-        if self.counted is None:
-            return pixels, told
-        near = 2 * BORDER + 1
-        around = avg_pool2d(self.counted[None].double(), near, stride=1, padding=BORDER, count_include_pad=False)
-        return pixels, told & (looked_up(around, pixels, "nearest")[0] == 1)
+        return pixels, told if self.masked is None else told & (looked_up(self.masked, pixels, "nearest")[0] == 0)
 
 
 def aligned(

@@ -15,13 +15,16 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import restored_table, table_tensors
+from gsx.core.training.plateau import Plateau
+from gsx.core.training.poses import Poses
 from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
 
 SCHEMA = 1
-GENERATOR, EXPOSURE, PLATEAU, POSES = "run.generator", "exposure.", "plateau.", "poses."
+GENERATOR = "run.generator"
 LONGEST = 1e12
 """Seconds that no training takes."""
 
@@ -41,10 +44,9 @@ def write(run: Run, folder: Path) -> Path:
     """Write a checkpoint of the current step into a folder."""
     from safetensors.torch import save as to_bytes
 
-    of_exposures = {EXPOSURE + name: value for name, value in run.exposures.tensors().items()}
-    of_plateau = {PLATEAU + name: value for name, value in run.plateau.tensors().items()}
-    of_poses = {POSES + name: value for name, value in run.poses.tensors().items()}
-    held = table_tensors(run.backbone.table) | of_exposures | of_plateau | of_poses
+    held = table_tensors(run.backbone.table)
+    for prefix, part in parts_of(run).items():
+        held |= {prefix + name: value for name, value in part.tensors().items()}
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in held.items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
@@ -61,6 +63,11 @@ def write(run: Run, folder: Path) -> Path:
     }
     write_json(path.with_suffix(".json"), sidecar)
     return path
+
+
+def parts_of(run: Run) -> dict[str, Exposures | Plateau | Poses]:
+    """What a run learns beside its model, by how the names of its tensors begin."""
+    return {"exposure.": run.exposures, "plateau.": run.plateau, "poses.": run.poses}
 
 
 def names_of(run: Run) -> dict[str, list[str]]:
@@ -186,9 +193,8 @@ def restore(run: Run, training: bool = False) -> None:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
-    run.exposures.restore(taken_out(tensors, EXPOSURE))
-    run.plateau.restore(taken_out(tensors, PLATEAU))
-    run.poses.restore(taken_out(tensors, POSES))
+    for prefix, part in parts_of(run).items():
+        part.restore(taken_out(tensors, prefix))
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

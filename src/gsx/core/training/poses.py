@@ -19,6 +19,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.taken import posed
+from gsx.core.gaussians.turned import cross_matrix
 from gsx.core.quality.alignment import Motion, motion_to, rotation_by
 from gsx.core.quality.shifts import shift_of
 from gsx.core.ranges import Range, Share
@@ -107,17 +108,9 @@ class Poses:
         for asked, made in self.seen:
             if asked is views:
                 return made
-        made = [posed(view, self.camera(number)) for number, view in enumerate(views)]
+        made = [posed(view, at(view.camera, matrix)) for view, matrix in zip(views, self.matrices, strict=True)]
         self.seen.append((views, made))
         return made
-
-    def camera(self, number: int) -> Camera:
-        """The camera of a photograph, by the scene's intrinsics."""
-        own = self.cameras[number]
-        if self.matrices is None:
-            return own
-        matrix = self.matrices[number]
-        return replace(own, rotation=matrix[:, :3].to(own.rotation), translation=matrix[:, 3].to(own.translation))
 
     # -- what changes them ---------------------------------------------------------------------------------------------
 
@@ -172,6 +165,12 @@ def of_half(
     return (math.nan, math.nan) if found is None else (px * found[0], px * found[1])
 
 
+def at(camera: Camera, matrix: Float[Tensor, "3 4"]) -> Camera:
+    """The camera at a pose camera_from_world."""
+    rotation, translation = matrix[:, :3].to(camera.rotation), matrix[:, 3].to(camera.translation)
+    return replace(camera, rotation=rotation, translation=translation)
+
+
 # -- motions of cameras ------------------------------------------------------------------------------------------------
 
 
@@ -187,9 +186,7 @@ def in_px(before: Camera, after: Camera, depth: float) -> Float[Tensor, "6"]:
 
 def by_world(camera: Camera) -> Float[Tensor, "6 6"]:
     """How a camera's frame moves with the world: the adjoint of its pose."""
-    rotation, t = camera.rotation.double(), camera.translation.double()
-    zero = t.new_zeros(())
-    across = torch.stack([zero, -t[2], t[1], t[2], zero, -t[0], -t[1], t[0], zero]).view(3, 3)
+    rotation, across = camera.rotation.double(), cross_matrix(camera.translation.double())
     upper = torch.cat([rotation, torch.zeros_like(rotation)], 1)
     return torch.cat([upper, torch.cat([across @ rotation, rotation], 1)])
 

@@ -99,14 +99,10 @@ class Resolution:
         """The training views, as a step sees them, by the poses of the moment."""
         times = self.coarse_at(step)
         if times == 1:
-            return self.posed(self.scene.train)
+            return self.poses.views(self.scene.train)
         if times not in self.coarse_views:
             self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
-        return self.posed(self.coarse_views[times])
-
-    def posed(self, views: Sequence[View]) -> Sequence[View]:
-        """Training views, in order, by the poses of the moment."""
-        return self.poses.views(views)
+        return self.poses.views(self.coarse_views[times])
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

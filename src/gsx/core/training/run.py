@@ -201,7 +201,7 @@ class Run:
     @property
     def photographed(self) -> Sequence[View]:
         """The training views at their own resolution, by the poses of the moment."""
-        return self.resolution.posed(self.scene.train)
+        return self.poses.views(self.scene.train)
 
     @property
     def complete(self) -> bool:

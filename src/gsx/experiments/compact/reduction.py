@@ -105,8 +105,10 @@ def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor
     second moments of both; as zeros they would let the first steps be far too long."""
     pairs = into >= 0
     first, second = gone[pairs], into[pairs]
-    drawn = with_filter(detached_rows(table), smoothed_raw)
-    new = with_filter(merged(drawn, first, second), unsmoothed) if len(first) else {}
+    new: dict[str, Tensor] = {}
+    if len(first):
+        drawn = with_filter(detached_rows(table), smoothed_raw)
+        new = with_filter(merged(drawn, first, second), unsmoothed)
     moments = {name: value[first] + value[second] for name, value in second_moments(table).items()}
     for name in ORDERLESS:
         if name in moments:

@@ -11,7 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
@@ -229,8 +229,7 @@ class Evaluator:
             return view.camera
         if view.name not in self.cameras:
             self.cameras[view.name] = aligned_to(self.run, view)
-        own = self.cameras[view.name]
-        return replace(view.camera, rotation=own.rotation, translation=own.translation)
+        return view.camera.with_pose_of(self.cameras[view.name])
 
     def rendered(self, view: View, factor: float = 1) -> TiledRendering:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
