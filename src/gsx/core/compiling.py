@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 Result = TypeVar("Result")
 WHOLE_LOOPS: dict[str, str | int | bool] = {
@@ -75,10 +76,12 @@ def fused(function: Callable[..., Result]) -> Callable[..., Result]:
 def sizes_free(
     compiled: Callable[..., Any], varying: Callable[[tuple[Any, ...]], Iterable[tuple[Tensor, int]]]
 ) -> Callable[..., Any]:
-    """Tells torch at the first call which sizes (tensor, axis) vary, so that one compilation serves all."""
+    """Tells torch at the first call which sizes (tensor, axis) vary, so that one compilation serves all. Parameters are
+    handed on as tensors: whatever it is told, torch takes their own sizes for constants."""
     marked: list[bool] = []
 
-    def call(*arguments: Any) -> Any:
+    def call(*given: Any) -> Any:
+        arguments = tuple(a.view_as(a) if isinstance(a, Parameter) else a for a in given)
         if not marked:
             marked.append(True)
             for tensor, axis in varying(arguments):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.core.compiling import available
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
@@ -158,3 +159,23 @@ def test_compiled_colours_and_their_gradients_are_the_eager_ones(degree: int) ->
         found.append([colours.detach(), *(leaf.grad for leaf in leaves)])
     for eager, fast in zip(*found, strict=True):
         torch.testing.assert_close(fast, eager, rtol=1e-5, atol=1e-5)
+
+
+@needs_compiler
+def test_colours_of_parameters_compile_once_whatever_their_number() -> None:
+    """Density control replaces parameters by others of another size at every event."""
+
+    def learn(count: int) -> None:
+        generator = torch.Generator().manual_seed(count)
+        sizes = {"constant": (count, 1, 3), "rest": (count, 15, 3)}
+        constant, rest = (Parameter(torch.randn(size, generator=generator)) for size in sizes.values())
+        offsets = Parameter(torch.randn(count, 3, generator=generator))
+        colours_of(constant, rest, offsets, 3, compiled=True).sum().backward()
+        assert rest.grad is not None
+
+    learn(9)
+    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    assert before > 0
+    for count in (14, 40, 23):
+        learn(count)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
