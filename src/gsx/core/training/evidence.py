@@ -54,8 +54,8 @@ class Look:
 
 def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background: Float[Tensor, "3"]) -> Look:
     """Render splats for a camera, as it is rendered at that step."""
-    values = {name: value.detach() for name, value in vars(splats).items()}
-    colours, log_opacities = (values[name].requires_grad_() for name in ("colours", "log_opacities"))
+    values = {name: value.detach().requires_grad_() for name, value in vars(splats).items()}  # compiled as in training
+    colours, log_opacities = values["colours"], values["log_opacities"]
     rendering = rasterize(replace(splats, **values), raster.camera, rules, background=background)
     image = raster.reduced(rendering.image)
     leaves = {"colours": colours, "log_opacities": log_opacities}
