@@ -76,14 +76,16 @@ def fused(function: Callable[..., Result]) -> Callable[..., Result]:
 def sizes_free(
     compiled: Callable[..., Any], varying: Callable[[tuple[Any, ...]], Iterable[tuple[Tensor, int]]]
 ) -> Callable[..., Any]:
-    """Tells torch at the first call which sizes (tensor, axis) vary, so that one compilation serves all. Parameters are
-    handed on as tensors: whatever it is told, torch takes their own sizes for constants."""
-    marked: list[bool] = []
+    """Tells torch which sizes (tensor, axis) vary, so that one compilation serves all: at the first call with gradients
+    of these arguments, and at that without, which torch compiles apart. Parameters are handed on as tensors: whatever
+    it is told, torch takes their own sizes for constants."""
+    marked: set[tuple[bool, ...]] = set()
 
     def call(*given: Any) -> Any:
         arguments = tuple(a.view_as(a) if isinstance(a, Parameter) else a for a in given)
-        if not marked:
-            marked.append(True)
+        kind = (torch.is_grad_enabled(), *(a.requires_grad for a in arguments if isinstance(a, Tensor)))
+        if kind not in marked:
+            marked.add(kind)
             for tensor, axis in varying(arguments):
                 torch._dynamo.maybe_mark_dynamic(tensor, axis)
         return compiled(*arguments)
