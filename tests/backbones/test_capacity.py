@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_scene import published_options, small_context, small_gs3d, small_scene, spread
+from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
 from test_anchors import small_anchors
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
@@ -19,6 +19,7 @@ from gsx.backbones.capacity import Budget, BudgetOptions, Growing
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.builtin import plugins
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
@@ -296,6 +297,33 @@ def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: 
     scene, model = half_of_it_faint()
     assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())
+
+
+class RightHalf(Grey):
+    """Photographs that are transparent left of their middle; `all_of_it`: everywhere."""
+
+    all_of_it = False
+
+    def transparent(self, camera: Camera) -> Tensor:
+        column = torch.arange(camera.width).expand(camera.height, -1)
+        return (column < camera.width // 2) | self.all_of_it
+
+
+@pytest.mark.parametrize("all_of_it", [False, True])
+def test_adaptive_growth_starts_without_points_in_empty_space(all_of_it: bool) -> None:
+    """Those on the left of two photographs and more go at the first step; where that is all, none does."""
+    source, scene = RightHalf(), small_scene(spread(60))
+    source.all_of_it = all_of_it
+    scene = replace(scene, train=[replace(view, source=source) for view in scene.train])
+    left = torch.stack([v.camera.project(scene.points.positions)[0][:, 0] < 12 for v in scene.train]).sum(0) >= 2
+    assert 10 < int(left.sum()) < 50
+    models = {name: small_gs3d(scene, options=options_of(name)) for name in ("adaptive", "published")}
+    done = {name: [model.densify_and_prune(step) for step in (1, 2)] for name, model in models.items()}
+    kept = scene.points.positions if all_of_it else scene.points.positions[~left]
+    assert torch.equal(models["adaptive"].table["means"].detach(), kept)
+    assert done["adaptive"] == [{} if all_of_it else {"cleared": int(left.sum())}, {}]
+    assert done["published"] == [{}, {}]
+    assert len(models["published"].table) == 60
 
 
 def test_reports_show_what_growth_gained() -> None:

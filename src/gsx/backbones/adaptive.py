@@ -14,11 +14,14 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
+from torch import Tensor
 
 from gsx.backbones.capacity import Growing, Undone, error_exponent, worth_in_training
+from gsx.core.data.empty_space import in_empty_space
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
+from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import window_errors
@@ -80,6 +83,18 @@ class Adaptive:
         """Nothing has been added or found yet."""
         table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
         table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
+
+    def clear(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
+        """Remove what lies where photographs show that nothing is: most of random points."""
+        empty = in_empty_space(positions.detach(), self.context.scene.train)
+        count = int(empty.sum())
+        if count in (0, len(empty)):
+            return {}
+        logger.info(
+            "%s of %s points lie where photographs are transparent: they are removed", f"{count:,}", f"{len(empty):,}"
+        )
+        keep_rows(table, ~empty)
+        return {"cleared": count}
 
     # -- validation windows --------------------------------------------------------------------------------------
 

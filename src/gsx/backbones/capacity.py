@@ -12,6 +12,7 @@ from torch.nn import Parameter
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
+from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import Removal, some_of, worth_of_rows
@@ -84,6 +85,10 @@ class Capacity(Protocol):
         """Give a fresh table what is kept there."""
         ...
 
+    def clear(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
+        """Remove rows that nothing has to be learnt of, at the first step; how many, for the log."""
+        ...
+
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Look at the model before an event; what was found, for the log."""
         ...
@@ -111,6 +116,10 @@ class Cap:
 
     def begin(self, table: ParameterTable) -> None:
         """Nothing."""
+
+    def clear(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
+        """Nothing."""
+        return {}
 
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Nothing."""

@@ -177,8 +177,9 @@ class GS3D:
         return self.capacity.validation_window(self.table, view, step)
 
     def densify_and_prune(self, step: int) -> dict[str, float]:
-        """Clone, split, prune and reset when due."""
-        done = self.control.densify(self, step) if self.control.due(step) else {}
+        """Clear once, clone, split, prune and reset when due."""
+        done = self.capacity.clear(self.table, self.table["means"]) if step == 1 else {}
+        done |= self.control.densify(self, step) if self.control.due(step) else {}
         if done or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)

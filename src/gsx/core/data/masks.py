@@ -56,6 +56,12 @@ class Mask:
         return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
 
 
+def transparent(alpha: UInt8[Tensor, "1 H W"], width: int, height: int, filter: str) -> Bool[Tensor, "1 height width"]:
+    """Where a picture of that alpha, resized by a filter, shows nothing: where all that a pixel is made from is 0."""
+    shown = adaptive_max_pool2d((alpha > 0).float()[None], (height, width))[0] > 0
+    return ~grown(shown, REACH.get(filter, 0) if alpha.shape[1:] != (height, width) else 0)
+
+
 def grown(masked: Bool[Tensor, "1 H W"], reach: int) -> Bool[Tensor, "1 H W"]:
     """With all pixels within `reach` of a masked one."""
     return max_pool2d(masked.float()[None], 2 * reach + 1, 1, reach)[0] > 0

@@ -7,8 +7,8 @@ from pathlib import Path
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import ImageCache, composite, read_image, refuse_other_size
-from gsx.core.data.masks import Mask
+from gsx.core.data.images import ImageCache, composite, has_alpha, read_image, refuse_other_size
+from gsx.core.data.masks import Mask, transparent
 from gsx.core.data.resize import ResizeRule, Size, resize
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
@@ -57,6 +57,18 @@ class PhotoSource:
         mask, made_by = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
         return window.cut(self.cache.get(made_by, lambda: self._counted(mask, width, height)))[0]
 
+    def transparent(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
+        """Which pixels of `image(camera)` show nothing of the scene, all they were made from being transparent; None:
+        the photograph is opaque, or a mask says that what it leaves out is unknown. Decodes the file anew.
+
+        Raises:
+            InputError: the file cannot be read or has another size than the camera model states.
+        """
+        if self.mask is not None or not has_alpha(self.path):
+            return None
+        window, width, height = self.window_of(camera)
+        return window.cut(transparent(self._decoded()[3:], width, height, self.rule.filter))[0]
+
     def window_of(self, camera: Camera) -> tuple[Window, int, int]:
         """(what the camera sees of the whole photograph on its raster, width and height of that).
 
@@ -81,12 +93,14 @@ class PhotoSource:
             raise InputError(f"The mask '{mask.path}' leaves nothing of '{self.path}': remove the photograph.")
         return counted
 
-    def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
+    def _decoded(self) -> UInt8[Tensor, "C h w"]:
         image = read_image(self.path)
         if self.expected_size is not None:
             refuse_other_size(self.path, (image.shape[2], image.shape[1]), self.expected_size)
-        if self.remap is not None:
-            image = self.remap(image)
+        return image if self.remap is None else self.remap(image)
+
+    def _resized(self, width: int, height: int) -> UInt8[Tensor, "3 height width"]:
+        image = self._decoded()
         if image.shape[0] == 4:
             image = composite(image, self.rule.background)
         return resize(image, width, height, self.rule.filter, self.rule.light)

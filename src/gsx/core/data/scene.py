@@ -45,6 +45,15 @@ class Masked(Protocol):
         ...
 
 
+@runtime_checkable
+class CutOut(Protocol):
+    """A source of pictures that may be transparent where they show nothing of the scene."""
+
+    def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """Which pixels of `image(camera)` show the background alone; None: the picture does not tell."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A camera and the image it took. Images are decoded when asked for and kept as uint8."""
@@ -62,6 +71,10 @@ class View:
     def counted(self) -> Bool[Tensor, "H W"] | None:
         """Which pixels count in losses and figures; None: all. The others show what is not part of the scene."""
         return self.source.counted(self.camera) if isinstance(self.source, Masked) else None
+
+    def transparent(self) -> Bool[Tensor, "H W"] | None:
+        """Which pixels show nothing of the scene, by the picture's own alpha; None: it does not tell."""
+        return self.source.transparent(self.camera) if isinstance(self.source, CutOut) else None
 
     def zoom(self, factor: float) -> "View | None":
         """The view sampled `factor` times as finely, or None where the data hold no such truth."""

@@ -94,6 +94,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "zoom": zoom_rows(evaluation),
         "zoom_chart": zoom_chart(evaluation),
         "growth_chart": growth_chart(run.lines),
+        "cleared": next((line["cleared"] for line in run.lines if is_number(line.get("cleared"))), 0),
         "removals": [line for line in run.lines if is_number(line.get("removed"))],
         "curves": curves(run),
         "resets": any(line.get("opacity_resets") for line in run.lines),
