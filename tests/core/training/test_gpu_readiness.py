@@ -15,6 +15,9 @@ MOST = {
     ("backbone=octree_scaffold",): (9, 560),
 }
 """Waits and launches of a step: sizes of four lists and the guard, with anchors four more."""
+CLOSE, CLOSE_WITH_ADAM_OF_FEW = 1e-4, 1e-3
+"""Relative differences of losses. Exposures are a dozen numbers a photograph, which Adam's first steps move by their
+gradient's sign: where that is next to nothing it is another by rounding, by how much depends on the processor."""
 
 
 @pytest.mark.parametrize("words", MOST)
@@ -25,6 +28,7 @@ def test_a_step_waits_for_a_gpu_seldom_and_launches_little(words: tuple[str, ...
     ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert ended.returncode == 0, ended.stderr
     told = json.loads(ended.stdout)
-    assert told["device"] == pytest.approx(told["cpu"], rel=1e-4)
+    close = CLOSE_WITH_ADAM_OF_FEW if any("exposure" in word for word in words) else CLOSE
+    assert told["device"] == pytest.approx(told["cpu"], rel=close)
     for counts, most in zip((told["waits"], told["launches"]), MOST[words], strict=True):
         assert 0 < sum(counts.values()) <= most, counts
