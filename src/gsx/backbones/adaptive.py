@@ -30,8 +30,6 @@ from gsx.core.training.validation import decibels, rounding_in, validation_windo
 
 logger = logging.getLogger(__name__)
 
-LOOKS = 24
-"""Training views, at most, that say what a row is worth: half of what a budget asks, since asking costs time."""
 SLOWER, FASTER = 0.5, 1.5
 """By how much the rate of growth changes from one event to the next, at most."""
 
@@ -50,8 +48,6 @@ class AdaptiveOptions:
     fastest: Annotated[float, Range(1e-6, 10)] = 0.15
     slowest: Annotated[float, Range(1e-6, 10)] = 0.01
     """Growth that slows down to less has ended."""
-    looks: Annotated[int, Range(1, 1000)] = 4
-    """Training views that the error of each primitive is found in at an event. The default: runs older than this."""
     views: Annotated[int, Range(1, 1000)] = 6
     """Training views that have a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
@@ -157,7 +153,7 @@ class Adaptive:
         (10 N ln 2) of its squared error, as that will be in the end, with that of the photograph's rounding. Rows
         are judged in the mean over the views that show them.
         """
-        found = worth_in_training(model, self.context, step, LOOKS)
+        found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share + found.rounding_share
         least = error_exponent(self.options.price) * lasting
         doomed = (found.shown > 0) & (found.squares < least)

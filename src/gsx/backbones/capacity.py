@@ -181,9 +181,9 @@ def error_exponent(price: float) -> float:
     return price * math.log(10) / (10 * math.log(2))
 
 
-def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int, looks: int = LOOKS) -> Removal:
-    """What training views, at most so many, lose without each row."""
-    views = some_of(context.resolution.views(step), looks, context.generator)
+def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
+    """What training views lose without each row."""
+    views = some_of(context.resolution.views(step), LOOKS, context.generator)
     background, form = context.scene.background.to(context.device), context.resolution.forming(step)
 
     def look() -> Removal:

@@ -20,7 +20,7 @@ class CapacityOptions:
     capacity: str = "published"
     """published, budget or adaptive. The default: runs older than this option."""
     looks: Annotated[int, Range(1, 1000)] = 4
-    """Of a budget: training views that the error of each primitive is found in at an event."""
+    """Of a budget and adaptive: training views that the error of each primitive is found in at an event."""
     budget: BudgetOptions = BudgetOptions()
     adaptive: AdaptiveOptions = AdaptiveOptions()
 
@@ -46,8 +46,3 @@ def capacity_of(options: CapacityOptions, context: BackboneContext, growing: Gro
     if options.capacity == "adaptive":
         return Adaptive(options.adaptive, context, growing, options.max_primitives)
     return Cap(options.max_primitives)
-
-
-def looks_of(options: CapacityOptions) -> int:
-    """Training views that the error of each primitive is found in at an event."""
-    return options.adaptive.looks if options.capacity == "adaptive" else options.looks

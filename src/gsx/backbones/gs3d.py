@@ -10,7 +10,7 @@ from torch.nn import Parameter
 from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import LOOKS, growing_of
-from gsx.backbones.capacity_options import capacity_of, looks_of
+from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
@@ -76,7 +76,7 @@ def colours_from(
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """The backbones gs3d, gs3d_zoom and mip_splatting."""
-    how = CloneSplit() if options.capacity == "published" else LongAxis(looks_of(options))
+    how = CloneSplit() if options.capacity == "published" else LongAxis(options.looks)
     return GS3D(options, context, AllVisible(), how)
 
 
