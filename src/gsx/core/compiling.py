@@ -82,7 +82,7 @@ def sizes_free(
     marked: set[tuple[bool, ...]] = set()
 
     def call(*given: Any) -> Any:
-        arguments = tuple(a.view_as(a) if isinstance(a, Parameter) else a for a in given)
+        arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
         kind = (torch.is_grad_enabled(), *(a.requires_grad for a in arguments if isinstance(a, Tensor)))
         if kind not in marked:
             marked.add(kind)

@@ -167,9 +167,8 @@ def test_colours_of_parameters_compile_once_whatever_their_number() -> None:
 
     def learn(count: int) -> None:
         generator = torch.Generator().manual_seed(count)
-        sizes = {"constant": (count, 1, 3), "rest": (count, 15, 3)}
-        constant, rest = (Parameter(torch.randn(size, generator=generator)) for size in sizes.values())
-        offsets = Parameter(torch.randn(count, 3, generator=generator))
+        sizes = ((count, 1, 3), (count, 15, 3), (count, 3))
+        constant, rest, offsets = (Parameter(torch.randn(size, generator=generator)) for size in sizes)
         colours_of(constant, rest, offsets, 3, compiled=True).sum().backward()
         assert rest.grad is not None
 

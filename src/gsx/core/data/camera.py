@@ -129,6 +129,10 @@ class Camera:
         pixels, depth = self.project(points)
         return ((pixels >= 0) & (pixels <= pixels.new_tensor(self.size))).all(dim=1) & (depth > 0)
 
+    def shows(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Bool[Tensor, "P"]:
+        """Which projected points lie on a pixel of its raster, beyond its near plane."""
+        return ((pixels >= 0) & (pixels < pixels.new_tensor(self.size))).all(1) & (depths > self.near)
+
     def narrow(self, fraction: float) -> "Camera":
         """The centre `fraction` of the raster at unchanged focal length."""
         width, height = max(1, round(self.width * fraction)), max(1, round(self.height * fraction))

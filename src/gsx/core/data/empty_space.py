@@ -28,8 +28,7 @@ def in_empty_space(positions: Float[Tensor, "P 3"], views: Sequence[View]) -> Bo
 
 def shown_empty(positions: Float[Tensor, "P 3"], view: View, empty: Bool[Tensor, "H W"]) -> Bool[Tensor, "P"]:
     """Which points a view has in an empty pixel."""
-    camera = view.camera
-    pixels, depths = camera.project(positions)
-    inside = ((pixels >= 0) & (pixels < pixels.new_tensor(camera.size))).all(1) & (depths > camera.near)
+    pixels, depths = view.camera.project(positions)
+    inside = view.camera.shows(pixels, depths)
     column, row = torch.where(inside[:, None], pixels, 0).long().unbind(1)
     return inside & empty.to(positions.device)[row, column]

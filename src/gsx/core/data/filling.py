@@ -68,7 +68,7 @@ def gaps_of(
 def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M"]]:
     """Pixel positions and depths of the points that lie in a camera's raster, beyond its near plane."""
     pixels, depths = camera.project(positions)
-    inside = ((pixels >= 0) & (pixels < pixels.new_tensor(camera.size))).all(1) & (depths > camera.near)
+    inside = camera.shows(pixels, depths)
     return pixels[inside], depths[inside]
 
 

@@ -52,14 +52,16 @@ class Mask:
 
     def reduced(self, width: int, height: int, filter: str, whole: tuple[int, int]) -> Bool[Tensor, "1 height width"]:
         """Which pixels count of a photograph of the size `whole` resized by a filter (`resize.FILTERS`)."""
-        touched = adaptive_max_pool2d(self.masked().float()[None], (height, width))[0] > 0
-        return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
+        return untouched(self.masked(), width, height, filter, whole)
 
 
-def transparent(alpha: UInt8[Tensor, "1 H W"], width: int, height: int, filter: str) -> Bool[Tensor, "1 height width"]:
-    """Where a picture of that alpha, resized by a filter, shows nothing: where all that a pixel is made from is 0."""
-    shown = adaptive_max_pool2d((alpha > 0).float()[None], (height, width))[0] > 0
-    return ~grown(shown, REACH.get(filter, 0) if alpha.shape[1:] != (height, width) else 0)
+def untouched(
+    marked: Bool[Tensor, "1 H W"], width: int, height: int, filter: str, whole: tuple[int, int]
+) -> Bool[Tensor, "1 height width"]:
+    """Which pixels of a picture of the size `whole`, resized by a filter (`resize.FILTERS`), are made from none that is
+    marked."""
+    touched = adaptive_max_pool2d(marked.float()[None], (height, width))[0] > 0
+    return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
 
 
 def grown(masked: Bool[Tensor, "1 H W"], reach: int) -> Bool[Tensor, "1 H W"]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache, composite, has_alpha, read_image, refuse_other_size
-from gsx.core.data.masks import Mask, transparent
+from gsx.core.data.masks import Mask, untouched
 from gsx.core.data.resize import ResizeRule, Size, resize
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
@@ -67,7 +67,7 @@ class PhotoSource:
         if self.mask is not None or not has_alpha(self.path):
             return None
         window, width, height = self.window_of(camera)
-        return window.cut(transparent(self._decoded()[3:], width, height, self.rule.filter))[0]
+        return window.cut(untouched(self._decoded()[3:] > 0, width, height, self.rule.filter, self.whole.size))[0]
 
     def window_of(self, camera: Camera) -> tuple[Window, int, int]:
         """(what the camera sees of the whole photograph on its raster, width and height of that).
