@@ -30,8 +30,10 @@ from gsx.core.training.validation import decibels, rounding_in, validation_windo
 
 logger = logging.getLogger(__name__)
 
-SLOWER, FASTER = 0.5, 1.5
+SLOWER, FASTER = 0.5, 2.0
 """By how much the rate of growth changes from one event to the next, at most."""
+STEPS = 100
+"""That rates of growth are told for: events are farther apart where there are more training views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +45,12 @@ class AdaptiveOptions:
     discount: Annotated[float, Range(1e-6, 1)] = 0.2
     """So much of what is found during growth is left in the end: of gains, since other primitives count on the new
     ones and nothing has learnt without them; of errors, since learning goes on."""
-    rate: Annotated[float, Range(1e-6, 10)] = 0.1
-    """Share of the primitives that the first event adds."""
-    fastest: Annotated[float, Range(1e-6, 10)] = 0.15
-    slowest: Annotated[float, Range(1e-6, 10)] = 0.01
-    """Growth that slows down to less has ended."""
+    rate: Annotated[float, Range(1e-6, 10)] = 0.15
+    """Growth over a hundred steps, at first."""
+    fastest: Annotated[float, Range(1e-6, 10)] = 0.4
+    """Over a hundred steps, whatever is gained."""
+    slowest: Annotated[float, Range(1e-6, 10)] = 0.025
+    """Growth that slows down to less over a hundred steps has ended."""
     views: Annotated[int, Range(1, 1000)] = 6
     """Training views that have a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
@@ -66,7 +69,7 @@ class Trial:
     error: float
     """Its standard error over the windows."""
     rate: float
-    """Share of the primitives that the next event adds."""
+    """Growth from here on, over a hundred steps."""
 
 
 class Adaptive:
@@ -168,15 +171,19 @@ class Adaptive:
 
     def tell(self, trial: Trial, table: ParameterTable) -> None:
         """Log what was decided, because of which number and threshold."""
-        verdict = "has ended" if self.ended(table) else f"goes on by {trial.rate:.1%}"
+        verdict = "has ended" if self.ended(table) else f"goes on by {self.share(table):.1%}"
         gain, price = f"{trial.gain:.2f} +- {trial.error:.2f} dB per doubling in validation windows", self.options.price
         told = trial.step, verdict, trial.primitives, trial.added, gain, price
         logger.info("step %d: growth %s at %d primitives: the last %d gained %s, price %.2f", *told)
 
     def rate(self, table: ParameterTable) -> float:
-        """Share of the primitives that the next event adds: more while a doubling gains more than its price."""
+        """Growth over a hundred steps: more while a doubling gains more than its price."""
         trials = table.record["trials"]
         return float(trials[-1, 5]) if len(trials) else self.options.rate
+
+    def share(self, table: ParameterTable) -> float:
+        """Of the primitives, that an event adds at this rate."""
+        return (1 + self.rate(table)) ** (self.growing.every / STEPS) - 1
 
     def ended(self, table: ParameterTable) -> bool:
         """Whether growth has become too slow to go on."""
@@ -189,7 +196,7 @@ class Adaptive:
     def asked(self, table: ParameterTable, step: int) -> int:
         """How many an event may add if no cap holds it; none at the last one, which nothing would judge."""
         over = self.ended(table) or self.growing.share(step) == 1
-        return 0 if over else math.ceil(self.rate(table) * len(table))
+        return 0 if over else max(1, round(self.share(table) * len(table)))
 
     def plan(self) -> dict[str, Any]:
         """The price."""
