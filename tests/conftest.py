@@ -11,7 +11,8 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
-os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")  # as runs do (build.py)
+for switch, value in {"TORCHINDUCTOR_VEC_ISA_OK": "1", "TORCH_FAKE_TENSOR_DISPATCH_CACHE": "0"}.items():
+    os.environ.setdefault(switch, value)  # as runs do (build.py)
 # by content, so that it may serve all tests and the next time, too: runs would name one below their private cache
 os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(gettempdir()) / f"torchinductor_{getuser()}"))
 

@@ -1,6 +1,8 @@
 """What holds for the process in which a run is built."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,3 +27,15 @@ def test_compiled_code_is_kept_in_an_entry_of_the_cache_or_where_torch_keeps_it(
     os.utime(entry / MANIFEST, (1, 1))  # used by nobody since
     assert trim(0) == [entry]
     assert not entry.exists()
+
+
+def test_the_compiler_takes_the_settings_that_hasten_it() -> None:
+    """In a process of its own: torch reads them once."""
+    code = (
+        "from gsx.experiments.runs.build import hasten_compiling; hasten_compiling(); "
+        "from torch._dynamo import config as tracing; from torch._inductor import config as writing; "
+        "print(tracing.fake_tensor_cache_enabled, writing.cpp.vec_isa_ok)"
+    )
+    unset = {name: value for name, value in os.environ.items() if not name.startswith("TORCH")}
+    ended = subprocess.run([sys.executable, "-c", code], env=unset, capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["False", "True"]

@@ -90,8 +90,15 @@ def prepare_process(device: torch.device, training: bool) -> None:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
     keep_compiled_code()
+    hasten_compiling()
+
+
+def hasten_compiling() -> None:
+    """Settings that torch's compiler reads from the environment when it is first needed."""
     # torch would compile and load programs to see which vector registers there are: the system says so
     os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
+    # remembering what each operation says of sizes and formats costs more than asking again where sizes are symbols
+    os.environ.setdefault("TORCH_FAKE_TENSOR_DISPATCH_CACHE", "0")
 
 
 def keep_compiled_code() -> None:
