@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 SLOWER, FASTER = 0.5, 2.0
 """By how much the rate of growth changes from one event to the next, at most."""
 STEPS = 100
-"""That rates of growth are told for: events are farther apart where there are more training views."""
+"""Rates of growth are told for so many: the more training views there are, the farther apart events are."""
 
 
 @dataclass(frozen=True, kw_only=True)
