@@ -3,7 +3,7 @@
     python benchmarks/starts.py [--scenes FOLDER] [--only room,castle] [--seeds 0,1,2] [--jobs 2]
 
 The same steps of `gs3d`: published and adaptive growth, from the points of the scene, and with points where training
-views show none (`scene.fill`); and adaptive growth for about as long as published growth takes. FOLDER holds `fox`
+views show none (`scene.fill`); and adaptive growth by a third more steps. FOLDER holds `fox`
 (COLMAP) and `castle` (photographs alone). Finished runs below --runs are not trained again.
 """
 
@@ -32,7 +32,7 @@ ARMS = {
     "adaptive, more points": (ADAPTIVE, "scene.fill"),
     "adaptive, more points and steps": (ADAPTIVE, "scene.fill", "iterations"),
 }
-"""`scene.fill` by as many as FILL says; `iterations`: a third more of them, which take about as long as published."""
+"""`scene.fill` by as many as FILL says; `iterations`: LONGER times as many."""
 LONGER = 4 / 3
 COLUMNS = [
     *(["scene", "scene"], ["arm", "growth and start"], ["seeds", "seeds"]),

@@ -182,7 +182,7 @@ class Adaptive:
         return float(trials[-1, 5]) if len(trials) else self.options.rate
 
     def share(self, table: ParameterTable) -> float:
-        """Of the primitives, that an event adds at this rate."""
+        """Share of the primitives that an event adds at the rate of growth."""
         return (1 + self.rate(table)) ** (self.growing.every / STEPS) - 1
 
     def ended(self, table: ParameterTable) -> bool:
