@@ -309,6 +309,52 @@ def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: 
     assert bool((model.table["opacity_logits"] > -15).all())
 
 
+@pytest.mark.parametrize(
+    ("fine", "middle", "coarse", "left"),
+    [
+        (1.0001, 1.0001, 1.5, [0]),  # both finer levels gain next to nothing
+        (1.0001, 1.5, 1.0001, [0, 1]),  # what coarse ones gain is told, but those before which finer ones are stay
+        (1.5, 1.0001, 1.5, [0, 1, 2]),
+        (1.0, 1.0001, 1.5, [0, 1, 2]),  # of what no window shows nothing is known
+    ],
+)
+def test_finest_levels_that_gain_too_little_are_removed(
+    fine: float, middle: float, coarse: float, left: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Levels of 8, 16, 16 primitives; errors are told by which levels there are, times 1e9."""
+    scene = small_scene(spread(40))
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    model.table.columns["level"] = torch.tensor([0] * 8 + [1] * 16 + [2] * 16, dtype=torch.int16)
+    factors = {0: coarse, 1: middle, 2: fine}
+
+    def errors(model: GS3D, table: ParameterTable, *more: object) -> Tensor:
+        missing = [factors[level] for level in factors if not bool((table["level"] == level).any())]
+        return torch.full((4,), 1e9 * math.prod(missing)).double()
+
+    monkeypatch.setattr("gsx.backbones.adaptive.window_errors", errors)
+    judge = Adaptive(AdaptiveOptions(price=0.1, discount=1 / 3), small_context(scene), PUBLISHED, 0)
+    found = judge.without_idle_levels(model, 700)
+    assert model.table["level"].unique().tolist() == left
+    assert found["levels_removed"] == 3 - len(left)
+    gain = 10 * math.log10(fine) / 3 / math.log2(40 / 24)
+    assert found["gain_of_level_2"] == pytest.approx(gain, abs=1e-6)
+    assert len(found) == (3 if left == [0] else 4)  # the last one left is not judged
+
+
+def test_levels_are_judged_when_growth_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, while no step has seen the windows: at the event that ends growth, or at the last one."""
+    scene = small_scene(spread(40))
+    for rate, step, asked in ((0.1, 700, 0), (0.1, 14900, 1), (0.001, 14900, 0)):
+        calls = list[int]()
+        monkeypatch.setattr(
+            Adaptive, "without_idle_levels", lambda judge, model, step, calls=calls: calls.append(step) or {}
+        )
+        model = small_gs3d(scene, options=options_of("adaptive"))
+        model.table.record["trials"] = trials(rate)
+        adaptive(scene, price=0.2).judge(model, lambda table: None, step)
+        assert len(calls) == asked
+
+
 class RightHalf(Grey):
     """Photographs that are transparent left of their middle; `all_of_it`: everywhere."""
 

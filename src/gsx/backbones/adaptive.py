@@ -16,12 +16,12 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.backbones.capacity import Growing, Undone, error_exponent, worth_in_training
+from gsx.backbones.capacity import Growing, Undone, error_exponent, with_rows, worth_in_training
 from gsx.core.data.empty_space import in_empty_space
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import window_errors
@@ -120,7 +120,9 @@ class Adaptive:
         grew = not self.ended(model.table)
         found = self.tried(model, undone, step)
         last = self.growing.share(step) == 1
-        found |= self.removed(model, step) if last or (grew and self.ended(model.table)) else {}
+        ends = grew and (last or self.ended(model.table))
+        found |= self.without_idle_levels(model, step) if ends else {}
+        found |= self.removed(model, step) if last or ends else {}
         held = self.asked(model.table, step) - room_under(self.most, len(model.table))
         return found | ({"withheld": held} if held > 0 else {})
 
@@ -130,15 +132,7 @@ class Adaptive:
         before = None if self.ended(table) else undone(table)
         if before is None:
             return {}
-        windows = self.windows(step)
-        form = self.context.resolution.forming(step)
-        floor = rounding_in(windows)
-
-        def look() -> tuple[float, float]:
-            both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))
-            return decibels(*(errors.cpu() + floor for errors in both))
-
-        gain, error = self.context.found_by_first(look)
+        gain, error = self.gain(model, table, before, step)
         each = self.options.discount / math.log2(len(table) / len(before))
         rate = self.rate(table) * min(FASTER, max(SLOWER, each * gain / self.options.price))
         added = len(table) - len(before)
@@ -148,6 +142,54 @@ class Adaptive:
         self.tell(trial, table)
         spread = {"gain_error": trial.error} if math.isfinite(trial.error) else {}  # of one window there is none
         return {"judged": len(table), "gain": trial.gain, "price": self.options.price} | spread
+
+    def gain(
+        self, model: Backbone[Any], table: ParameterTable, before: ParameterTable, step: int
+    ) -> tuple[float, float]:
+        """(dB by which validation windows are better drawn with one table than with another, its standard error)."""
+        windows = self.windows(step)
+        form, floor = self.context.resolution.forming(step), rounding_in(windows)
+
+        def look() -> tuple[float, float]:
+            both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))
+            return decibels(*(errors.cpu() + floor for errors in both))
+
+        return self.context.found_by_first(look)
+
+    def without_idle_levels(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Remove the finest levels of detail while they gain less than the price; tell what all of them gain.
+
+        Each is judged by what validation windows lose without its primitives, in dB per doubling. A level that no
+        window shows is kept: others may, and nothing is known of it.
+        """
+        if "level" not in model.table.columns:
+            return {}
+        gains: dict[str, float] = {}
+        removing, gone = True, 0
+        for level in model.table["level"].unique().flip(0).tolist():
+            of_level = model.table["level"] == level
+            if bool(of_level.all()):
+                break
+            gain = self.gain_of_rows(model, of_level, step)
+            removing = removing and gain != 0 and gain < self.options.price
+            self.tell_level(level, int(of_level.sum()), gain, removing, step)
+            gains[f"gain_of_level_{level}"] = gain
+            if removing:
+                keep_rows(model.table, ~of_level)
+                gone += 1
+        return gains | {"levels_removed": gone}
+
+    def gain_of_rows(self, model: Backbone[Any], rows: Bool[Tensor, "N"], step: int) -> float:
+        """dB per doubling of the primitives that validation windows lose without these, discounted."""
+        without = with_rows(model.table, ~rows)
+        doublings = math.log2(len(model.table) / len(without))
+        return self.options.discount * self.gain(model, model.table, without, step)[0] / doublings
+
+    def tell_level(self, level: int, count: int, gain: float, removed: bool, step: int) -> None:
+        """Log what a level of detail gains, and what becomes of it."""
+        verdict = "is removed" if removed else "is kept"
+        told = step, level, verdict, count, gain, self.options.price
+        logger.info("step %d: level %d %s: its %d primitives gain %.2f dB per doubling, price %.2f", *told)
 
     def removed(self, model: Backbone[Any], step: int) -> dict[str, float]:
         """Remove rows without which the error of the training views would grow by less than their share of the price.

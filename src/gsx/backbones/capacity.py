@@ -12,7 +12,7 @@ from torch.nn import Parameter
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import Removal, some_of, worth_of_rows
@@ -203,7 +203,12 @@ def without_newborn(table: ParameterTable) -> ParameterTable | None:
     old = table.statistics["born"] == 0
     if bool(old.all()) or not bool(old.any()):
         return None
-    return to_look_at(table, {name: value[old] for name, value in detached_rows(table).items()})
+    return with_rows(table, old)
+
+
+def with_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> ParameterTable:
+    """The table with these rows alone, by which nothing is learnt."""
+    return to_look_at(table, {name: value[kept] for name, value in detached_rows(table).items()})
 
 
 def to_look_at(table: ParameterTable, rows: dict[str, Tensor]) -> ParameterTable:
