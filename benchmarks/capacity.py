@@ -8,7 +8,8 @@ published ends with, and of fewer, beside published growth held at that cap; the
 runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
 numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
 published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`: longer runs that
-leave out steps which gain too little, beside such that take them all. Finished runs below --runs are not trained
+leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose coarsest cells are
+pixels, grown as published and adaptively, beside published ones. Finished runs below --runs are not trained
 again. A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
@@ -55,7 +56,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, "fox,fox_4,lego,castle,demo", "outputs/capacity")
     parser.add_argument(
-        "--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown, plateau"
+        "--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown, plateau, cells"
     )
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
@@ -220,6 +221,40 @@ def patient_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any
             row = row_of(scene, f"{price:g}", own, first)
             rows.append(row | {"left": f"{statistics.mean(run['left'] for run in own):.2f}"})
     return rows
+
+
+# -- cells of levels of detail -----------------------------------------------------------------------------------------
+
+CELLS = {
+    "published": (PUBLISHED,),
+    "cells of a pixel": (PUBLISHED, "backbone.levels.cell_pixels=1"),
+    "cells of a pixel, adaptive": (ADAPTIVE, "backbone.levels.cell_pixels=1"),
+}
+CELLS_COLUMNS = [[key, "cells and growth" if key == "arm" else label] for key, label in COLUMNS]
+CELLS_NOTE = (
+    "`backbone.levels.cell_pixels=1`: the base layer has as many forks as leave a cell a pixel where its level is drawn "
+    "from the farthest, but no more than published. PSNR on held-out views, dB, means over seeds ± half their range; "
+    "differences and shares seed by seed, times are medians. The same steps."
+)
+
+
+def cells_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of a backbone."""
+    scenes = scenes_of(given)
+
+    def look(scene: str, seed: int) -> dict[str, Any]:
+        found = {}
+        for arm, wish in CELLS.items():
+            folder = folder_of(f"cells_{arm}", scene, backbone, seed, given)
+            found[arm] = trained(folder, words_of(wish, scene, backbone, seed, given), given)
+        return found
+
+    found = over_seeds(look, scenes, given)
+    return [
+        row_of(scene, arm, [one[arm] for one in found[scene]], [one["published"] for one in found[scene]])
+        for scene in scenes
+        for arm in CELLS
+    ]
 
 
 # -- bands of colour ---------------------------------------------------------------------------------------------------
@@ -439,6 +474,9 @@ def main(words: Sequence[str]) -> None:
         if "plateau" in given.what:
             title, rows = f"Steps of {backbone} that gain too little", patient_rows(backbone, given)
             tables[f"{backbone}_plateau"] = stamped(title, PLATEAU_COLUMNS, rows, [PLATEAU_NOTE], load, command)
+        if "cells" in given.what:
+            title, rows = f"Cells of {backbone}", cells_rows(backbone, given)
+            tables[f"{backbone}_cells"] = stamped(title, CELLS_COLUMNS, rows, [CELLS_NOTE], load, command)
         if "compact" in given.what:
             title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
             tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)

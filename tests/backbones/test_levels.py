@@ -157,6 +157,26 @@ def test_base_layer_follows_the_voxel(count, base):
         assert levels.size(count // 2 - 1) == pytest.approx(0.02, rel=0.5)
 
 
+@pytest.mark.parametrize(("pixels", "base"), [(0, 10), (1, 4), (1.7, 4), (1.8, 3), (16, 0), (1000, 0)])
+def test_the_base_layer_has_cells_of_whole_pixels(pixels, base):
+    """A box of 8.8 seen at 50 px a unit of length, from 16: 27.5 px; halved four times 1.71875, five times less than
+    a pixel. What is given holds where it is coarser."""
+    points = torch.tensor([[-2.0, 0, 1], [3, 6, 2]])
+    options = replace(PUBLISHED, base_layer=10, count=4, cell_pixels=pixels)
+    far = derive(points, [camera_at(0, 0, 9)], options, 0).farthest
+    options = replace(options, cell_pixels=pixels * 16 / far)
+    assert derive(points, [camera_at(0, 0, 9)], options, 0).base_layer == base
+    assert derive(points, [camera_at(0, 0, 9)], replace(options, base_layer=0), 0).base_layer == 0
+
+
+def test_cells_are_as_many_pixels_on_every_level():
+    """Measured where each level is drawn from the farthest."""
+    levels = single(count=4)
+    for level in range(4):
+        farthest = levels.farthest / 2**level
+        assert levels.size(level) * 50 / farthest == pytest.approx(levels.pixels_per_cell)
+
+
 @given(st.floats(-1e4, 1e4), st.floats(1e-2, 1e3))
 def test_the_sane_box_holds_the_points_and_is_as_long(start, length):
     points = torch.tensor([[start, start, start + length], [start, start + length / 2, start]])

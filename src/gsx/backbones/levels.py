@@ -99,6 +99,12 @@ class Levels:
         """Cell length v of level 0, scene units (Octree-GS, octree_sample)."""
         return self.size(0)
 
+    @property
+    def pixels_per_cell(self) -> float:
+        """Cell length of a level where it is drawn from the farthest, px of the finest training camera; the same on
+        every level, since cells get smaller as distances do."""
+        return self.cell * self.views.focal / self.farthest
+
     def size(self, level: int) -> float:
         """Cell length of one level, scene units."""
         return self.box / float(self.fork) ** (self.base_layer + level)
@@ -148,7 +154,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         farthest=farthest,
         origin=origin,
         extent=extent,
-        base_layer=base_layer(extent or farthest, count, options),
+        base_layer=base_layer(extent or farthest, count, options, views.focal / farthest),
         first=first,
         switches=switch_points(count, first, until, options.coarse_factor),
         threshold=options.visible_threshold,
@@ -191,11 +197,15 @@ def first_level(count: int, given: int, until: int) -> int:
     return min(count // 2 if given == -1 else given, count - 1)
 
 
-def base_layer(box: float, count: int, options: LevelOptions) -> int:
-    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (Octree-GS)."""
-    if options.base_layer >= 0:
-        return options.base_layer
-    return round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
+def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> int:
+    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (Octree-GS); no
+    more than leave a cell `cell_pixels`, `pixels` being those of a unit of length at the farthest."""
+    chosen = options.base_layer
+    if chosen < 0:
+        chosen = round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
+    if not options.cell_pixels:
+        return chosen
+    return min(chosen, max(0, math.floor(math.log(box * pixels / options.cell_pixels, options.fork))))
 
 
 def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
@@ -308,6 +318,7 @@ def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, An
         "base_layer": levels.base_layer,
         "voxel": levels.cell,
         "finest_voxel": levels.size(levels.count - 1),
+        "pixels_per_cell": levels.pixels_per_cell,
         "first_level": levels.first,
         "switch_points": list(levels.switches),
         "threshold": levels.threshold,
