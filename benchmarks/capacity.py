@@ -8,9 +8,9 @@ published ends with, and of fewer, beside published growth held at that cap; the
 runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
 numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
 published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`: longer runs that
-leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose coarsest cells are
-pixels, grown as published and adaptively, beside published ones. Finished runs below --runs are not trained
-again. A quarter of an hour of two cores for a scene, a backbone and a seed.
+leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose coarsest cells
+are pixels, grown as published and adaptively, beside published ones. Finished runs below --runs are not trained again.
+A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
@@ -232,9 +232,9 @@ CELLS = {
 }
 CELLS_COLUMNS = [[key, "cells and growth" if key == "arm" else label] for key, label in COLUMNS]
 CELLS_NOTE = (
-    "`backbone.levels.cell_pixels=1`: the base layer has as many forks as leave a cell a pixel where its level is drawn "
-    "from the farthest, but no more than published. PSNR on held-out views, dB, means over seeds ± half their range; "
-    "differences and shares seed by seed, times are medians. The same steps."
+    "`backbone.levels.cell_pixels=1`: the base layer has as many forks as leave a cell a pixel where its level is "
+    "drawn from the farthest, but no more than published. PSNR on held-out views, dB, means over seeds ± half their "
+    "range; differences and shares seed by seed, times are medians. The same steps."
 )
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.training.distractors import Distractors
 from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.plateau import Plateau
@@ -65,9 +66,14 @@ def write(run: Run, folder: Path) -> Path:
     return path
 
 
-def parts_of(run: Run) -> dict[str, Exposures | Plateau | Poses]:
+def parts_of(run: Run) -> dict[str, Exposures | Plateau | Poses | Distractors]:
     """What a run learns beside its model, by how the names of its tensors begin."""
-    return {"exposure.": run.exposures, "plateau.": run.plateau, "poses.": run.poses}
+    return {
+        "exposure.": run.exposures,
+        "plateau.": run.plateau,
+        "poses.": run.poses,
+        "distractors.": run.distractors,
+    }
 
 
 def names_of(run: Run) -> dict[str, list[str]]:

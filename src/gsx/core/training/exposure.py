@@ -17,12 +17,12 @@ from torch import Tensor
 
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.occasions import WHEN
 from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a photograph is seen a few dozen times in a short run."""
-WHEN = ("never", "auto", "always")
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
 FEWEST_PIXELS, FEWEST_VIEWS = 64, 3

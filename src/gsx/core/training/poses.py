@@ -23,9 +23,9 @@ from gsx.core.gaussians.turned import cross_matrix
 from gsx.core.quality.alignment import Motion, motion_to, rotation_by
 from gsx.core.quality.shifts import shift_of
 from gsx.core.ranges import Range, Share
-from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.exposure import WHEN, shared_spread
+from gsx.core.training.exposure import shared_spread
+from gsx.core.training.occasions import WHEN, occasions, some_photographs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +73,8 @@ class Poses:
     def steps(self) -> list[int]:
         """The steps before which poses are corrected, if they are, the first of them after that is judged; none where
         nobody asks."""
-        if self.options.when == "never":
-            return []
-        own, last = self.options, max(1, self.options.times - 1)
-        shares = [own.start * (own.until / own.start) ** (number / last) for number in range(own.times)]
-        return sorted({max(1, round(share * self.iterations)) + 1 for share in shares})
+        own = self.options
+        return [] if own.when == "never" else occasions(own.start, own.until, own.times, self.iterations)
 
     @property
     def first(self) -> int:
@@ -91,9 +88,7 @@ class Poses:
 
     def judged_by(self, views: Sequence[View]) -> list[View]:
         """The photographs that they are judged by: the same in every run."""
-        generator = torch.Generator().manual_seed(derived_seed("poses"))
-        order = torch.randperm(len(views), generator=generator)[: self.options.views]
-        return [views[number] for number in order.tolist()]
+        return some_photographs(views, self.options.views, "poses")
 
     def needed(self, spread: float) -> bool:
         """Whether a spread of shifts, px, asks for corrections."""

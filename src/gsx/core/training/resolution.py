@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.shapes import Bool, UInt8
+from gsx.core.training.distractors import Distractors
 from gsx.core.training.poses import Poses
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
@@ -81,6 +82,8 @@ class Resolution:
     """Those that were asked for, by how many times as coarse they are."""
     poses: Poses = field(default_factory=Poses)
     """Where photographs were taken: where their views say, unless that is corrected."""
+    distractors: Distractors = field(default_factory=Distractors)
+    """Parts of photographs that do not count: none unless they are found."""
     closer: dict[str, Sequence[PseudoView]] = field(default_factory=dict)
     """Pseudo views that are trained on at the moment, by augmenter."""
 
@@ -96,13 +99,17 @@ class Resolution:
         return self.supersample if step > self.finer_after else 1
 
     def views(self, step: int) -> Sequence[View]:
-        """The training views, as a step sees them, by the poses of the moment."""
+        """The training views, as a step sees them, by the poses of the moment, without distractors."""
         times = self.coarse_at(step)
         if times == 1:
-            return self.poses.views(self.scene.train)
+            return self.photographed()
         if times not in self.coarse_views:
             self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
-        return self.poses.views(self.coarse_views[times])
+        return self.distractors.views(self.poses.views(self.coarse_views[times]))
+
+    def photographed(self) -> Sequence[View]:
+        """The training views at their own resolution, by the poses of the moment, without distractors."""
+        return self.distractors.views(self.poses.views(self.scene.train))
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

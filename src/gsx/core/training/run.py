@@ -19,6 +19,7 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation, Settling
 from gsx.core.training.checked_regenerator import Tally
+from gsx.core.training.distractors import DistractorOptions, Distractors
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
@@ -52,6 +53,7 @@ class TrainingOptions:
     """Share of the steps after which they are seen as they are."""
     exposure: ExposureOptions = field(default_factory=ExposureOptions)
     poses: PoseOptions = field(default_factory=PoseOptions)
+    distractors: DistractorOptions = field(default_factory=DistractorOptions)
     cooldown: Share = 0.0
     """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
     published: these stay as they are."""
@@ -78,6 +80,7 @@ class TrainingOptions:
             supersample=self.supersample,
             finer_after=round(self.supersample_from * iterations) if self.supersample > 1 else 0,
             poses=Poses(self.poses, [view.camera for view in scene.train], iterations),
+            distractors=Distractors(self.distractors, iterations),
         )
 
 
@@ -199,9 +202,14 @@ class Run:
         return self.resolution.poses
 
     @property
+    def distractors(self) -> Distractors:
+        """Of the training photographs."""
+        return self.resolution.distractors
+
+    @property
     def photographed(self) -> Sequence[View]:
-        """The training views at their own resolution, by the poses of the moment."""
-        return self.poses.views(self.scene.train)
+        """The training views at their own resolution, by the poses of the moment, without distractors."""
+        return self.resolution.photographed()
 
     @property
     def complete(self) -> bool:
@@ -262,12 +270,13 @@ class Step:
 
 
 def settled_after(run: Run) -> int:
-    """Step after which nothing is due once before the last part of the run: of its exposures and poses, of the
-    resolution that it renders at, of its backbone."""
+    """Step after which nothing is due once before the last part of the run: of what photographs have wrong, of
+    the resolution that it renders at, of its backbone."""
     own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
     steps = [
         run.exposures.first,
         *run.poses.steps(),
+        *run.distractors.steps(),
         run.resolution.coarse_until,
         run.resolution.finer_after,
         *own,

@@ -3,9 +3,8 @@
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from statistics import median
 
 import torch
 from torch import Tensor
@@ -17,25 +16,19 @@ from gsx.core.data.window import Window
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
-from gsx.core.quality.alignment import aligned, usual_depth
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
+from gsx.core.training.captures import judge_photographs
 from gsx.core.training.evidence import window_errors
 from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
-from gsx.core.training.poses import spread_of_shifts
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
-from gsx.core.training.render import render
-from gsx.core.training.resolution import coarser
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
-
-SMALLER = 2
-"""By how much smaller pictures are than photographs that poses are told from: in a third of the time as well."""
 
 
 def train(run: Run, plugins: Plugins) -> None:
@@ -56,8 +49,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
     judge_steps(run)
     told = run.plateau.told_at(run.step + 1)
-    told |= judge_poses(run) if run.poses.due(run.step + 1) else {}
-    told |= judge_exposures(run) if run.exposures.due(run.step + 1) else {}
+    told |= judge_photographs(run)
     with taken_or_not(run):
         step = backward(run)
         step.changes.update(told)
@@ -74,60 +66,6 @@ def train_step(run: Run, plugins: Plugins) -> Step:
         run.exposures.update(step.number)
     run.step, run.changing = step.number, False
     return step if not reason else replace(step, skipped=reason)
-
-
-def judge_exposures(run: Run) -> dict[str, float]:
-    """Whether training photographs have exposures of their own, from what the model shows in their places; for the
-    line of the step."""
-    pairs = ((render(run, view.camera).image, view.image(), view.counted()) for view in run.photographed)
-    begun = time.perf_counter()
-    spread = run.exposures.judge(pairs)
-    learnt = run.exposures.matrices is not None
-    verdict = "each has its own from here on" if learnt else "they are taken for equal"
-    logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
-    seconds = round(time.perf_counter() - begun, 3)
-    return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
-
-
-def judge_poses(run: Run) -> dict[str, float]:
-    """Whether poses of training photographs are wrong, where that is asked first, and correct them if so; for the line
-    of the step."""
-    begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
-    if run.step + 1 == poses.first:
-        told["pose_spread"] = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
-        needed, verdict = poses.needed(told["pose_spread"]), "poses are corrected from here on"
-        verdict = verdict if needed else "poses are taken for right"
-        logger.info("step %d: photographs lie %.2f px beside: %s", run.step + 1, told["pose_spread"], verdict)
-        if not needed:
-            return told | {"poses": 0, "pose_seconds": round(time.perf_counter() - begun, 3)}
-    told["poses"], told["pose_motion"] = len(views), correct_poses(run, views)
-    logger.info("step %d: poses are corrected by %.2f px", run.step + 1, told["pose_motion"])
-    return told | {"pose_seconds": round(time.perf_counter() - begun, 3)}
-
-
-def beside_renders(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor, Tensor | None, float]]:
-    """(render, photograph, which pixels count, px of the photograph in one of these) of views, smaller."""
-    for view in views:
-        run.refuse_if_stopping()
-        small = coarser(view, run.scene.reduction, SMALLER)
-        image = render(run, small.camera).image
-        yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal
-
-
-def correct_poses(run: Run, views: Sequence[View]) -> float:
-    """Move each photograph to where the model says that it was taken; returns how far pictures move, px."""
-    after, depths = list[Camera](), list[float]()
-    for view, given in zip(views, run.poses.cameras, strict=True):
-        run.refuse_if_stopping()
-        small = coarser(view, run.scene.reduction, SMALLER)
-        shown = render(run, small.camera, supersample=1, depth=True)
-        assert shown.depth is not None
-        pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        after.append(aligned(small.camera, *pictures, given=given))
-        depths.append(usual_depth(shown.depth, shown.alpha))
-    known = [depth for depth in depths if math.isfinite(depth)]
-    depth = median(known) if known else run.scene.extent
-    return run.poses.correct([view.camera for view in views], after, depth, run.step + 1)
 
 
 def judge_steps(run: Run) -> None:

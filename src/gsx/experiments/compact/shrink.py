@@ -31,6 +31,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.colour_fits import colour_fits, fitted, take_coefficients
+from gsx.core.training.distractors import Distractors
 from gsx.core.training.evidence import ROUNDING, Forming, draws_of_each, looked_at, squared_changes
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
@@ -353,7 +354,7 @@ def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
     before = {name: getattr(run, name) for name in names}
     run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
     run.iterations = run.step + steps
-    run.resolution = replace(run.resolution, scene=run.scene, coarse_views={}, poses=Poses())
+    run.resolution = replace(run.resolution, scene=run.scene, coarse_views={}, poses=Poses(), distractors=Distractors())
     run.training = replace(run.training, cooldown=steps / run.iterations)
     try:
         yield

@@ -48,7 +48,7 @@ class CapNotice:
 
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, pictures of `pseudo` views, and
-    exposures and poses of photographs.
+    exposures, poses and distractors of photographs.
 
     Only what there is.
     """
@@ -58,6 +58,7 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
     pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
     found = {"withheld": cap, "pseudo": pseudo, "exposures": judged_exposures(lines), "poses": judged_poses(lines)}
+    found["distractors"] = judged_distractors(lines)
     return {key: value for key, value in found.items() if value}
 
 
@@ -81,6 +82,17 @@ def judged_poses(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return first | {"motions": motions, "seconds": sum(line["pose_seconds"] for line in told)}
 
 
+def judged_distractors(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """At which step distractors were judged, of which share of some photographs, which share of all does not count,
+    each time that was found, and seconds of it all."""
+    told = [line for line in lines if "distractor_seconds" in line]
+    if not told:
+        return {}
+    marked = [line["distractors"] for line in told if line["distractors"]]
+    seconds = sum(line["distractor_seconds"] for line in told)
+    return {"step": told[0]["step"], "share": told[0]["distractor_share"], "marked": marked, "seconds": seconds}
+
+
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
     asked = added(event["asked"] for event in events)
@@ -102,7 +114,7 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
-    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks, pose_remarks)
+    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks, pose_remarks, distractor_remarks)
     return [remark for kind in kinds for remark in kind(evaluation)]
 
 
@@ -142,6 +154,16 @@ def pose_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"training photographs lay {found['spread']:.2f} px beside the model, their poses are corrected from step "
             f"{found['step']:,} on: those of test views are the scene's; eval.poses=aligned looks past that"
+        )
+
+
+def distractor_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Parts of training photographs that did not count."""
+    found = evaluation.get("distractors") or {}
+    if found.get("marked"):
+        yield (
+            f"{found['marked'][-1]:.1%} of training photographs show what others do not, and do not count from step "
+            f"{found['step']:,} on"
         )
 
 

@@ -22,6 +22,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
+from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.guard import Guard
 from gsx.core.training.poses import PoseOptions
 from gsx.core.training.render import render
@@ -72,7 +73,8 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
 def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
     views = [view for number, view in enumerate(run.photographed) if number % HALVES != half]
-    scene, training = replace(run.scene, train=views, test=[]), replace(run.training, poses=PoseOptions())
+    unasked = replace(run.training, poses=PoseOptions(), distractors=DistractorOptions())
+    scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
     backbone = anew(scene, steps, generator)
@@ -82,8 +84,8 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         scene=scene,
         backbone=backbone,
         raster=backbone.raster,
-        training=training,
-        resolution=training.resolution(scene, steps),
+        training=unasked,
+        resolution=unasked.resolution(scene, steps),
         iterations=steps,
         device=run.device,
         generator=generator,

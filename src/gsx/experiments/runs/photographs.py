@@ -54,7 +54,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Of every training photograph, worst first."""
     views = different(run.photographed)
-    progress, known = Countdown("looking at photographs", len(views)), sharpness_of(views)
+    progress, known = Countdown("looking at photographs", len(views)), sharpness_of(run.scene.train)
     found = []
     for view in views:
         found.append(finding(run, view, known.get(view.name), pixels))

@@ -1,0 +1,137 @@
+"""What stands before the scene in one photograph alone: who passes by, what moves.
+
+A model of a static scene shows what photographs agree on. Where one of them differs from it by more than fine detail,
+and the photographs that see the same place do not, something was in the way (distractors: RobustNeRF, Sabour et al.
+2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here by the places that depth
+tells). Where others differ there as well it is the model that is wrong.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from gsx.core.data.camera import Camera
+from gsx.core.shapes import Bool, Float
+
+BLOCK = 2
+"""Px of a picture that are looked at as one: finer differences are detail that the model has yet to learn."""
+LEAST, TIMES = 0.06, 6.0
+"""A difference, display values, that stands out: at least so much, and so many times the usual."""
+COVERED = 0.5
+"""Alpha of a block that has a depth."""
+WITNESSES = 2
+"""Other photographs, at least, that have to see a place."""
+NEAREST = 12
+"""Other photographs, at most, that are asked: of the nearest cameras."""
+HIDDEN = 1.05
+"""A place farther than so many times the depth that a camera is shown there is hidden from it."""
+FAR = 100.0
+"""What lies behind everything is so many times as far as the farthest of it."""
+FEWEST = 3
+"""Blocks of a distractor, of the nine around each of its own."""
+GROWTH = 3
+"""Rounds in which neighbours join that differ by half as much."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Difference:
+    """A photograph against the model's render of it, in blocks."""
+
+    camera: Camera
+    """Whose pixels are the blocks."""
+    size: Float[Tensor, "h w"]
+    """Of the mean difference, largest over channels, less what all of the photograph differs by; display values."""
+    depth: Float[Tensor, "h w"]
+    """Camera z, scene units; inf where nothing is."""
+    counted: Bool[Tensor, "h w"]
+    """Blocks of which all pixels count."""
+
+
+def difference_of(
+    camera: Camera,
+    image: Float[Tensor, "3 H W"],
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    photograph: Float[Tensor, "3 H W"],
+    counted: Bool[Tensor, "H W"] | None = None,
+) -> Difference:
+    """Of a render and a photograph; depth: blending-weighted sum of camera z, scene units, as the rasterizer has it."""
+    width, height = (side // BLOCK for side in camera.size)
+    blocks = camera.crop(0, 0, width * BLOCK, height * BLOCK).resize(width, height)
+    off, weight, z = (avg_pool2d(values[None], BLOCK)[0] for values in (photograph - image, alpha[None], depth[None]))
+    off = off - off.flatten(1).median(1).values[:, None, None]
+    seen = weight[0] > COVERED
+    whole = torch.ones(height, width, dtype=torch.bool)
+    if counted is not None:
+        whole = avg_pool2d(counted[None].float(), BLOCK)[0] == 1
+    return Difference(
+        camera=blocks,
+        size=off.abs().amax(0) * whole,
+        depth=torch.where(seen, z[0] / weight[0].clamp_min(COVERED), torch.inf),
+        counted=whole,
+    )
+
+
+def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"]]:
+    """Which blocks of each photograph show a distractor."""
+    usual = torch.cat([one.size[one.counted] for one in differences]).median()
+    least = max(LEAST, TIMES * float(usual))
+    centres = torch.stack([one.camera.centre.double() for one in differences])
+    found = []
+    for number, own in enumerate(differences):
+        order = (centres - centres[number]).norm(dim=1).argsort(stable=True)
+        others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
+        found.append(whole_of(alone(own, others, least), own.size > least / 2))
+    return found
+
+
+def alone(own: Difference, others: Sequence[Difference], least: float) -> Bool[Tensor, "h w"]:
+    """Blocks that differ by at least so much while few of the others that see the same place differ by half of that."""
+    strong = own.size > least
+    points, sizes = places(own, strong), own.size[strong]
+    seen, wrong = torch.zeros_like(sizes), torch.zeros_like(sizes)
+    for other in others:
+        sees, size = looked_up(other, points)
+        seen += sees
+        wrong += sees & (size > sizes / 2)
+    marked = torch.zeros_like(strong)
+    marked[strong] = (seen >= WITNESSES) & (wrong < seen / 2)
+    return marked
+
+
+def places(own: Difference, chosen: Bool[Tensor, "h w"]) -> Float[Tensor, "P 3"]:
+    """World points that blocks show; far away where nothing is."""
+    camera, (y, x) = own.camera, chosen.nonzero(as_tuple=True)
+    across, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
+    known = own.depth[own.depth.isfinite()]
+    far = FAR * (float(known.max()) if len(known) else camera.near)
+    depth = torch.where(own.depth.isfinite(), own.depth, far)[chosen]
+    points = (torch.stack([across, down, torch.ones_like(across)]) * depth).double()
+    return (camera.rotation.double().T @ (points - camera.translation.double()[:, None])).T.float()
+
+
+def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "P"]]:
+    """(which points a photograph sees, in front of or on what the model shows it, and how much it differs there or in
+    a block beside)."""
+    pixels, depths = other.camera.project(points)
+    inside = other.camera.shows(pixels, depths)
+    x, y = torch.where(inside[:, None], pixels, 0).long().unbind(1)
+    sees = inside & other.counted[y, x] & (depths < HIDDEN * other.depth[y, x])
+    return sees, spread(other.size)[y, x]
+
+
+def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Marked blocks that have company, with the weak ones that they touch."""
+    around = 9 * avg_pool2d(marked[None].float(), 3, 1, 1)[0]
+    kept = marked & (around > FEWEST - 0.5)
+    for _ in range(GROWTH):
+        kept = kept | ((spread(kept.float()) > 0) & weak)
+    return kept
+
+
+def spread(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The largest of each block and those around it."""
+    return max_pool2d(values[None], 3, 1, 1)[0]

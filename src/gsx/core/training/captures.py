@@ -1,0 +1,121 @@
+"""What training photographs have wrong: asked before a step where that is due, and mended (docs/photographs.md)."""
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Sequence
+from statistics import median
+
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
+from gsx.core.quality.alignment import aligned, usual_depth
+from gsx.core.quality.distractors import Difference, difference_of, distractors_in
+from gsx.core.rasterizer import TiledRendering
+from gsx.core.training.distractors import share_of
+from gsx.core.training.poses import spread_of_shifts
+from gsx.core.training.render import render
+from gsx.core.training.resolution import coarser
+from gsx.core.training.run import Run
+
+logger = logging.getLogger(__name__)
+
+SMALLER = 2
+"""By how much smaller pictures are than photographs that poses and distractors are told from: in a third of the time
+as well."""
+
+
+def judge_photographs(run: Run) -> dict[str, float]:
+    """Ask whatever is due before the next step; for its line of metrics.jsonl."""
+    told = judge_poses(run) if run.poses.due(run.step + 1) else {}
+    told |= judge_exposures(run) if run.exposures.due(run.step + 1) else {}
+    return told | (judge_distractors(run) if run.distractors.due(run.step + 1) else {})
+
+
+def judge_exposures(run: Run) -> dict[str, float]:
+    """Whether training photographs have exposures of their own, from what the model shows in their places; for the
+    line of the step."""
+    pairs = ((render(run, view.camera).image, view.image(), view.counted()) for view in run.photographed)
+    begun = time.perf_counter()
+    spread = run.exposures.judge(pairs)
+    learnt = run.exposures.matrices is not None
+    verdict = "each has its own from here on" if learnt else "they are taken for equal"
+    logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
+    seconds = round(time.perf_counter() - begun, 3)
+    return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
+
+
+def judge_poses(run: Run) -> dict[str, float]:
+    """Whether poses of training photographs are wrong, where that is asked first, and correct them if so; for the line
+    of the step."""
+    begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
+    if run.step + 1 == poses.first:
+        told["pose_spread"] = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
+        needed, verdict = poses.needed(told["pose_spread"]), "poses are corrected from here on"
+        verdict = verdict if needed else "poses are taken for right"
+        logger.info("step %d: photographs lie %.2f px beside: %s", run.step + 1, told["pose_spread"], verdict)
+        if not needed:
+            return told | {"poses": 0, "pose_seconds": round(time.perf_counter() - begun, 3)}
+    told["poses"], told["pose_motion"] = len(views), correct_poses(run, views)
+    logger.info("step %d: poses are corrected by %.2f px", run.step + 1, told["pose_motion"])
+    return told | {"pose_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def beside_renders(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor, Tensor | None, float]]:
+    """(render, photograph, which pixels count, px of the photograph in one of these) of views, smaller."""
+    for view in views:
+        run.refuse_if_stopping()
+        small = coarser(view, run.scene.reduction, SMALLER)
+        image = render(run, small.camera).image
+        yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal
+
+
+def correct_poses(run: Run, views: Sequence[View]) -> float:
+    """Move each photograph to where the model says that it was taken; returns how far pictures move, px."""
+    after, depths = list[Camera](), list[float]()
+    for view, given in zip(views, run.poses.cameras, strict=True):
+        run.refuse_if_stopping()
+        small, shown = seen_smaller(run, view)
+        assert shown.depth is not None
+        pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
+        after.append(aligned(small.camera, *pictures, given=given))
+        depths.append(usual_depth(shown.depth, shown.alpha))
+    known = [depth for depth in depths if math.isfinite(depth)]
+    depth = median(known) if known else run.scene.extent
+    return run.poses.correct([view.camera for view in views], after, depth, run.step + 1)
+
+
+def judge_distractors(run: Run) -> dict[str, float]:
+    """Whether photographs show distractors, where that is asked first, and find those of all if so; for the line of
+    the step."""
+    begun, distractors, told = time.perf_counter(), run.distractors, dict[str, float]()
+    views = run.poses.views(run.scene.train)
+    if run.step + 1 == distractors.first:
+        some = distractors.judged_by(views)
+        told["distractor_share"] = share_of(distractors_in(list(differences(run, some))))
+        needed = distractors.needed(told["distractor_share"])
+        verdict = "they do not count from here on" if needed else "all of them counts"
+        shown = 100 * told["distractor_share"]
+        logger.info("step %d: %.1f %% of photographs show what others do not: %s", run.step + 1, shown, verdict)
+        if not needed:
+            return told | {"distractors": 0, "distractor_seconds": round(time.perf_counter() - begun, 3)}
+    told["distractors"] = distractors.mark(distractors_in(list(differences(run, views))), run.step + 1)
+    logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
+    return told | {"distractor_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def differences(run: Run, views: Sequence[View]) -> Iterator[Difference]:
+    """Between photographs and what the model shows in their places, smaller."""
+    for view in views:
+        run.refuse_if_stopping()
+        small, shown = seen_smaller(run, view)
+        assert shown.depth is not None
+        image = run.exposures.applied(shown.image, view.name).detach().cpu()
+        yield difference_of(small.camera, image, shown.depth, shown.alpha, small.image(), small.counted())
+
+
+def seen_smaller(run: Run, view: View) -> tuple[View, TiledRendering]:
+    """(a view at a smaller size, what the model shows there, with depth)."""
+    small = coarser(view, run.scene.reduction, SMALLER)
+    return small, render(run, small.camera, supersample=1, depth=True)

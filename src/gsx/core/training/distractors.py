@@ -1,0 +1,171 @@
+"""Distractors: what stands before the scene in one training photograph alone does not count.
+
+Whether there are any is judged once, from some photographs (`core.quality.distractors`). If so, those of all
+photographs are found, and again a few times as the model learns more; pixels that show one count in no loss, no
+growth and no figure from there on, as if a mask had left them out. Test photographs play no part.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import FromFile, ImageSource, Masked, View
+from gsx.core.ranges import Range, Share
+from gsx.core.shapes import Bool, UInt8
+from gsx.core.training.occasions import WHEN, occasions, some_photographs
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistractorOptions:
+    """Options; values in conf/config.yaml."""
+
+    when: str = "never"
+    """auto: where photographs show what others do not."""
+    start: Share = 0.1
+    """Share of the steps after which that is judged, and distractors are found first: what was learnt of them until
+    then is not unlearnt soon."""
+    until: Share = 0.6
+    """Share of the steps after which they are found last."""
+    times: Annotated[int, Range(1, 1000)] = 4
+    """How often they are, at shares that grow by the same factor."""
+    share: Annotated[float, Range(0, 1)] = 0.02
+    """`auto`: of the pictures that are judged by, from which on what shows a distractor does not count."""
+    views: Annotated[int, Range(3, 10**6)] = 24
+    """Photographs that are judged by, at most."""
+
+    def __post_init__(self) -> None:
+        if self.when not in WHEN:
+            raise ValueError(f"training.distractors.when is '{self.when}'; choose from {', '.join(WHEN)}")
+        if not 0 < self.start < 1 or not self.start <= self.until < 1:
+            raise ValueError(
+                f"training.distractors.start is {self.start} and training.distractors.until {self.until}: give shares "
+                "of the steps between 0 and 1, the second one not smaller"
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Obstructed:
+    """A source of a photograph of which some parts show a distractor."""
+
+    source: ImageSource
+    marked: Bool[Tensor, "h w"]
+    """Which, on a raster of its own over the whole frame."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """That of the source."""
+        return self.source.image(camera)
+
+    def max_zoom(self, camera: Camera) -> float:
+        """That of the source."""
+        return self.source.max_zoom(camera)
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """What counts of the source, and shows no distractor."""
+        left = ~self.marked[rows_of(camera, self.marked.shape[0])[:, None], columns_of(camera, self.marked.shape[1])]
+        own = self.source.counted(camera) if isinstance(self.source, Masked) else None
+        return left if own is None else left & own
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObstructedFile(Obstructed):
+    """The same of a source that reads a file."""
+
+    @property
+    def path(self) -> Path:
+        """The file that the source reads."""
+        assert isinstance(self.source, FromFile)
+        return self.source.path
+
+
+def rows_of(camera: Camera, count: int) -> Tensor:
+    """In which of so many rows over the whole frame each row of the camera's pixels lies."""
+    frame = camera.frame
+    return ((torch.arange(camera.height) + 0.5 + frame.top) / frame.height * count).long().clamp(0, count - 1)
+
+
+def columns_of(camera: Camera, count: int) -> Tensor:
+    """The same of columns."""
+    frame = camera.frame
+    return ((torch.arange(camera.width) + 0.5 + frame.left) / frame.width * count).long().clamp(0, count - 1)
+
+
+def obstructed(view: View, marked: Bool[Tensor, "h w"]) -> View:
+    """The view without what is marked; itself where nothing is."""
+    if not bool(marked.any()):
+        return view
+    kind = ObstructedFile if isinstance(view.source, FromFile) else Obstructed
+    return replace(view, source=kind(source=view.source, marked=marked))
+
+
+@dataclass(eq=False)
+class Distractors:
+    """Of a run's training photographs. All pixels count before `mark`."""
+
+    options: DistractorOptions = field(default_factory=DistractorOptions)
+    iterations: int = 0
+    marked: Sequence[Bool[Tensor, "h w"]] | None = None
+    """Of each photograph, in order; None: they were not needed."""
+    looked: int = 0
+    """The last step before which they were found: not again where that step is taken anew."""
+    seen: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
+    """Views that were asked for, and what they are without distractors."""
+
+    def steps(self) -> list[int]:
+        """The steps before which they are found, if there are any, the first of them after that is judged."""
+        own = self.options
+        return [] if own.when == "never" else occasions(own.start, own.until, own.times, self.iterations)
+
+    @property
+    def first(self) -> int:
+        """The step before which it is judged whether there are any."""
+        return self.steps()[0]
+
+    def due(self, number: int) -> bool:
+        """Whether they are judged or found before this step."""
+        steps = self.steps()
+        return number in steps and number > self.looked and (number == steps[0] or self.marked is not None)
+
+    def judged_by(self, views: Sequence[View]) -> list[View]:
+        """The photographs that it is judged by: the same in every run."""
+        return some_photographs(views, self.options.views, "distractors")
+
+    def needed(self, share: float) -> bool:
+        """Whether a share of pictures that shows distractors asks for masks."""
+        return self.options.when == "always" or share > self.options.share
+
+    def views(self, views: Sequence[View]) -> Sequence[View]:
+        """The training views, in order, without their distractors; the same ones until others are found."""
+        if self.marked is None:
+            return views
+        for asked, made in self.seen:
+            if asked is views:
+                return made
+        made = [obstructed(view, marked) for view, marked in zip(views, self.marked, strict=True)]
+        self.seen.append((views, made))
+        return made
+
+    def mark(self, marked: Sequence[Bool[Tensor, "h w"]] | None, number: int) -> float:
+        """These from a step on; returns their share of the pictures."""
+        self.marked, self.looked, self.seen = marked, number, []
+        return share_of(marked or [])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint holds of them; nothing where there are none."""
+        if self.marked is None:
+            return {}
+        return {"looked": torch.tensor(self.looked)} | {str(n): marked for n, marked in enumerate(self.marked)}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a checkpoint's tensors; none: all pixels count."""
+        marked = [tensors[str(number)].clone() for number in range(len(tensors) - 1)] if tensors else None
+        self.mark(marked, int(tensors["looked"]) if tensors else 0)
+
+
+def share_of(marked: Sequence[Bool[Tensor, "h w"]]) -> float:
+    """Of pictures, in the mean over them."""
+    return sum(float(one.float().mean()) for one in marked) / max(1, len(marked))

@@ -1,0 +1,131 @@
+"""Distractors in pictures of a plane whose truth is known: found where they are, and nowhere else."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.quality.distractors import BLOCK, LEAST, TIMES, Difference, difference_of, distractors_in, whole_of
+
+SIZE = 64, 48
+
+
+def cameras(count: int = 6) -> list[Camera]:
+    """On a line before the plane z = 0, which they see whole."""
+    return [look_at([0.3 * i - 0.8, -1.0, 4], [0, 0, 0], fov_x=0.7, width=SIZE[0], height=SIZE[1])
+            for i in range(count)]  # fmt: skip
+
+
+def on_plane(camera: Camera) -> tuple[Tensor, Tensor]:
+    """(world points of the plane at the pixels, camera z of them)."""
+    y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double()
+    world, centre = rays @ camera.rotation.double(), camera.centre.double()
+    depth = -centre[2] / world[..., 2]
+    return centre + depth[..., None] * world, depth.float()
+
+
+def shown(camera: Camera) -> tuple[Tensor, Tensor]:
+    """(picture of the plane, depth)."""
+    points, depth = on_plane(camera)
+    grey = (0.5 + 0.2 * (4 * points[..., 0]).sin() * (3 * points[..., 1]).cos()).float()
+    return torch.stack([grey, grey, grey]), depth
+
+
+def seen(photographs: list[Tensor], counted: Tensor | None = None) -> list[Difference]:
+    """Photographs against renders of the plane, which covers everything."""
+    return [
+        difference_of(camera, *shown(camera), torch.ones(48, 64), photograph, counted)
+        for camera, photograph in zip(cameras(), photographs, strict=True)
+    ]
+
+
+def noisy(seed: int = 0, noise: float = 0.01) -> list[Tensor]:
+    """What cameras photograph of the plane."""
+    generator = torch.Generator().manual_seed(seed)
+    pictures = [shown(camera)[0] for camera in cameras()]
+    return [picture + noise * torch.randn(picture.shape, generator=generator) for picture in pictures]
+
+
+def blocks(y: slice, x: slice) -> Tensor:
+    """The blocks of some pixels."""
+    marked = torch.zeros(48, 64, dtype=torch.bool)
+    marked[y, x] = True
+    return marked[::BLOCK, ::BLOCK]
+
+
+def test_what_stands_in_one_photograph_is_found_there_alone() -> None:
+    photographs = noisy()
+    photographs[2][:, 12:24, 20:40] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+    found = distractors_in(seen(photographs))
+    assert torch.equal(found[2], blocks(slice(12, 24), slice(20, 40)))
+    assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
+
+
+def test_what_all_photographs_show_is_an_error_of_the_model() -> None:
+    """A disc on the plane that the model has not learnt."""
+    photographs = noisy()
+    for camera, photograph in zip(cameras(), photographs, strict=True):
+        photograph[:, on_plane(camera)[0][..., :2].norm(dim=-1) < 0.4] += 0.4
+    assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)))
+
+
+def test_what_nobody_else_sees_is_not_judged() -> None:
+    photographs = noisy()
+    photographs[2][:, 12:24, 20:40] = 0.95
+    counted = torch.zeros(48, 64, dtype=torch.bool)
+    counted[:, :3] = True  # of all other photographs next to nothing counts
+    pictures = [
+        difference_of(camera, *shown(camera), torch.ones(48, 64), photograph, None if number == 2 else counted)
+        for number, (camera, photograph) in enumerate(zip(cameras(), photographs, strict=True))
+    ]
+    assert not any(bool(marked.any()) for marked in distractors_in(pictures))
+
+
+def test_before_an_empty_background_directions_tell() -> None:
+    """Turned cameras see a part of the same sky; none of them sees anything but it."""
+    turned = [look_at([0.1 * i, 0, 0], [0.1 * i + 0.1 * i, 5, 0], fov_x=0.7, width=SIZE[0], height=SIZE[1])
+              for i in range(5)]  # fmt: skip
+    photographs = [torch.full((3, 48, 64), 0.6) for _ in turned]
+    photographs[2][:, 12:24, 20:40] = 0.1
+    empty = torch.zeros(48, 64)
+    pictures = [
+        difference_of(camera, torch.full((3, 48, 64), 0.6), empty, empty, photograph)
+        for camera, photograph in zip(turned, photographs, strict=True)
+    ]
+    found = distractors_in(pictures)
+    assert torch.equal(found[2], blocks(slice(12, 24), slice(20, 40)))
+    assert sum(int(marked.sum()) for marked in found) == int(found[2].sum())
+
+
+def test_another_exposure_is_no_distractor() -> None:
+    photographs = noisy()
+    photographs[3] += 0.3
+    assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)))
+
+
+@pytest.mark.parametrize(("noise", "step", "found"), [(0.0, 0.8, False), (0.0, 1.2, True), (0.3, 1.2, False)])
+def test_how_much_stands_out(noise: float, step: float, found: bool) -> None:
+    """Of the least difference where there is no noise; with noise it has to be so many times the usual."""
+    assert TIMES * 0.3 * 0.67 / BLOCK > 1.2 * LEAST
+    photographs = noisy(noise=noise)
+    photographs[2][:, 12:24, 20:40] += step * LEAST
+    marked = distractors_in(seen(photographs))
+    assert bool(marked[2][blocks(slice(12, 24), slice(20, 40))].float().mean() > 0.5) == found
+
+
+def test_masked_pixels_are_no_distractor() -> None:
+    photographs = noisy()
+    photographs[2][:, 12:24, 20:40] = 0.95
+    counted = ~blocks(slice(12, 24), slice(20, 40)).repeat_interleave(BLOCK, 0).repeat_interleave(BLOCK, 1)
+    assert not bool(distractors_in(seen(photographs, counted))[2].any())
+
+
+def test_single_blocks_go_and_weak_neighbours_come() -> None:
+    """A lone block is noise; three in a row take the weak ones beside them in three rounds."""
+    marked, weak = torch.zeros(8, 12, dtype=torch.bool), torch.zeros(8, 12, dtype=torch.bool)
+    marked[1, 1] = marked[4, 3:6] = weak[4, 3:] = True
+    weak[4, 10] = False
+    expected = torch.zeros(8, 12, dtype=torch.bool)
+    expected[4, 4:8] = expected[4, 3] = True
+    assert torch.equal(whole_of(marked, weak), expected)

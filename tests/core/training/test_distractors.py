@@ -1,0 +1,149 @@
+"""Distractors in runs: found when they are due, left out of the loss, kept and resumed; no change where none are."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import Grey, small_scene, spread
+from tiny import final_tensors, tiny_run
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.core.data.camera import Camera
+from gsx.core.data.disturbed import patch_of
+from gsx.core.data.scene import View
+from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+
+
+def views(count: int = 4) -> list[View]:
+    """Of 24 x 16 px."""
+    return list(small_scene(spread(5), views=count).train)
+
+
+def marks(count: int = 4) -> list[Tensor]:
+    """The first photograph has a distractor at its upper left, in blocks of 4 px."""
+    marked = [torch.zeros(4, 6, dtype=torch.bool) for _ in range(count)]
+    marked[0][1, :2] = True
+    return marked
+
+
+def test_they_are_judged_once_and_found_again_only_where_there_are_any() -> None:
+    own = Distractors(DistractorOptions(when="auto", start=0.1, until=0.4, times=3), 1000)
+    assert [number for number in range(1, 1001) if own.due(number)] == [101]
+    own.mark(marks(), 101)
+    assert [number for number in range(1, 1001) if own.due(number)] == [201, 401]
+    assert not any(Distractors(DistractorOptions(), 1000).due(number) for number in range(1, 1001))
+
+
+def test_auto_asks_for_more_than_the_share_and_always_for_nothing() -> None:
+    auto, always = (Distractors(DistractorOptions(when=when, share=0.03), 10) for when in ("auto", "always"))
+    assert [auto.needed(value) for value in (0.02, 0.04)] == [False, True]
+    assert always.needed(0.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [({"when": "on"}, "never, auto, always"), ({"start": 0.0}, "between 0 and 1"), ({"until": 0.05}, "not smaller")],
+)
+def test_wrong_options_are_named(wrong, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        DistractorOptions(**wrong)
+
+
+# -- pixels ----------------------------------------------------------------------------------------------------------
+
+
+def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> None:
+    view = obstructed(views()[0], marks()[0])
+    expected = torch.ones(16, 24, dtype=torch.bool)
+    expected[4:8, :8] = False
+    assert torch.equal(view.counted(), expected)
+    finer = replace(view, camera=view.camera.zoom(2))
+    assert torch.equal(finer.counted(), expected.repeat_interleave(2, 0).repeat_interleave(2, 1))
+    cut = replace(view, camera=view.camera.crop(6, 3, 10, 8))
+    assert torch.equal(cut.counted(), expected[3:11, 6:16])
+    assert torch.equal(view.image(), views()[0].image())
+    assert obstructed(views()[1], marks()[1]).counted() is None
+
+
+class HalfMasked(Grey):
+    """Of which the left half does not count."""
+
+    def counted(self, camera: Camera) -> Tensor:
+        return (torch.arange(camera.width) >= camera.width // 2).expand(camera.height, -1)
+
+
+def test_masks_of_the_scene_hold_beside_them() -> None:
+    source, marked = HalfMasked(), torch.zeros(4, 6, dtype=torch.bool)
+    marked[0] = True
+    counted = Obstructed(source=source, marked=marked).counted(views()[0].camera)
+    expected = torch.zeros(16, 24, dtype=torch.bool)
+    expected[4:, 12:] = True
+    assert torch.equal(counted, expected)
+
+
+def test_views_are_the_same_until_others_are_found() -> None:
+    own, given = Distractors(DistractorOptions(), 10), views()
+    assert own.views(given) is given
+    assert own.mark(marks(), 5) == pytest.approx(2 / 24 / 4)
+    made = own.views(given)
+    assert own.views(given) is made
+    assert made[1] is given[1]
+    again = Distractors(DistractorOptions(), 10)
+    again.restore(own.tensors())
+    assert again.looked == 5
+    assert torch.equal(again.views(given)[0].counted(), made[0].counted())
+    own.restore({})
+    assert own.views(given) is given
+
+
+# -- runs ------------------------------------------------------------------------------------------------------------
+
+BEFORE_IT = (
+    "scene.disturb.covered=0.1",
+    "training.distractors.when=always",
+    "training.distractors.start=0.5",
+    "training.distractors.until=0.8",
+    "iterations=60",
+    "backbone.rates.shortened=0.4",
+)
+
+
+def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photographs(tmp_path: Path) -> None:
+    """Of what covers them most is found; not much of the rest."""
+    whole = tiny_run(tmp_path / "whole", BEFORE_IT)
+    tiny_run(tmp_path / "stopped", BEFORE_IT, stop_after=40)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    assert run.distractors.marked is not None
+    execute(run, settings, plugins())
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert "distractors.0" in a
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    told = [line for line in whole.curves if "distractor_seconds" in line]
+    assert [line["step"] for line in told] == run.distractors.steps()
+    found, covered, others = 0, 0, 0
+    for view, own in zip(whole.photographed, whole.scene.train, strict=True):
+        patch, counted = patch_of(view.name, 0.1), view.counted()
+        black = torch.zeros(3, view.camera.height, view.camera.width, dtype=torch.uint8)
+        there = (patch.over(black, own.camera) != patch.over(black + 255, own.camera)).logical_not().all(0)
+        out = torch.zeros_like(there) if counted is None else ~counted
+        found, covered = found + int((out & there).sum()), covered + int(there.sum())
+        others += int((out & ~there).sum())
+    assert found > 0.4 * covered
+    assert others < found / 3
+
+
+def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
+    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
+    asked = ["training.distractors.when=auto", "training.distractors.share=0.9"]
+    judged = tiny_run(tmp_path / "judged", ["iterations=12", *asked])
+    assert plain.distractors.marked is None
+    assert judged.distractors.marked is None
+    assert [line["distractors"] for line in judged.curves if "distractor_share" in line] == [0]
+    a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
