@@ -1,14 +1,15 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--what exposure,poses,covered] [--only demo,fox] [--seeds 0,1]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,poses,covered,passed] [--only demo,fox] [--seeds 0,1]
                                   [--share 0.4]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
 `training.exposure.when=auto`, beside the scene as it is, with it. `poses`: training cameras turned by half a pixel and
 by two, with and without `training.poses.when=auto`, likewise. `covered`: something plain stands before a part of each
-training photograph, with and without `training.distractors.when=auto`, likewise. `faults`: a tenth of the photographs
-are made worse, and what `gsx photographs` names is counted. Finished runs below --runs are not trained again.
+training photograph, with and without `training.distractors.when=auto`, likewise; `passed`: somebody does in the
+built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx photographs` names is counted.
+Finished runs below --runs are not trained again.
 """
 
 import argparse
@@ -54,6 +55,9 @@ COVERED = ("scene.disturb.covered=0.15",)
 UNCOVERED = ("training.distractors.when=auto",)
 COVERED_ARMS = {"as it is, auto": UNCOVERED, "covered": COVERED, "covered, auto": (*COVERED, *UNCOVERED)}
 """The same of what stands before the scene."""
+SOMEBODY = ("scene.passer_by=true",)
+PASSED_ARMS = {"as it is, auto": UNCOVERED, "passed by": SOMEBODY, "passed by, auto": (*SOMEBODY, *UNCOVERED)}
+"""The same of who does, in the built-in scene."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -248,10 +252,14 @@ def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 # -- distractors -------------------------------------------------------------------------------------------------------
 
 
-def seen_past(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+Arms = Mapping[str, Sequence[str]]
+"""Overrides by the name of a row: what there is to win back, disturbed, and mended."""
+
+
+def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of colours, and what it found of distractors."""
     steps = round(given.share * steps_among(SUBJECTS[scene]))
-    words = [*OWN, *COVERED_ARMS[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    words = [*OWN, *arms[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
     folder = trained(scene, seed, given, words, arm)
     evaluation = read_json(folder / "evaluation.json")
     return {
@@ -262,9 +270,9 @@ def seen_past(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dic
     }
 
 
-def covered_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     """Figures of one arm over seeds."""
-    found = by_arm[arm]
+    found, (best, worst, mended) = by_arm[arm], by_arm
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     asked = [one["distractors"] for one in found if one["distractors"]]
     row["share"] = told([100 * one["share"] for one in asked], ".1f") if asked else ""
@@ -273,30 +281,55 @@ def covered_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, 
     row["cost"] = f"{statistics.mean(cost):.1f}" if cost else ""
     for zoom in ZOOMS:
         row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
-        if arm == "covered, auto":
-            row[f"back{zoom}"] = told(shares_won([by_arm[name] for name in COVERED_ARMS], "fitted", zoom), ".2f")
+        if arm == mended:
+            arms = [by_arm[name] for name in (best, worst, mended)]
+            row[f"back{zoom}"] = told(shares_won(arms, "fitted", zoom), ".2f")
     return row | {f"x{zoom}": told(psnr_of(found, "rendered", zoom), ".2f") for zoom in ZOOMS}
 
 
+PAST_COLUMNS = [
+    *(["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["share", "judged to show, %"]),
+    *(["marked", "left out at last, %"], ["cost", "% of training"], ["fitted1", "x1"], ["fitted4", "x4"]),
+    *(["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as rendered"], ["x4", "x4 as rendered"]),
+]
+
+
+def past(arms: Arms, scenes: Sequence[str], given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of something in the way, and of what sees past it."""
+    found = over_seeds(lambda scene, seed: {a: seen_past(scene, seed, a, arms, given) for a in arms}, scenes, given)
+    by_scene = {scene: {arm: [one[arm] for one in found[scene]] for arm in arms} for scene in scenes}
+    return [past_row(scene, arm, by_scene[scene]) for scene in scenes for arm in arms]
+
+
+PAST_NOTE = (
+    "PSNR on held-out views that nothing covers, of right halves in colours fitted on the left (as rendered: of whole "
+    "views as the model shows them); means over seeds ± half their range."
+)
+
+
 def covered(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
-    """What stands before the scene, and what sees past it."""
-    found = over_seeds(lambda scene, seed: {a: seen_past(scene, seed, a, given) for a in COVERED_ARMS}, scenes, given)
-    rows = []
-    for scene in scenes:
-        by_arm = {arm: [one[arm] for one in found[scene]] for arm in COVERED_ARMS}
-        rows += [covered_row(scene, arm, by_arm) for arm in COVERED_ARMS]
-    columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["share", "judged to show, %"]]
-    columns += [["marked", "left out at last, %"], ["cost", "% of training"], ["fitted1", "x1"], ["fitted4", "x4"]]
-    columns += [["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as rendered"], ["x4", "x4 as rendered"]]
+    """Photographs with something in the way."""
+    note = f"{given.share:g} of the steps; a plain patch covers 15 % of each training photograph, anywhere on it. "
+    rows = past(COVERED_ARMS, scenes, given)
+    return "Photographs with something in the way", PAST_COLUMNS, rows, note + PAST_NOTE
+
+
+def passed(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Photographs with somebody in the way, in the built-in scene."""
     note = (
-        f"{given.share:g} of the steps; a plain patch covers 15 % of each training photograph, anywhere on it; PSNR on "
-        "held-out views that are not covered, of right halves in colours fitted on the left (as rendered: of whole "
-        "views as the model shows them); means over seeds ± half their range."
+        f"{given.share:g} of the steps; somebody stands before each training camera, in another place, with a shadow. "
     )
-    return "Photographs with something in the way", columns, rows, note
+    rows = past(PASSED_ARMS, [scene for scene in scenes if scene == "demo"], given)
+    return "Photographs with somebody in the way", PAST_COLUMNS, rows, note + PAST_NOTE
 
 
-WHAT: dict[str, Measure] = {"exposure": exposure, "poses": poses, "covered": covered, "faults": faults}
+WHAT: dict[str, Measure] = {
+    "exposure": exposure,
+    "poses": poses,
+    "covered": covered,
+    "passed": passed,
+    "faults": faults,
+}
 
 
 def main(words: Sequence[str]) -> None:

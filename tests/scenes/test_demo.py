@@ -519,3 +519,32 @@ def test_sky_and_ground_are_where_they_belong(life):
     assert bool((owner[0] == SKY).all())
     assert bool((owner[-1] == GROUND).any())
     assert not bool((owner[:15] == GROUND).any())
+
+
+# --- somebody who passes by -----------------------------------------------------------------------------------------
+
+
+def test_somebody_stands_before_training_cameras_alone(scene: Scene) -> None:
+    """Where the arrangement has the coat, the photograph is red; nobody in test pictures; the points are the same."""
+    walked = load(options(passer_by=True))
+    shares, seen = [], 0
+    for view, empty in zip(walked.train, scene.train, strict=True):
+        assert view.camera.draws_as(empty.camera)
+        picture, without = view.image(), empty.image()
+        shares.append(float(((picture - without).abs().amax(0) > 0.03).float().mean()))
+        coat = next(solid for solid in view.source.life.solids if solid.name == "coat")
+        pixel, depth = view.camera.project(coat.centre[None].float())
+        x, y = pixel[0].long().tolist()
+        inside = float(depth) > 0 and 0 <= x < 64 and 0 <= y < 48
+        if inside and trace(view.source.life, rays_through(view.camera, *pixel.double().T)).depth > 0.8 * depth:
+            red, green, blue = picture[:, y, x].tolist()
+            assert red > 2 * max(green, blue)
+            seen += 1
+    assert seen > 3
+    assert 0.05 < sum(shares) / len(shares) < 0.4
+    assert len({tuple(view.source.life.solids[-1].centre.tolist()) for view in walked.train}) == len(walked.train)
+    for view, empty in zip(walked.test, scene.test, strict=True):
+        assert torch.equal(view.image(), empty.image())
+    assert torch.equal(walked.points.positions, scene.points.positions)
+    assert walked.provenance["passer_by"]
+    assert "passer_by" not in scene.provenance

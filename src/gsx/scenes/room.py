@@ -160,4 +160,5 @@ def load(options: DemoOptions) -> Scene:
         ConfigError: see `gsx.scenes.demo.views.check`.
     """
     check(options)
-    return photographed(options, make_room(), walking_camera, found_points, "room", room_version(), "a walk")
+    version = room_version()
+    return photographed(options, make_room(), walking_camera, found_points, "room", version, "a walk", floor=FLOOR)

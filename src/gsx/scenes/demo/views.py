@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +20,7 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError
 from gsx.core.ranges import Points, Range, Seed
 from gsx.core.shapes import Float, UInt8
+from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import rays_through, render, shade, trace
 from gsx.scenes.options import SceneOptions
@@ -50,6 +51,8 @@ class DemoOptions(SceneOptions):
     """Rays per pixel, averaged in display light."""
     seed: Seed
     """Of the initial points."""
+    passer_by: bool = False
+    """Somebody stands before each training camera. The default: runs older than this option."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,9 +166,10 @@ def check(options: DemoOptions) -> None:
         raise ConfigError(f"scene.background is {list(options.background)}, give red, green and blue in [0, 1].")
 
 
-def make_views(group: str, cameras: Sequence[Camera], source: Callable[..., DemoSource]) -> list[View]:
+def make_views(group: str, cameras: Sequence[Camera], source: Callable[[str, Camera], DemoSource]) -> list[View]:
     """Numbered views, each with its own source."""
-    return [View(f"{group}_{index:03d}", camera, source(own=camera)) for index, camera in enumerate(cameras)]
+    named = {f"{group}_{index:03d}": camera for index, camera in enumerate(cameras)}
+    return [View(name, camera, source(name, camera)) for name, camera in named.items()]
 
 
 def load(options: DemoOptions) -> Scene:
@@ -186,34 +190,53 @@ PointsOf = Callable[[StillLife, Sequence[Camera], int, torch.Generator], PointCl
 
 
 def photographed(
-    options: DemoOptions, life: StillLife, camera_at: CameraAt, points: PointsOf, name: str, version: str, path: str
+    options: DemoOptions,
+    life: StillLife,
+    camera_at: CameraAt,
+    points: PointsOf,
+    name: str,
+    version: str,
+    path: str,
+    floor: float = 0.0,
 ) -> Scene:
     """An arrangement seen along a path: training cameras evenly on it, test cameras half-way between neighbours.
 
-    name: of the format and of its cached pictures; version: a digest of the code that makes them; path: its name.
+    name: of the format and of its cached pictures; version: a digest of the code that makes them; path: its name;
+    floor: height of what people stand on, scene units.
     """
     size = training_size(options.width, options.height, options.downscale, options.max_width)
     count = options.train_views
     train = [camera_at(index / count, *size) for index in range(count)]
     places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
     test = [camera_at(place, *size) for place in places]
-    folder = cache_folder(name, content_key(version, options.samples))
+    made_by = version, options.samples
     cache = ImageCache(int(options.cache_gb * 1e9))
-    source = partial(DemoSource, life=life, samples=options.samples, cache=cache, folder=folder)
+
+    def still(_: str, camera: Camera) -> DemoSource:
+        folder = cache_folder(name, content_key(*made_by))
+        return DemoSource(life=life, own=camera, samples=options.samples, cache=cache, folder=folder)
+
+    def walked_through(view: str, camera: Camera) -> DemoSource:
+        folder = cache_folder(name, content_key(*made_by, "passer by", view))
+        seen = with_passer_by(life, camera, view, floor)
+        return DemoSource(life=seen, own=camera, samples=options.samples, cache=cache, folder=folder)
+
     return Scene(
         name=options.name,
-        train=make_views("train", train, source),
-        test=make_views("test", test, source),
+        train=make_views("train", train, walked_through if options.passer_by else still),
+        test=make_views("test", test, still),
         points=points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
         background=torch.tensor(options.background),
         extent=extent_of(train),
+        notes=["somebody stands before each training camera (scene.passer_by)"] if options.passer_by else [],
         provenance=provenance(options, size, name, version, path),
     )
 
 
 def provenance(options: DemoOptions, size: tuple[int, int], name: str, version: str, path: str) -> dict[str, Any]:
     """What decides how the pictures look, for the evaluation protocol."""
-    return {
+    somebody = {"passer_by": True} if options.passer_by else {}
+    return somebody | {
         "format": name,
         "version": version,
         "size": list(size),
