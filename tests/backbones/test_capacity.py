@@ -46,7 +46,7 @@ def test_events_of_the_published_run() -> None:
     due = [step for step in range(1, 30001) if PUBLISHED.due(step)]
     assert due == list(range(600, 15000, 100))
     assert PUBLISHED.events() == len(due) == 144
-    assert [PUBLISHED.share(step) for step in (500, 600, 7700, 14900, 20000)] == [0, 1 / 144, 0.5, 1, 1]
+    assert [PUBLISHED.passed(step) for step in (500, 600, 7700, 14900, 20000)] == [0, 1 / 144, 0.5, 1, 1]
 
 
 @pytest.mark.parametrize(("start", "stop", "every"), [(17, 500, 43), (20, 600, 100), (0, 10, 3), (5, 7, 9), (0, 9, 3)])
@@ -54,7 +54,7 @@ def test_events_are_counted_for_any_schedule(start: int, stop: int, every: int) 
     growing = Growing(start, stop, every)
     due = [step for step in range(stop + 50) if growing.due(step)]
     assert growing.events() == max(1, len(due))
-    assert [growing.share(step) for step in due] == [(i + 1) / len(due) for i in range(len(due))]
+    assert [growing.passed(step) for step in due] == [(i + 1) / len(due) for i in range(len(due))]
 
 
 def test_the_curve_of_a_budget_by_hand() -> None:

@@ -119,7 +119,7 @@ class Adaptive:
         event, remove what is not worth the price."""
         grew = not self.ended(model.table)
         found = self.tried(model, undone, step)
-        last = self.growing.share(step) == 1
+        last = self.growing.passed(step) == 1
         ends = grew and (last or self.ended(model.table))
         found |= self.without_idle_levels(model, step) if ends else {}
         found |= self.removed(model, step) if last or ends else {}
@@ -237,7 +237,7 @@ class Adaptive:
 
     def asked(self, table: ParameterTable, step: int) -> int:
         """How many an event may add if no cap holds it; none at the last one, which nothing would judge."""
-        over = self.ended(table) or self.growing.share(step) == 1
+        over = self.ended(table) or self.growing.passed(step) == 1
         return 0 if over else max(1, round(self.share(table) * len(table)))
 
     def plan(self) -> dict[str, Any]:

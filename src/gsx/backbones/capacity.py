@@ -46,7 +46,7 @@ class Growing:
         """How often it acts, at least once."""
         return max(1, (self.stop - 1) // self.every - self.start // self.every)
 
-    def share(self, step: int) -> float:
+    def passed(self, step: int) -> float:
         """How much of the events is over after the one at a step, from 0 to 1."""
         return min(1.0, max(0.0, (step // self.every - self.start // self.every) / self.events()))
 
@@ -169,7 +169,7 @@ class Budget(Cap):
 
     def target(self, first: int, step: int) -> int:
         """How many there may be after the event of a step, of a model that began with `first`."""
-        return math.floor(first + (self.most - first) * self.growing.share(step) ** self.options.power)
+        return math.floor(first + (self.most - first) * self.growing.passed(step) ** self.options.power)
 
     def plan(self) -> dict[str, Any]:
         """The number."""
