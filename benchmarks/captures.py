@@ -260,7 +260,7 @@ def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Names
     """Figures of a run by both protocols of colours, and what it found of distractors."""
     steps = round(given.share * steps_among(SUBJECTS[scene]))
     words = [*OWN, *arms[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    folder = trained(scene, seed, given, words, arm)
+    folder = trained(scene, seed, given, words, f"distractors {arm}")
     evaluation = read_json(folder / "evaluation.json")
     return {
         "rendered": evaluation["zoom"],

@@ -169,12 +169,18 @@ def test_the_base_layer_has_cells_of_whole_pixels(pixels, base):
     assert derive(points, [camera_at(0, 0, 9)], replace(options, base_layer=0), 0).base_layer == 0
 
 
-def test_cells_are_as_many_pixels_on_every_level():
-    """Measured where each level is drawn from the farthest."""
-    levels = single(count=4)
-    for level in range(4):
-        farthest = levels.farthest / 2**level
-        assert levels.size(level) * 50 / farthest == pytest.approx(levels.pixels_per_cell)
+@pytest.mark.parametrize(
+    ("mode", "least", "most"), [("floor", 1.0, 1.0), ("round", 2**-0.5, 2**-0.5), ("ceil", 0.5, 0.5)]
+)
+def test_cells_in_pixels_where_a_level_is_drawn_first(mode, least, most):
+    """Against a search for the farthest distance at which a camera draws each level."""
+    levels, camera = single(count=4, mode=mode), camera_at(0, 0, 0)
+    distances = torch.linspace(0.2, 9, 20000).tolist()
+    highest = tops(levels, camera, distances)
+    for level in range(1, 4):
+        farthest = max(d for d, top in zip(distances, highest, strict=True) if top >= level)
+        pixels = levels.size(level) * 50 / farthest / levels.pixels_per_cell
+        assert pixels == pytest.approx(share, rel=0.01)
 
 
 @given(st.floats(-1e4, 1e4), st.floats(1e-2, 1e3))

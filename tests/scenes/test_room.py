@@ -73,3 +73,13 @@ def test_the_walls_are_plain_in_the_shade() -> None:
     assert len(plain) == 4
     for thing in plain:
         assert torch.equal(thing.texture(local, local, made.kit), torch.tensor(room.PLASTER)[:, None].expand(3, 50))
+
+
+def test_somebody_stands_in_the_room_before_every_camera(options: DemoOptions) -> None:
+    """Not behind a wall: each photograph shows them, but for what hides them."""
+    walked, empty = room.load(replace(options, passer_by=True)), room.load(options)
+    for view, without in zip(walked.train, empty.train, strict=True):
+        assert ((view.image() - without.image()).abs().amax(0) > 0.03).float().mean() > 0.02
+        centre = view.source.life.solids[-1].centre
+        assert abs(float(centre[0])) < room.HALF[0]
+        assert abs(float(centre[1])) < room.HALF[1]

@@ -46,7 +46,7 @@ class LevelOptions:
     coarse_factor: Annotated[float, Range(1, 1000)]
     """Each interval between two levels is this much shorter than the one before (Octree-GS, set_coarse_interval)."""
     cell_pixels: Annotated[float, Range(0, 1000)] = 0.0
-    """Ours: no cell of the base layer is smaller than so many pixels where it is drawn from the farthest; 0: whatever
+    """Ours: no more forks for the base layer than leave its cells so many pixels at the farthest; 0: whatever
     base_layer and voxel say. The default: runs older than this option."""
 
     def __post_init__(self) -> None:

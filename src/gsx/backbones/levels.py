@@ -101,8 +101,8 @@ class Levels:
 
     @property
     def pixels_per_cell(self) -> float:
-        """Cell length of a level where it is drawn from the farthest, px of the finest training camera; the same on
-        every level, since cells get smaller as distances do."""
+        """Cell length of level 0 at the farthest, px of the finest training camera; where finer levels are drawn first
+        their cells are as many, or (by mode) down to 1 / fork of that."""
         return self.cell * self.views.focal / self.farthest
 
     def size(self, level: int) -> float:
@@ -205,7 +205,7 @@ def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> 
         chosen = round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
     if not options.cell_pixels:
         return chosen
-    return min(chosen, max(0, math.floor(math.log(box * pixels / options.cell_pixels, options.fork))))
+    return min(chosen, max(0, math.floor(math.log(box * pixels / options.cell_pixels, options.fork) + 1e-9)))
 
 
 def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.quality.distractors import BLOCK, LEAST, TIMES, Difference, difference_of, distractors_in, whole_of
+from gsx.core.training.captures import at_exposure
 
 SIZE = 64, 48
 
@@ -98,10 +99,33 @@ def test_before_an_empty_background_directions_tell() -> None:
     assert sum(int(marked.sum()) for marked in found) == int(found[2].sum())
 
 
-def test_another_exposure_is_no_distractor() -> None:
+@pytest.mark.parametrize("gain", [0.7, 1.5])
+def test_another_exposure_is_no_distractor_and_hides_none(gain: float) -> None:
+    """Saturated where that is bright; something dark stands in it."""
+    pictures = []
+    for number, (camera, photograph) in enumerate(zip(cameras(), noisy(), strict=True)):
+        taken = (photograph * gain).clamp(0, 1) if number == 2 else photograph
+        if number == 2:
+            taken[:, 12:24, 20:40] = 0.05
+        image, depth = shown(camera)
+        image = at_exposure(image, taken, None)
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken))
+    found = distractors_in(pictures)
+    assert torch.equal(found[2], blocks(slice(12, 24), slice(20, 40)))
+    assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
+
+
+def test_what_masks_leave_out_says_nothing_of_the_rest() -> None:
+    """Most of the picture is masked, and differs."""
     photographs = noisy()
-    photographs[3] += 0.3
-    assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)))
+    counted = torch.zeros(48, 64, dtype=torch.bool)
+    counted[:, :24] = True
+    for photograph in photographs:
+        photograph[:, ~counted] = 0.0
+    photographs[2][:, 12:24, 4:20] = 0.95
+    found = distractors_in(seen(photographs, counted))
+    assert torch.equal(found[2], blocks(slice(12, 24), slice(4, 20)))
+    assert sum(int(marked.sum()) for marked in found) == int(found[2].sum())
 
 
 @pytest.mark.parametrize(("noise", "step", "found"), [(0.0, 0.8, False), (0.0, 1.2, True), (0.3, 1.2, False)])

@@ -14,6 +14,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import patch_of
 from gsx.core.data.scene import View
 from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed
+from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 
@@ -69,6 +70,32 @@ def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> N
     assert obstructed(views()[1], marks()[1]).counted() is None
 
 
+@pytest.mark.parametrize(("width", "height"), [(67, 71), (131, 97)])
+def test_blocks_are_whole_pixels_and_the_last_take_the_rest(width: int, height: int) -> None:
+    """Of pictures that blocks of 4 px do not divide."""
+    camera = views()[0].camera.resize(width, height)
+    view = View("a", camera, Grey())
+    marked = torch.zeros(height // 4, width // 4, dtype=torch.bool)
+    marked[-2:, 3] = marked[2, -1] = True
+    expected = torch.ones(height, width, dtype=torch.bool)
+    expected[(height // 4 - 2) * 4 :, 12:16] = False
+    expected[8:12, (width // 4 - 1) * 4 :] = False
+    assert torch.equal(obstructed(view, marked).counted(), expected)
+
+
+class CutOutGrey(Grey):
+    """Transparent everywhere."""
+
+    def transparent(self, camera: Camera) -> Tensor:
+        return torch.ones(camera.height, camera.width, dtype=torch.bool)
+
+
+def test_what_is_transparent_stays_so() -> None:
+    view = replace(views()[0], source=CutOutGrey())
+    assert bool(obstructed(view, marks()[0]).transparent().all())
+    assert obstructed(views()[0], marks()[0]).transparent() is None
+
+
 class HalfMasked(Grey):
     """Of which the left half does not count."""
 
@@ -79,7 +106,7 @@ class HalfMasked(Grey):
 def test_masks_of_the_scene_hold_beside_them() -> None:
     source, marked = HalfMasked(), torch.zeros(4, 6, dtype=torch.bool)
     marked[0] = True
-    counted = Obstructed(source=source, marked=marked).counted(views()[0].camera)
+    counted = Obstructed(source=source, marked=marked, size=(24, 16)).counted(views()[0].camera)
     expected = torch.zeros(16, 24, dtype=torch.bool)
     expected[4:, 12:] = True
     assert torch.equal(counted, expected)
@@ -135,6 +162,14 @@ def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photog
         others += int((out & ~there).sum())
     assert found > 0.4 * covered
     assert others < found / 3
+
+
+def test_a_stop_between_finding_and_the_step_is_told_as_far_as_it_is_known() -> None:
+    lines = [{"step": 7, "distractors": 0.05, "distractor_seconds": 1.0}, {"step": 9, "loss": 1.0}]
+    assert gathered(lines)["distractors"] == {"step": 7, "share": None, "marked": [0.05], "seconds": 1.0}
+    assert "5.0% of the pixels" in " ".join(remarks_of(gathered(lines)))
+    poses = gathered([{"step": 7, "poses": 6, "pose_motion": 0.2, "pose_seconds": 1.0}])
+    assert "corrected" in " ".join(remarks_of(poses))
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:

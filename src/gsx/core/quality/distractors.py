@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
 from gsx.core.data.camera import Camera
 from gsx.core.shapes import Bool, Float
@@ -43,7 +43,7 @@ class Difference:
     camera: Camera
     """Whose pixels are the blocks."""
     size: Float[Tensor, "h w"]
-    """Of the mean difference, largest over channels, less what all of the photograph differs by; display values."""
+    """Of the mean difference, largest over channels; display values."""
     depth: Float[Tensor, "h w"]
     """Camera z, scene units; inf where nothing is."""
     counted: Bool[Tensor, "h w"]
@@ -58,27 +58,28 @@ def difference_of(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None = None,
 ) -> Difference:
-    """Of a render and a photograph; depth: blending-weighted sum of camera z, scene units, as the rasterizer has it."""
-    width, height = (side // BLOCK for side in camera.size)
-    blocks = camera.crop(0, 0, width * BLOCK, height * BLOCK).resize(width, height)
-    off, weight, z = (avg_pool2d(values[None], BLOCK)[0] for values in (photograph - image, alpha[None], depth[None]))
-    off = off - off.flatten(1).median(1).values[:, None, None]
-    seen = weight[0] > COVERED
-    whole = torch.ones(height, width, dtype=torch.bool)
-    if counted is not None:
-        whole = avg_pool2d(counted[None].float(), BLOCK)[0] == 1
+    """Of a render at the exposure of a photograph, and that; depth: blending-weighted sum of camera z, scene units, as
+    the rasterizer has it."""
+    width, height = (max(1, side // BLOCK) for side in camera.size)
+
+    def by_block(values: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        return adaptive_avg_pool2d(values[None], (height, width))[0]
+
+    off, weight, z = by_block(photograph - image), by_block(alpha[None])[0], by_block(depth[None])[0]
+    everything = torch.ones(height, width, dtype=torch.bool)
+    whole = everything if counted is None else by_block(counted[None].float())[0] == 1
     return Difference(
-        camera=blocks,
+        camera=camera.resize(width, height),
         size=off.abs().amax(0) * whole,
-        depth=torch.where(seen, z[0] / weight[0].clamp_min(COVERED), torch.inf),
+        depth=torch.where(weight > COVERED, z / weight.clamp_min(COVERED), torch.inf),
         counted=whole,
     )
 
 
 def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"]]:
     """Which blocks of each photograph show a distractor."""
-    usual = torch.cat([one.size[one.counted] for one in differences]).median()
-    least = max(LEAST, TIMES * float(usual))
+    counted = torch.cat([one.size[one.counted] for one in differences])
+    least = max(LEAST, TIMES * float(counted.median())) if len(counted) else LEAST
     centres = torch.stack([one.camera.centre.double() for one in differences])
     found = []
     for number, own in enumerate(differences):

@@ -13,7 +13,9 @@ from gsx.core.data.scene import View
 from gsx.core.quality.alignment import aligned, usual_depth
 from gsx.core.quality.distractors import Difference, difference_of, distractors_in
 from gsx.core.rasterizer import TiledRendering
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.distractors import share_of
+from gsx.core.training.exposure import log_gains
 from gsx.core.training.poses import spread_of_shifts
 from gsx.core.training.render import render
 from gsx.core.training.resolution import coarser
@@ -99,6 +101,7 @@ def judge_distractors(run: Run) -> dict[str, float]:
         shown = 100 * told["distractor_share"]
         logger.info("step %d: %.1f %% of photographs show what others do not: %s", run.step + 1, shown, verdict)
         if not needed:
+            distractors.mark(None, run.step + 1)
             return told | {"distractors": 0, "distractor_seconds": round(time.perf_counter() - begun, 3)}
     told["distractors"] = distractors.mark(distractors_in(list(differences(run, views))), run.step + 1)
     logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
@@ -111,8 +114,17 @@ def differences(run: Run, views: Sequence[View]) -> Iterator[Difference]:
         run.refuse_if_stopping()
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
-        image = run.exposures.applied(shown.image, view.name).detach().cpu()
-        yield difference_of(small.camera, image, shown.depth, shown.alpha, small.image(), small.counted())
+        photograph, counted = small.image(), small.counted()
+        image = at_exposure(run.exposures.applied(shown.image, view.name).detach().cpu(), photograph, counted)
+        yield difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
+
+
+def at_exposure(
+    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+) -> Float[Tensor, "3 H W"]:
+    """A render, as bright in each channel as its photograph; saturated as that is."""
+    gains = log_gains(image, photograph, counted).nan_to_num(0.0).exp()
+    return (gains[:, None, None] * image).clamp(0, 1)
 
 
 def seen_smaller(run: Run, view: View) -> tuple[View, TiledRendering]:

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import FromFile, ImageSource, Masked, View
+from gsx.core.data.scene import CutOut, FromFile, ImageSource, Masked, View
 from gsx.core.ranges import Range, Share
-from gsx.core.shapes import Bool, UInt8
+from gsx.core.shapes import Bool, Int, UInt8
 from gsx.core.training.occasions import WHEN, occasions, some_photographs
 
 
@@ -54,7 +54,9 @@ class Obstructed:
 
     source: ImageSource
     marked: Bool[Tensor, "h w"]
-    """Which, on a raster of its own over the whole frame."""
+    """Which, in blocks of whole pixels of the photograph; the last ones take what is left over."""
+    size: tuple[int, int]
+    """(width, height) of that, px."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """That of the source."""
@@ -66,9 +68,16 @@ class Obstructed:
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """What counts of the source, and shows no distractor."""
-        left = ~self.marked[rows_of(camera, self.marked.shape[0])[:, None], columns_of(camera, self.marked.shape[1])]
+        (height, width), frame = self.marked.shape, camera.frame
+        down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
+        across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
+        left = ~self.marked[down[:, None], across]
         own = self.source.counted(camera) if isinstance(self.source, Masked) else None
         return left if own is None else left & own
+
+    def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """What the source shows of the background alone."""
+        return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,24 +91,20 @@ class ObstructedFile(Obstructed):
         return self.source.path
 
 
-def rows_of(camera: Camera, count: int) -> Tensor:
-    """In which of so many rows over the whole frame each row of the camera's pixels lies."""
-    frame = camera.frame
-    return ((torch.arange(camera.height) + 0.5 + frame.top) / frame.height * count).long().clamp(0, count - 1)
-
-
-def columns_of(camera: Camera, count: int) -> Tensor:
-    """The same of columns."""
-    frame = camera.frame
-    return ((torch.arange(camera.width) + 0.5 + frame.left) / frame.width * count).long().clamp(0, count - 1)
+def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
+    """In which of so many blocks along an axis of a photograph of that size pixels lie: `count` from the `first` of a
+    frame on, which is the photograph in so many pixels."""
+    places = (torch.arange(count) + 0.5 + first) / frame * size
+    return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
 
 
 def obstructed(view: View, marked: Bool[Tensor, "h w"]) -> View:
     """The view without what is marked; itself where nothing is."""
     if not bool(marked.any()):
         return view
+    frame = view.camera.frame
     kind = ObstructedFile if isinstance(view.source, FromFile) else Obstructed
-    return replace(view, source=kind(source=view.source, marked=marked))
+    return replace(view, source=kind(source=view.source, marked=marked, size=(frame.width, frame.height)))
 
 
 @dataclass(eq=False)

@@ -77,20 +77,21 @@ def judged_poses(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     told = [line for line in lines if "pose_seconds" in line]
     if not told:
         return {}
-    first = {"step": told[0]["step"], "spread": told[0]["pose_spread"], "corrected": told[0]["poses"]}
+    first = {"step": told[0]["step"], "spread": told[0].get("pose_spread"), "corrected": told[0]["poses"]}
     motions = [line["pose_motion"] for line in told if "pose_motion" in line]
     return first | {"motions": motions, "seconds": sum(line["pose_seconds"] for line in told)}
 
 
 def judged_distractors(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """At which step distractors were judged, of which share of some photographs, which share of all does not count,
-    each time that was found, and seconds of it all."""
+    """At which step distractors were judged, of which share of some photographs, which share of all pixels does not
+    count, each time that was found, and seconds of it all. A stop before the step was taken loses what was told."""
     told = [line for line in lines if "distractor_seconds" in line]
     if not told:
         return {}
-    marked = [line["distractors"] for line in told if line["distractors"]]
+    marked = [line["distractors"] for line in told] if any(line["distractors"] for line in told) else []
+    shares = [line["distractor_share"] for line in told if "distractor_share" in line]
     seconds = sum(line["distractor_seconds"] for line in told)
-    return {"step": told[0]["step"], "share": told[0]["distractor_share"], "marked": marked, "seconds": seconds}
+    return {"step": told[0]["step"], "share": (shares or [None])[0], "marked": marked, "seconds": seconds}
 
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -151,8 +152,9 @@ def pose_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     """Poses that were corrected: test views have those of the scene."""
     found = evaluation.get("poses") or {}
     if found.get("corrected"):
+        beside = "beside the model" if found["spread"] is None else f"{found['spread']:.2f} px beside the model"
         yield (
-            f"training photographs lay {found['spread']:.2f} px beside the model, their poses are corrected from step "
+            f"training photographs lay {beside}, their poses are corrected from step "
             f"{found['step']:,} on: those of test views are the scene's; eval.poses=aligned looks past that"
         )
 
@@ -162,8 +164,8 @@ def distractor_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     found = evaluation.get("distractors") or {}
     if found.get("marked"):
         yield (
-            f"{found['marked'][-1]:.1%} of training photographs show what others do not, and do not count from step "
-            f"{found['step']:,} on"
+            f"{found['marked'][-1]:.1%} of the pixels of training photographs show what others do not, and do not "
+            f"count from step {found['step']:,} on"
         )
 
 

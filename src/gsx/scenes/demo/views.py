@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -212,19 +212,15 @@ def photographed(
     made_by = version, options.samples
     cache = ImageCache(int(options.cache_gb * 1e9))
 
-    def still(_: str, camera: Camera) -> DemoSource:
-        folder = cache_folder(name, content_key(*made_by))
-        return DemoSource(life=life, own=camera, samples=options.samples, cache=cache, folder=folder)
-
-    def walked_through(view: str, camera: Camera) -> DemoSource:
-        folder = cache_folder(name, content_key(*made_by, "passer by", view))
-        seen = with_passer_by(life, camera, view, floor)
+    def source(view: str, camera: Camera, somebody: bool) -> DemoSource:
+        seen = with_passer_by(life, camera, view, floor) if somebody else life
+        folder = cache_folder(name, content_key(*made_by, "passer by", view) if somebody else content_key(*made_by))
         return DemoSource(life=seen, own=camera, samples=options.samples, cache=cache, folder=folder)
 
     return Scene(
         name=options.name,
-        train=make_views("train", train, walked_through if options.passer_by else still),
-        test=make_views("test", test, still),
+        train=make_views("train", train, partial(source, somebody=options.passer_by)),
+        test=make_views("test", test, partial(source, somebody=False)),
         points=points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
         background=torch.tensor(options.background),
         extent=extent_of(train),
