@@ -169,10 +169,8 @@ def test_the_base_layer_has_cells_of_whole_pixels(pixels, base):
     assert derive(points, [camera_at(0, 0, 9)], replace(options, base_layer=0), 0).base_layer == 0
 
 
-@pytest.mark.parametrize(
-    ("mode", "least", "most"), [("floor", 1.0, 1.0), ("round", 2**-0.5, 2**-0.5), ("ceil", 0.5, 0.5)]
-)
-def test_cells_in_pixels_where_a_level_is_drawn_first(mode, least, most):
+@pytest.mark.parametrize(("mode", "share"), [("floor", 1.0), ("round", 2**-0.5), ("ceil", 0.5)])
+def test_cells_in_pixels_where_a_level_is_drawn_first(mode, share):
     """Against a search for the farthest distance at which a camera draws each level."""
     levels, camera = single(count=4, mode=mode), camera_at(0, 0, 0)
     distances = torch.linspace(0.2, 9, 20000).tolist()
