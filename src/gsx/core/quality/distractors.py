@@ -58,8 +58,8 @@ def difference_of(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None = None,
 ) -> Difference:
-    """Of a render at the exposure of a photograph, and that; depth: blending-weighted sum of camera z, scene units, as
-    the rasterizer has it."""
+    """A photograph against a render that is as bright; depth: blending-weighted sum of camera z, scene units, as the
+    rasterizer has it."""
     width, height = (max(1, side // BLOCK) for side in camera.size)
 
     def by_block(values: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:

@@ -91,21 +91,24 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
 def judge_distractors(run: Run) -> dict[str, float]:
     """Whether photographs show distractors, where that is asked first, and find those of all if so; for the line of
     the step."""
-    begun, distractors, told = time.perf_counter(), run.distractors, dict[str, float]()
-    views = run.poses.views(run.scene.train)
-    if run.step + 1 == distractors.first:
-        some = distractors.judged_by(views)
-        told["distractor_share"] = share_of(distractors_in(list(differences(run, some))))
-        needed = distractors.needed(told["distractor_share"])
-        verdict = "they do not count from here on" if needed else "all of them counts"
-        shown = 100 * told["distractor_share"]
-        logger.info("step %d: %.1f %% of photographs show what others do not: %s", run.step + 1, shown, verdict)
-        if not needed:
-            distractors.mark(None, run.step + 1)
-            return told | {"distractors": 0, "distractor_seconds": round(time.perf_counter() - begun, 3)}
-    told["distractors"] = distractors.mark(distractors_in(list(differences(run, views))), run.step + 1)
-    logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
+    begun, views = time.perf_counter(), run.poses.views(run.scene.train)
+    first = run.step + 1 == run.distractors.first
+    told = {"distractor_share": share_of_distractors(run, views)} if first else {}
+    wanted = not first or run.distractors.needed(told["distractor_share"])
+    marked = distractors_in(list(differences(run, views))) if wanted else None
+    told["distractors"] = run.distractors.mark(marked, run.step + 1)
+    if wanted:
+        logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
     return told | {"distractor_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def share_of_distractors(run: Run, views: Sequence[View]) -> float:
+    """Of some of the views."""
+    distractors = run.distractors
+    share = share_of(distractors_in(list(differences(run, distractors.judged_by(views)))))
+    verdict = "they do not count from here on" if distractors.needed(share) else "all of them counts"
+    logger.info("step %d: %.1f %% of photographs show what others do not: %s", run.step + 1, 100 * share, verdict)
+    return share
 
 
 def differences(run: Run, views: Sequence[View]) -> Iterator[Difference]:
