@@ -341,6 +341,30 @@ def test_finest_levels_that_gain_too_little_are_removed(
     assert len(found) == (3 if left == [0] else 4)  # the last one left is not judged
 
 
+@pytest.mark.parametrize(("level", "left"), [(1, [0]), (0, [0, 1])])
+def test_a_level_that_a_render_hardly_shows_is_removed_if_it_is_the_finest(level: int, left: list[int]) -> None:
+    """Two levels of black anchors before photographs that are grey; one of them is nearly transparent."""
+    words = (
+        "levels.count=2",
+        "levels.mode=ceil",
+        "levels.base_layer=2",
+        "levels.coarse_until=0",
+        "levels.visible_threshold=0",
+        "capacity=adaptive",
+    )
+    scene = small_scene(spread(60), torch.zeros(60, 3, dtype=torch.uint8), background=128 / 255)
+    model = small_anchors("octree_gs3d", *words, scene=scene)
+    levels = model.table["level"]
+    assert levels.unique().tolist() == [0, 1]
+    with torch.no_grad():
+        model.table["opacity_logits"].fill_(2.0)
+        model.table["opacity_logits"][levels == level] = -5.0
+        model.table["sh_dc"][levels != level] = 0.0  # grey, as photographs
+    found = model.capacity.without_idle_levels(model, 30000)
+    assert model.table["level"].unique().tolist() == left
+    assert found["gain_of_level_1"] != 0
+
+
 def test_levels_are_judged_when_growth_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once, while no step has seen the windows: at the event that ends growth, or at the last one."""
     scene = small_scene(spread(40))
