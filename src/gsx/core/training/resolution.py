@@ -102,14 +102,10 @@ class Resolution:
         """The training views, as a step sees them, by the poses of the moment, without distractors."""
         times = self.coarse_at(step)
         if times == 1:
-            return self.photographed()
+            return self.distractors.views(self.poses.views(self.scene.train))
         if times not in self.coarse_views:
             self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
         return self.distractors.views(self.poses.views(self.coarse_views[times]))
-
-    def photographed(self) -> Sequence[View]:
-        """The training views at their own resolution, by the poses of the moment, without distractors."""
-        return self.distractors.views(self.poses.views(self.scene.train))
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

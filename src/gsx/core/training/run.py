@@ -209,7 +209,7 @@ class Run:
     @property
     def photographed(self) -> Sequence[View]:
         """The training views at their own resolution, by the poses of the moment, without distractors."""
-        return self.resolution.photographed()
+        return self.distractors.views(self.poses.views(self.scene.train))
 
     @property
     def complete(self) -> bool:
