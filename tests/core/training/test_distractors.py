@@ -45,15 +45,6 @@ def test_auto_asks_for_more_than_the_share_and_always_for_nothing() -> None:
     assert always.needed(0.0)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "told"),
-    [({"when": "on"}, "never, auto, always"), ({"start": 0.0}, "between 0 and 1"), ({"until": 0.05}, "not smaller")],
-)
-def test_wrong_options_are_named(wrong, told: str) -> None:
-    with pytest.raises(ValueError, match=told):
-        DistractorOptions(**wrong)
-
-
 # -- pixels ----------------------------------------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ from gsx.core.data.taken import Taken, posed
 from gsx.core.errors import Stopped
 from gsx.core.quality.alignment import Motion, moved, rotation_by
 from gsx.core.training import trainer
+from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.poses import PoseOptions, Poses, in_moved_world, in_px, spread_of_shifts, without_common
 from gsx.core.training.run import Run, Step
 from gsx.core.training.trainer import view_loss
@@ -65,13 +66,14 @@ def test_auto_asks_for_more_than_the_threshold_and_always_for_nothing() -> None:
     assert always.needed(0.0)
 
 
+@pytest.mark.parametrize("options", [PoseOptions, DistractorOptions])
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [({"when": "on"}, "never, auto, always"), ({"start": 0.0}, "between 0 and 1"), ({"until": 0.05}, "not smaller")],
 )
-def test_wrong_options_are_named(wrong, told: str) -> None:
+def test_wrong_options_are_named(options, wrong, told: str) -> None:
     with pytest.raises(ValueError, match=told):
-        PoseOptions(**wrong)
+        options(**wrong)
 
 
 # -- are they wrong? -----------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import CutOut, FromFile, ImageSource, Masked, View
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Int, UInt8
-from gsx.core.training.occasions import WHEN, occasions, some_photographs
+from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +39,7 @@ class DistractorOptions:
     """Photographs that are judged by, at most."""
 
     def __post_init__(self) -> None:
-        if self.when not in WHEN:
-            raise ValueError(f"training.distractors.when is '{self.when}'; choose from {', '.join(WHEN)}")
-        if not 0 < self.start < 1 or not self.start <= self.until < 1:
-            raise ValueError(
-                f"training.distractors.start is {self.start} and training.distractors.until {self.until}: give shares "
-                "of the steps between 0 and 1, the second one not smaller"
-            )
+        refuse_wrong("distractors", self.when, self.start, self.until)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,7 +111,7 @@ class Distractors:
     """Of each photograph, in order; None: they were not needed."""
     looked: int = 0
     """The last step before which they were found: not again where that step is taken anew."""
-    seen: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
+    seen: MadeOf = field(default_factory=MadeOf)
     """Views that were asked for, and what they are without distractors."""
 
     def steps(self) -> list[int]:
@@ -132,8 +126,7 @@ class Distractors:
 
     def due(self, number: int) -> bool:
         """Whether they are judged or found before this step."""
-        steps = self.steps()
-        return number in steps and number > self.looked and (number == steps[0] or self.marked is not None)
+        return due_at(number, self.steps(), self.looked, self.marked is not None)
 
     def judged_by(self, views: Sequence[View]) -> list[View]:
         """The photographs that it is judged by: the same in every run."""
@@ -147,16 +140,12 @@ class Distractors:
         """The training views, in order, without their distractors; the same ones until others are found."""
         if self.marked is None:
             return views
-        for asked, made in self.seen:
-            if asked is views:
-                return made
-        made = [obstructed(view, marked) for view, marked in zip(views, self.marked, strict=True)]
-        self.seen.append((views, made))
-        return made
+        pairs = zip(views, self.marked, strict=True)
+        return self.seen.views(views, lambda: [obstructed(view, marked) for view, marked in pairs])
 
     def mark(self, marked: Sequence[Bool[Tensor, "h w"]] | None, number: int) -> float:
         """These from a step on; returns their share of the pictures."""
-        self.marked, self.looked, self.seen = marked, number, []
+        self.marked, self.looked, self.seen = marked, number, MadeOf()
         return share_of(marked or [])
 
     def tensors(self) -> dict[str, Tensor]:

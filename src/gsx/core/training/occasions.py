@@ -1,6 +1,7 @@
 """When a run asks what its photographs have wrong, and which of them it asks first."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import torch
 
@@ -17,6 +18,38 @@ def occasions(start: float, until: float, times: int, iterations: int) -> list[i
     last = max(1, times - 1)
     shares = [start * (until / start) ** (number / last) for number in range(times)]
     return sorted({max(1, round(share * iterations)) + 1 for share in shares})
+
+
+def due_at(number: int, steps: Sequence[int], last: int, needed: bool) -> bool:
+    """Whether it asks before a step: of these the first, and where that found a need the others; not again where a step
+    is taken anew. last: the one before which it asked last."""
+    return number in steps and number > last and (number == steps[0] or needed)
+
+
+def refuse_wrong(name: str, when: str, start: float, until: float) -> None:
+    """Raise ValueError for options below `training.NAME` that say nothing of when."""
+    if when not in WHEN:
+        raise ValueError(f"training.{name}.when is '{when}'; choose from {', '.join(WHEN)}")
+    if not 0 < start < 1 or not start <= until < 1:
+        raise ValueError(
+            f"training.{name}.start is {start} and training.{name}.until {until}: give shares of the steps between 0 "
+            "and 1, the second one not smaller"
+        )
+
+
+@dataclass(eq=False)
+class MadeOf:
+    """What was made of training views: the same for the same ones, until it is forgotten."""
+
+    made: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
+
+    def views(self, views: Sequence[View], make: Callable[[], list[View]]) -> list[View]:
+        """What was made of these, or is now."""
+        for asked, made in self.made:
+            if asked is views:
+                return made
+        self.made.append((views, make()))
+        return self.made[-1][1]
 
 
 def some_photographs(views: Sequence[View], count: int, purpose: str) -> list[View]:

@@ -25,7 +25,7 @@ from gsx.core.quality.shifts import shift_of
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.exposure import shared_spread
-from gsx.core.training.occasions import WHEN, occasions, some_photographs
+from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,13 +46,7 @@ class PoseOptions:
     """Photographs that are judged by, at most."""
 
     def __post_init__(self) -> None:
-        if self.when not in WHEN:
-            raise ValueError(f"training.poses.when is '{self.when}'; choose from {', '.join(WHEN)}")
-        if not 0 < self.start < 1 or not self.start <= self.until < 1:
-            raise ValueError(
-                f"training.poses.start is {self.start} and training.poses.until {self.until}: give shares of the steps "
-                "between 0 and 1, the second one not smaller"
-            )
+        refuse_wrong("poses", self.when, self.start, self.until)
 
 
 @dataclass(eq=False)
@@ -67,7 +61,7 @@ class Poses:
     """camera_from_world, rotation and translation; None: those of the scene."""
     corrected: int = 0
     """The last step before which they were: not again where that step is taken anew."""
-    seen: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
+    seen: MadeOf = field(default_factory=MadeOf)
     """Views that were asked for, and what they are by the poses of the moment."""
 
     def steps(self) -> list[int]:
@@ -83,8 +77,7 @@ class Poses:
 
     def due(self, number: int) -> bool:
         """Whether they are judged or corrected before this step."""
-        steps = self.steps()
-        return number in steps and number > self.corrected and (number == steps[0] or self.matrices is not None)
+        return due_at(number, self.steps(), self.corrected, self.matrices is not None)
 
     def judged_by(self, views: Sequence[View]) -> list[View]:
         """The photographs that they are judged by: the same in every run."""
@@ -100,12 +93,8 @@ class Poses:
         """The training views, in order, by the poses of the moment; the same ones until these change."""
         if self.matrices is None:
             return views
-        for asked, made in self.seen:
-            if asked is views:
-                return made
-        made = [posed(view, at(view.camera, matrix)) for view, matrix in zip(views, self.matrices, strict=True)]
-        self.seen.append((views, made))
-        return made
+        pairs = zip(views, self.matrices, strict=True)
+        return self.seen.views(views, lambda: [posed(view, at(view.camera, matrix)) for view, matrix in pairs])
 
     # -- what changes them ---------------------------------------------------------------------------------------------
 
@@ -121,7 +110,7 @@ class Poses:
 
     def take(self, matrices: Float[Tensor, "N 3 4"] | None) -> None:
         """These from now on."""
-        self.matrices, self.seen = matrices, []
+        self.matrices, self.seen = matrices, MadeOf()
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where they are the scene's."""
