@@ -38,6 +38,7 @@ from zoom import (
 
 ZOOMS = ("1", "4")
 OWN = ("backbone=mip_splatting", "backbone.rates.shortened=0.4")
+FITTED = ("eval.colours=fitted",)
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
@@ -79,19 +80,23 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
+def figures(
+    scene: str, seed: int, name: str, wish: Sequence[str], asked: str, given: argparse.Namespace
+) -> dict[str, Any]:
+    """Of a run: as it was evaluated (`own`), seconds of training, and what it found of what photographs have wrong, by
+    the name that evaluation.json has for that."""
+    steps = round(given.share * steps_among(SUBJECTS[scene]))
+    words = [*OWN, *wish, f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
+    folder = trained(scene, seed, given, words, name)
+    evaluation = read_json(folder / "evaluation.json")
+    found = {"folder": folder, "own": evaluation["zoom"], "seconds": evaluation["train_seconds"]}
+    return found | {asked: evaluation.get(asked, {})}
+
+
 def measured(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of colours, and what it found of exposures."""
-    steps = round(given.share * steps_among(SUBJECTS[scene]))
-    words = [*OWN, *ARMS[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    folder = trained(scene, seed, given, words, arm)
-    evaluation = read_json(folder / "evaluation.json")
-    exposures = evaluation.get("exposures", {})
-    return {
-        "asking": exposures.get("seconds", 0.0) / evaluation["train_seconds"],
-        "rendered": evaluation["zoom"],
-        "fitted": looked_at(folder, "fitted", ["eval.colours=fitted"]),
-        "exposures": exposures,
-    }
+    found = figures(scene, seed, arm, ARMS[arm], "exposures", given)
+    return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
 
 
 Found = Sequence[Mapping[str, Any]]
@@ -105,12 +110,13 @@ def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     spreads = [100 * one["exposures"]["spread"] for one in found if one["exposures"]]
     row["spread"] = told(spreads, ".1f") if spreads else ""
     row["learnt"] = f"{sum(one['exposures'].get('learnt', 0) > 0 for one in found)} of {len(found)}"
-    row["asking"] = f"{100 * statistics.mean(one['asking'] for one in found):.1f}" if spreads else ""
+    asking = [100 * one["exposures"].get("seconds", 0.0) / one["seconds"] for one in found]
+    row["asking"] = f"{statistics.mean(asking):.1f}" if spreads else ""
     for zoom in ZOOMS:
         row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
         if arm == "disturbed, auto":
             row[f"back{zoom}"] = told(shares_won([by_arm[name] for name in ARMS], "fitted", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "rendered", zoom), ".2f") for zoom in ZOOMS}
+    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
 
 
 def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
@@ -202,16 +208,8 @@ def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 def posed(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of poses, and what it found of them."""
-    steps = round(given.share * steps_among(SUBJECTS[scene]))
-    words = [*OWN, *POSE_ARMS[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    folder = trained(scene, seed, given, words, f"poses {arm}")
-    evaluation = read_json(folder / "evaluation.json")
-    return {
-        "given": evaluation["zoom"],
-        "aligned": looked_at(folder, "aligned", ["eval.poses=aligned"]),
-        "poses": evaluation.get("poses", {}),
-        "seconds": evaluation["train_seconds"],
-    }
+    found = figures(scene, seed, f"poses {arm}", POSE_ARMS[arm], "poses", given)
+    return found | {"aligned": looked_at(found["folder"], "aligned", ["eval.poses=aligned"])}
 
 
 def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
@@ -228,7 +226,7 @@ def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
         if arm.endswith("px, auto"):
             arms = [by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm)]
             row[f"back{zoom}"] = told(shares_won(arms, "aligned", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "given", zoom), ".2f") for zoom in ZOOMS}
+    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
 
 
 def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
@@ -258,16 +256,8 @@ Arms = Mapping[str, Sequence[str]]
 
 def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of colours, and what it found of distractors."""
-    steps = round(given.share * steps_among(SUBJECTS[scene]))
-    words = [*OWN, *arms[arm], f"iterations={steps}", f"eval.zoom=[{','.join(ZOOMS)}]"]
-    folder = trained(scene, seed, given, words, f"distractors {arm}")
-    evaluation = read_json(folder / "evaluation.json")
-    return {
-        "rendered": evaluation["zoom"],
-        "fitted": looked_at(folder, "fitted", ["eval.colours=fitted"]),
-        "distractors": evaluation.get("distractors", {}),
-        "seconds": evaluation["train_seconds"],
-    }
+    found = figures(scene, seed, f"distractors {arm}", arms[arm], "distractors", given)
+    return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
 
 
 def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
@@ -284,7 +274,7 @@ def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
         if arm == mended:
             arms = [by_arm[name] for name in (best, worst, mended)]
             row[f"back{zoom}"] = told(shares_won(arms, "fitted", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "rendered", zoom), ".2f") for zoom in ZOOMS}
+    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
 
 
 PAST_COLUMNS = [
