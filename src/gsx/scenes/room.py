@@ -21,7 +21,7 @@ from gsx.scenes.demo import textures
 from gsx.scenes.demo.noise import blend
 from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
 from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
-from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, rgb, smoothstep
+from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, plain, rgb, smoothstep
 from gsx.scenes.demo.tracing import rays_through, shade, trace
 from gsx.scenes.demo.views import DemoOptions, check, photographed, scene_version
 
@@ -35,11 +35,6 @@ PLASTER = (0.87, 0.85, 0.81)
 BOARD = 0.16  # width of a floor board
 CONTRAST = 0.04  # of display values between neighbouring pixels: where structure from motion finds points
 TRIES = 5  # rays for each point that is wanted
-
-
-def plaster(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """One colour."""
-    return rgb(PLASTER).expand_as(p)
 
 
 def boards(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
@@ -56,6 +51,7 @@ def boards(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit)
 def walls() -> list[tuple[Solid, Texture, float]]:
     """Floor and four walls."""
     (x, y), z = HALF, HEIGHT / 2
+    plaster = partial(plain, colour=PLASTER)
     return [
         (box("floor", (0.0, 0.0, 0.01), (2 * x, 2 * y, 0.02)), boards, 0.0),
         (box("north", (0.0, y + THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster, 0.0),

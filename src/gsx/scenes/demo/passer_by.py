@@ -13,7 +13,7 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.scenes.demo.solids import Solid, cylinder, sphere
 from gsx.scenes.demo.still_life import StillLife, Texture, arranged
-from gsx.scenes.demo.textures import Kit, rgb
+from gsx.scenes.demo.textures import plain
 from gsx.scenes.demo.tracing import Rays, trace
 
 AHEAD = (1.2, 2.0)
@@ -23,13 +23,6 @@ LEEWAY, LEAST = 0.4, 0.5
 ASIDE = 0.45
 """How far beside the middle of the picture, at most, as a share of that."""
 SKIN, HAIR, COAT, TROUSERS = (0.80, 0.62, 0.52), (0.25, 0.17, 0.12), (0.70, 0.16, 0.14), (0.16, 0.19, 0.30)
-
-
-def plain(
-    p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, colour: tuple[float, float, float]
-) -> Float[Tensor, "3 points"]:
-    """One colour."""
-    return rgb(colour).expand_as(p)
 
 
 def person_at(x: float, y: float, floor: float) -> list[tuple[Solid, Texture, float]]:

@@ -67,6 +67,13 @@ def rgb(colour: tuple[float, float, float]) -> Float[Tensor, "3 1"]:
     return torch.tensor(colour)[:, None]
 
 
+def plain(
+    p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, colour: tuple[float, float, float]
+) -> Float[Tensor, "3 points"]:
+    """One colour."""
+    return rgb(colour).expand_as(p)
+
+
 def between(a: tuple[float, float, float], b: tuple[float, float, float], weight: Tensor) -> Float[Tensor, "3 points"]:
     """From colour `a` at weight 0 to `b` at weight 1."""
     return blend(rgb(a), rgb(b), weight)

@@ -72,7 +72,7 @@ class DemoSource:
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What `camera` sees; a crop gives the very bytes of the picture it is cut from."""
         key = camera_key(camera)
-        return self.cache.get((key, self.samples), lambda: self.picture(camera, self.folder / f"{key}.png"))
+        return self.cache.get((self.folder, key), lambda: self.picture(camera, self.folder / f"{key}.png"))
 
     def picture(self, camera: Camera, path: Path) -> UInt8[Tensor, "3 H W"]:
         """Rendered, or read where an earlier run has rendered it."""
@@ -209,12 +209,12 @@ def photographed(
     train = [camera_at(index / count, *size) for index in range(count)]
     places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
     test = [camera_at(place, *size) for place in places]
-    made_by = version, options.samples
     cache = ImageCache(int(options.cache_gb * 1e9))
 
     def source(view: str, camera: Camera, somebody: bool) -> DemoSource:
         seen = with_passer_by(life, camera, view, floor) if somebody else life
-        folder = cache_folder(name, content_key(*made_by, "passer by", view) if somebody else content_key(*made_by))
+        who = ("passer by", view) if somebody else ()
+        folder = cache_folder(name, content_key(version, options.samples, *who))
         return DemoSource(life=seen, own=camera, samples=options.samples, cache=cache, folder=folder)
 
     return Scene(
