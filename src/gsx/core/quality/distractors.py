@@ -8,6 +8,7 @@ tells). Where others differ there as well it is the model that is wrong.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -48,6 +49,11 @@ class Difference:
     """Camera z, scene units; inf where nothing is."""
     counted: Bool[Tensor, "h w"]
     """Blocks of which all pixels count."""
+
+    @cached_property
+    def size_around(self) -> Float[Tensor, "h w"]:
+        """The largest of each block and those beside it."""
+        return spread(self.size)
 
 
 def difference_of(
@@ -121,7 +127,7 @@ def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Ten
     inside = other.camera.shows(pixels, depths)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(1)
     sees = inside & other.counted[y, x] & (depths < HIDDEN * other.depth[y, x])
-    return sees, spread(other.size)[y, x]
+    return sees, other.size_around[y, x]
 
 
 def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

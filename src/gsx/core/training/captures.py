@@ -91,35 +91,39 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
 def judge_distractors(run: Run) -> dict[str, float]:
     """Whether photographs show distractors, where that is asked first, and find those of all if so; for the line of
     the step."""
-    begun, views = time.perf_counter(), run.poses.views(run.scene.train)
-    first = run.step + 1 == run.distractors.first
-    told = {"distractor_share": share_of_distractors(run, views)} if first else {}
-    wanted = not first or run.distractors.needed(told["distractor_share"])
-    marked = distractors_in(list(differences(run, views))) if wanted else None
-    told["distractors"] = run.distractors.mark(marked, run.step + 1)
+    begun, views, distractors = time.perf_counter(), run.poses.views(run.scene.train), run.distractors
+    seen, told, wanted = dict[View, Difference](), dict[str, float](), True
+    if run.step + 1 == distractors.first:
+        seen = differences(run, distractors.judged_by(views))
+        told["distractor_share"] = share_of(distractors_in(list(seen.values())))
+        wanted = distractors.needed(told["distractor_share"])
+        tell_share(told["distractor_share"], wanted, run.step + 1)
+    if wanted:
+        seen |= differences(run, [view for view in views if view not in seen])
+    marked = distractors_in([seen[view] for view in views]) if wanted else None
+    told["distractors"] = distractors.mark(marked, run.step + 1)
     if wanted:
         logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
     return told | {"distractor_seconds": round(time.perf_counter() - begun, 3)}
 
 
-def share_of_distractors(run: Run, views: Sequence[View]) -> float:
-    """Of some of the views."""
-    distractors = run.distractors
-    share = share_of(distractors_in(list(differences(run, distractors.judged_by(views)))))
-    verdict = "they do not count from here on" if distractors.needed(share) else "all of them counts"
-    logger.info("step %d: %.1f %% of photographs show what others do not: %s", run.step + 1, 100 * share, verdict)
-    return share
+def tell_share(share: float, needed: bool, step: int) -> None:
+    """Log what was found of distractors in some photographs, and what follows."""
+    verdict = "they do not count from here on" if needed else "all of them counts"
+    logger.info("step %d: %.1f %% of photographs show what others do not: %s", step, 100 * share, verdict)
 
 
-def differences(run: Run, views: Sequence[View]) -> Iterator[Difference]:
+def differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
     """Between photographs and what the model shows in their places, smaller."""
+    found = dict[View, Difference]()
     for view in views:
         run.refuse_if_stopping()
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         photograph, counted = small.image(), small.counted()
         image = at_exposure(run.exposures.applied(shown.image, view.name).detach().cpu(), photograph, counted)
-        yield difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
+        found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
+    return found
 
 
 def at_exposure(

@@ -39,7 +39,7 @@ class DistractorOptions:
     """Photographs that are judged by, at most."""
 
     def __post_init__(self) -> None:
-        refuse_wrong("distractors", self.when, self.start, self.until)
+        refuse_wrong("distractors", self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,8 +116,7 @@ class Distractors:
 
     def steps(self) -> list[int]:
         """The steps before which they are found, if there are any, the first of them after that is judged."""
-        own = self.options
-        return [] if own.when == "never" else occasions(own.start, own.until, own.times, self.iterations)
+        return occasions(self.options, self.iterations)
 
     @property
     def first(self) -> int:

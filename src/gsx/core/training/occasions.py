@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -12,11 +13,27 @@ WHEN = ("never", "auto", "always")
 """Whether it does: auto mends what is found, always mends without asking."""
 
 
-def occasions(start: float, until: float, times: int, iterations: int) -> list[int]:
-    """The steps before which it asks so many times, at shares of the steps that grow by the same factor: a model that
-    knows little yet changes most."""
-    last = max(1, times - 1)
-    shares = [start * (until / start) ** (number / last) for number in range(times)]
+@runtime_checkable
+class Asking(Protocol):
+    """Options that say when a run asks."""
+
+    @property
+    def when(self) -> str: ...
+    @property
+    def start(self) -> float: ...
+    @property
+    def until(self) -> float: ...
+    @property
+    def times(self) -> int: ...
+
+
+def occasions(own: Asking, iterations: int) -> list[int]:
+    """The steps before which it asks, at shares of the steps that grow by the same factor: a model that knows little
+    yet changes most; none where it never does."""
+    if own.when == "never":
+        return []
+    last = max(1, own.times - 1)
+    shares = [own.start * (own.until / own.start) ** (number / last) for number in range(own.times)]
     return sorted({max(1, round(share * iterations)) + 1 for share in shares})
 
 
@@ -26,14 +43,14 @@ def due_at(number: int, steps: Sequence[int], last: int, needed: bool) -> bool:
     return number in steps and number > last and (number == steps[0] or needed)
 
 
-def refuse_wrong(name: str, when: str, start: float, until: float) -> None:
+def refuse_wrong(name: str, own: Asking) -> None:
     """Raise ValueError for options below `training.NAME` that say nothing of when."""
-    if when not in WHEN:
-        raise ValueError(f"training.{name}.when is '{when}'; choose from {', '.join(WHEN)}")
-    if not 0 < start < 1 or not start <= until < 1:
+    if own.when not in WHEN:
+        raise ValueError(f"training.{name}.when is '{own.when}'; choose from {', '.join(WHEN)}")
+    if not 0 < own.start < 1 or not own.start <= own.until < 1:
         raise ValueError(
-            f"training.{name}.start is {start} and training.{name}.until {until}: give shares of the steps between 0 "
-            "and 1, the second one not smaller"
+            f"training.{name}.start is {own.start} and training.{name}.until {own.until}: give shares of the steps "
+            "between 0 and 1, the second one not smaller"
         )
 
 

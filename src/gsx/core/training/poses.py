@@ -46,7 +46,7 @@ class PoseOptions:
     """Photographs that are judged by, at most."""
 
     def __post_init__(self) -> None:
-        refuse_wrong("poses", self.when, self.start, self.until)
+        refuse_wrong("poses", self)
 
 
 @dataclass(eq=False)
@@ -67,8 +67,7 @@ class Poses:
     def steps(self) -> list[int]:
         """The steps before which poses are corrected, if they are, the first of them after that is judged; none where
         nobody asks."""
-        own = self.options
-        return [] if own.when == "never" else occasions(own.start, own.until, own.times, self.iterations)
+        return occasions(self.options, self.iterations)
 
     @property
     def first(self) -> int:

@@ -72,8 +72,8 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 
 def refuse_shared(training: TrainingOptions, ranks: Ranks) -> None:
     """Raise ConfigError where processes would have to find together what photographs have wrong."""
-    asked = {"exposure": training.exposure.when, "poses": training.poses.when}
-    for key, when in (asked | {"distractors": training.distractors.when}).items():
+    for key in ("exposure", "poses", "distractors"):
+        when = getattr(training, key).when
         if ranks.size > 1 and when != "never":
             raise ConfigError(
                 f"training.{key}.when is '{when}', which is for one process, and {ranks.size} train together: set it "
