@@ -305,6 +305,12 @@ Found by trying: fewer cuts these loops into several that talk through memory, m
 """
 
 
+def thresholds() -> list[str]:
+    """The compiler's options that say when a value is shared: CPUs have one of their own since torch 2.12."""
+    names = ("realize_opcount_threshold", "realize_cpu_opcount_threshold")
+    return [name for name in names if name in torch._inductor.list_options()]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Kernels:
     """The compiled loops of one set of rules."""
@@ -325,11 +331,7 @@ def kernels(rules: Rules) -> Kernels:
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     """`loop` of these rules through torch.compile."""
-    sharing = SHARING.get(loop.__name__, 50)
-    options: dict[str, Any] = WHOLE_LOOPS | {
-        "realize_opcount_threshold": sharing,
-        "realize_cpu_opcount_threshold": sharing,
-    }
+    options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, 50))
     if loop.__name__ in SHARING:
         # no guards on symbols, which are the number of blocks, the same in all arguments, and where in storage a view
         # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one, and 32-bit
