@@ -35,7 +35,8 @@ def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
 
 
 COMPILED = {
-    *(f"gsx.core.rasterizer.{name}" for name in ("kernels", "geometry", "pixel_windows", "selection", "boxes")),
+    *(f"gsx.core.rasterizer.{name}" for name in ("kernels", "segment_kernels", "pixel_windows")),
+    *(f"gsx.core.rasterizer.{name}" for name in ("geometry", "selection", "boxes")),
     *("gsx.core.gaussians.bands", "gsx.core.quality.similarity"),
 }
 """torch.compile must see these functions themselves, not the checks around them."""

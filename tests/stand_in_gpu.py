@@ -4,7 +4,7 @@ Where the host would have to wait for a GPU is counted, as are the kernels that 
 devices in one operation are refused as CUDA refuses them. What would be compiled runs as it stands and counts as one
 launch, though it may be several.
 
-    python tests/stand_in_gpu.py OVERRIDES   # a few steps on the CPU, then there; tells losses and counts as JSON
+    python tests/stand_in_gpu.py [--recorded] OVERRIDES   # a few steps on the CPU, then there; losses and counts as JSON
 """
 
 import json
@@ -26,6 +26,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from gsx.builtin import plugins
 from gsx.core.training.guard import Guard
+from gsx.core.training.parameter_table import ParameterTable, gradients, zero_grad
+from gsx.core.training.recorded import Learnt, Recorder
+from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import build
 from gsx.experiments.runs.load_scene import load_scene
@@ -41,6 +44,8 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
         "_local_scalar_dense"}  # fmt: skip
 """Operations that launch nothing."""
 STEPS = 3
+RECORDED_AFTER = 2
+"""More steps until one is replayed, whatever had to be made room for."""
 
 
 @dataclass
@@ -222,14 +227,53 @@ def stand_in() -> Iterator[Tally]:
         yield tally
 
 
-def steps(words: list[str], device: torch.device, begun: Callable[[], None] = lambda: None) -> list[Tensor]:
-    """Losses of the first steps of a tiny run; `begun` is called before each."""
+class Again:
+    """In place of a CUDA graph: does the work again, and copies what it makes to where it was made first."""
+
+    def __init__(self, work: Callable[[], Learnt], table: ParameterTable, tally: Tally) -> None:
+        self.work, self.table, self.tally, self.made = work, table, tally, work()
+        self.gradients = gradients(table)
+
+    def tensors(self, made: Learnt, found: dict[str, Tensor]) -> list[Tensor]:
+        """All that is read of a recorded step."""
+        rendering, screen = made.rendering, made.rendering.screen
+        moved = [screen.means2d_offset, *([] if screen.absgrad is None else [screen.absgrad])]
+        shown = [made.loss, rendering.image, rendering.alpha, rendering.needed, screen.ids, screen.radii]
+        return [*(value.detach() for value in shown), *(value.grad for value in moved), *found.values()]
+
+    def replay(self) -> None:
+        zero_grad(self.table)
+        waits = sum(self.tally.waits.values())
+        with one_launch(self.tally, "graph"):
+            places = self.tensors(self.made, self.gradients)
+            for place, value in zip(places, self.tensors(self.work(), gradients(self.table)), strict=True):
+                place.copy_(value)
+        assert sum(self.tally.waits.values()) == waits, f"recorded work waits: {+self.tally.waits}"
+
+
+def recording(run: Run, tally: Tally) -> Recorder:
+    """A recorder whose graphs are no graphs."""
+
+    def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
+        again = Again(work, run.backbone.table, tally)
+        return again.made, again
+
+    return Recorder(
+        backbone=run.backbone, raster=run.backbone.raster, ssim_weight=run.training.ssim_weight, record=record
+    )
+
+
+def steps(
+    words: list[str], device: torch.device, begun: Callable[[], None] = lambda: None, tally: Tally | None = None
+) -> list[Tensor]:
+    """Losses of the first steps of a tiny run; `begun` is called before each. `tally`: of steps to be recorded."""
     loaded, losses = plugins(), list[Tensor]()
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
         run = build.build(settings, load_scene(settings), Path(folder), training=True)
+        run.recorder = recording(run, tally) if tally else None
         with loaded.listening([Guard()]):
-            for _ in range(STEPS):
+            for _ in range(STEPS + (RECORDED_AFTER if tally else 0)):
                 begun()
                 losses.append(train_step(run, loaded).loss)
     return losses
@@ -237,11 +281,12 @@ def steps(words: list[str], device: torch.device, begun: Callable[[], None] = la
 
 def main(words: list[str]) -> None:
     """Losses on the CPU and there, and counts of the last step."""
+    recorded, words = "--recorded" in words, [word for word in words if word != "--recorded"]
     own = steps([*words, "rasterizer=eager"], torch.device("cpu"))
     with stand_in() as tally, patch.object(build, "decide", lambda raster, *_: raster):
-        found = steps([*words, "rasterizer=compiled"], DEVICE, tally.begin)
+        found = steps([*words, "rasterizer=compiled"], DEVICE, tally.begin, tally if recorded else None)
         waits, launches = (dict((+of).most_common()) for of in (tally.waits, tally.launches))
-        losses = {"cpu": [float(loss) for loss in own], "device": [float(loss) for loss in found]}
+        losses = {"cpu": [float(loss) for loss in own], "device": [float(loss) for loss in found[: len(own)]]}
     print(json.dumps(losses | {"waits": waits, "launches": launches}, indent=1))
 
 

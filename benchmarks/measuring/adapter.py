@@ -48,7 +48,7 @@ def blend_pairs(
     grid = TileGrid.of(camera, settings.tile_size)
     inputs = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     if settings.path == "compiled":
-        return composite_compiled(*inputs, pairs, grid, settings)[:-1]
+        return composite_compiled(*inputs, pairs, grid, settings)[0][:-1]
     return composite(*inputs, make_blocks(pairs, settings.chunk, len(screen.ids)), grid, settings)[:-1]
 
 

@@ -13,7 +13,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.compiled import available, takes
 from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial
-from gsx.core.rasterizer.scan import parts
+from gsx.core.rasterizer.segments import parts
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
 

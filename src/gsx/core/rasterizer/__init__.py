@@ -3,23 +3,28 @@
 import torch
 
 from gsx.core.rasterizer.batch import rasterize_batch
+from gsx.core.rasterizer.fixed_lists import FixedLists, Needed
 from gsx.core.rasterizer.path import goes_compiled
-from gsx.core.rasterizer.projection import drawable, take_rows
-from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
+from gsx.core.rasterizer.projection import checked_lens, drawable, take_rows
+from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize, rasterize_fixed
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import touches, undilated_radii
 
 __all__ = [
     "TILE_PIXELS",
+    "FixedLists",
+    "Needed",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
     "TiledRendering",
+    "checked_lens",
     "drawable",
     "goes_compiled",
     "rasterize",
     "rasterize_batch",
+    "rasterize_fixed",
     "rasterize_tiled",
     "take_rows",
     "touches",

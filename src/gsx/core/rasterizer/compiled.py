@@ -1,8 +1,7 @@
 """The compiled path: the picture and gradient of composite.py through loops that are compiled once (kernels.py).
 
-Two schedules of the same loops. `chunks`: front to back, one chunk of all groups at a time, and groups whose pixels
-have all ended leave. `segments`: the share of light that passes each block first; an associative scan makes of it the
-transmittance before every block; then all blocks at once. On the way back the scan runs from behind.
+Two schedules of the same mathematics. `chunks`: front to back, one chunk of all groups of tiles at a time, and groups
+whose pixels have all ended leave. `segments`: all blocks of all tiles at once (segments.py).
 """
 
 import functools
@@ -13,21 +12,24 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import available
-from gsx.core.rasterizer.composite import NOTHING
+from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
-from gsx.core.rasterizer.intersections import TileIntersections
+from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
 from gsx.core.rasterizer.path import warn_once
 from gsx.core.rasterizer.precision import Precision
-from gsx.core.rasterizer.scan import before_blocks, behind_blocks, parts
-from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.segments import SegmentComposite, cut, segment_job
+from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
 
 MOST_CHANNELS = 8
 """Channels are unrolled: beyond this number compilation takes longer than it saves."""
 CHECK_EVERY = 4
 """Chunks between looks at which groups have ended."""
+VALUES = {"cpu": 1 << 22}
+VALUES_OF_A_GPU = 1 << 26
+"""Alpha values at once where `compiled_values` leaves it to the device."""
 WORTH_LEAVING = 0.75
 """Groups are picked out when at most this share of them is still going: picking costs a copy."""
 
@@ -61,8 +63,7 @@ class Job:
     rules: Rules
     precision: Precision
     batch: int
-    """Groups, or blocks of segments, worked on at once."""
-    segments: bool
+    """Groups worked on at once."""
 
 
 def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation: torch.dtype, device: str) -> Rules:
@@ -90,7 +91,7 @@ def padded_table(
     """Everything blending needs of each splat in one row, and last a row that draws nothing."""
     table = torch.cat([means, conic_factors, log_opacities[:, None], channels], 1)
     nothing = table.new_zeros(1, table.shape[1])
-    nothing[0, TABLE - 1] = NOTHING
+    nothing[:, TABLE - 1].fill_(NOTHING)  # an assignment might copy the number from the host
     return torch.cat([table, nothing])
 
 
@@ -218,63 +219,7 @@ def chunk_moments(
     return moments
 
 
-# -- segments ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Segments:
-    """What the segment schedule keeps for its way back."""
-
-    passed: Float[Tensor, "S P L"]
-    """Share of light that passes each block."""
-    before: Float[Tensor, "S P L"]
-    """Transmittance in front of each block."""
-    contribution: Float[Tensor, "C_1 S P L"]
-    """What each block adds to the channels and the coverage."""
-
-
-def blend_segments(
-    job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
-) -> tuple[list[Float[Tensor, "G P L"]], Segments]:
-    """Channels and coverage, all blocks at once."""
-    x, y, lanes = job.basis.x, job.basis.y, job.lanes
-    passed = torch.cat([job.loops.fade(rows[part], x, y).to(inside.dtype) for part in parts(len(rows), job.batch)])
-    before = before_blocks(passed, inside, lanes)
-    accumulated = inside.new_zeros(job.rules.channels + 1, len(rows), *inside.shape[1:])
-    scratch = torch.empty_like(before)
-    for part in parts(len(rows), job.batch):
-        job.loops.blend(rows[part], x, y, before[part], scratch[part], [channel[part] for channel in accumulated])
-    total = inside.new_zeros(len(accumulated), *inside.shape)
-    for active, base in zip(lanes.active, lanes.bases, strict=True):
-        total[:, :active].add_(accumulated[:, base : base + active])
-    return list(total.unbind(0)), Segments(passed, before, accumulated)
-
-
-def segment_moments(
-    job: Job, rows: Float[Tensor, "S K F L"], kept: Segments, gradient: list[Float[Tensor, "G P L"]]
-) -> Float[Tensor, "S K V L"]:
-    """Moments of every entry, all blocks at once."""
-    seen = [g[job.lanes.groups] for g in gradient]
-    shine = sum(channel * g for channel, g in zip(kept.contribution, seen, strict=True))
-    own = torch.where(kept.before >= max(job.rules.stop, torch.finfo(kept.before.dtype).tiny), shine / kept.before, 0.0)
-    behind = behind_blocks(kept.passed, own, job.lanes)
-    moments = room_for_moments(job, rows)
-    for part in parts(len(rows), job.batch):
-        seen_here = [g[part] for g in seen]
-        block_moments(job, rows[part], kept.before[part], behind[part], seen_here, moments[part])
-    return moments
-
-
 # -- the autograd function -----------------------------------------------------------------------------------------
-
-
-def sum_by_splat(
-    values: Float[Tensor, "E V"], intersections: TileIntersections, lanes: Lanes, count: int
-) -> Float[Tensor, "M V"]:
-    """Sums over the entries of each splat, always in the same order."""
-    offsets = (intersections.counts.cumsum(0) - intersections.counts).int()
-    sums = torch.nn.functional.embedding_bag(lanes.places, values, offsets, mode="sum")
-    return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 
 class CompiledComposite(torch.autograd.Function):
@@ -286,7 +231,7 @@ class CompiledComposite(torch.autograd.Function):
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         ones = means.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
         inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
-        accumulated, kept = (blend_segments if job.segments else blend_chunks)(job, rows, inside)
+        accumulated, kept = blend_chunks(job, rows, inside)
         if any(ctx.needs_input_grad):
             ctx.kept = (job, intersections, len(means), rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
@@ -296,9 +241,9 @@ class CompiledComposite(torch.autograd.Function):
     def backward(ctx, gradient):
         job, intersections, count, rows, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
-        moments = (segment_moments if job.segments else chunk_moments)(job, rows, kept, seen)
+        moments = chunk_moments(job, rows, kept, seen)
         values = job.loops.entry_gradients(rows, moments).mT.flatten(0, 2)
-        total = sum_by_splat(values, intersections, job.lanes, count).to(dtype)
+        total = sum_by_splat(values, intersections, job.lanes.places, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)
@@ -314,11 +259,19 @@ def composite_compiled(
     settings: RasterSettings,
     *,
     absgrad: Float[Tensor, "M 2"] | None = None,
-) -> Float[Tensor, "C_plus_1 H W"]:
-    """What `composite` returns, through compiled loops; `absgrad` as there. There must be a pair."""
+    fixed: FixedLists | None = None,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Int[Tensor, "2"] | None]:
+    """(what `composite` returns, through compiled loops; by segments, how many blocks are needed in all and of one
+    tile). `absgrad` as there. There must be a pair."""
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
-    batch = max(2, settings.compiled_values // (settings.unrolled * settings.tile_size**2 * LANES))
+    values = settings.compiled_values or VALUES.get(means.device.type, VALUES_OF_A_GPU)
+    if settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"):
+        table = padded_table(means, conic_factors, log_opacities, channels)
+        segments, needed = cut(intersections, len(means), settings.unrolled, fixed)
+        work = segment_job(segments, grid, rules, precision, values, means.device)
+        return SegmentComposite.apply(table, absgrad, intersections, work), needed
+    batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
     lanes = lay_out(intersections, len(means), settings.unrolled, batch)
     exact = means.detach().to(precision.exact)
     job = Job(
@@ -330,9 +283,8 @@ def composite_compiled(
         rules=rules,
         precision=precision,
         batch=batch,
-        segments=settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"),
     )
-    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job)
+    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job), None
 
 
 # -- when? --------------------------------------------------------------------------------------------------------

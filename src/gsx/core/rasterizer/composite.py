@@ -20,11 +20,8 @@ from gsx.core.rasterizer.exponent import EXPONENTS, Exponent
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.precision import Precision, power_of_two_above
-from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
-
-NOTHING = -1e4
-"""Log-opacity of the padding behind a tile's list: exp of it is zero in every dtype."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

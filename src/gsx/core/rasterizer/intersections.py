@@ -5,16 +5,18 @@ no candidate is made that is no intersection. Screen splats come nearest first, 
 stable sort by tile keeps them so.
 """
 
+import functools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gsx.core.compiling import fused
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
+from gsx.core.rasterizer.fixed_lists import FixedLists, owners
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.projection import ScreenSplats
@@ -44,6 +46,9 @@ class TileIntersections:
     """How many each of them has."""
     radii: Int[Tensor, "M"]
     """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
+    needed: Int[Tensor, "2"] | None = None
+    """Rows of tiles and pairs that would be needed, where lists have fixed sizes: then behind the pairs are some of
+    padding, of the tile and splat that are one past the last."""
 
 
 def reach_of(settings: RasterSettings) -> float:
@@ -65,21 +70,27 @@ class Boxes:
     """Largest s^2 + r^2 at which alpha is still at least alpha_min; negative: nowhere."""
 
 
+@functools.lru_cache(maxsize=64)
+def raster_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: torch.device) -> Int[Tensor, "2 5"]:
+    """What `boxes` wants to know of a raster."""
+    sides = zip((frame.width, frame.height), (frame.left, frame.top), size, grid.first, grid.shape, strict=True)
+    numbers = [
+        [-(-whole // WINDOW_TILE), at, at + extent, begin, begin + count] for whole, at, extent, begin, count in sides
+    ]
+    return uploaded(torch.tensor(numbers, dtype=torch.int32), device)
+
+
 @torch.no_grad()
 def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Boxes:
     """Boxes of splats on the screen."""
-    grid, frame = TileGrid.of(camera, settings.tile_size), camera.frame
-    sides = zip((frame.width, frame.height), (frame.left, frame.top), camera.size, grid.first, grid.shape, strict=True)
-    raster = [
-        [-(-whole // WINDOW_TILE), at, at + size, begin, begin + count] for whole, at, size, begin, count in sides
-    ]
+    grid = TileGrid.of(camera, settings.tile_size)
     rules = (
         settings.alpha_min,
         grid.tile,
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
-    numbers = uploaded(torch.tensor(raster, dtype=torch.int32), screen.means.device)
+    numbers = raster_numbers(camera.frame, camera.size, grid, screen.means.device)
     given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
     compiled = len(screen.ids) > 1 and compiles(settings, screen.means.device.type)
     *edges, radii, limits = compiled_boxes(*rules)(*given) if compiled else boxes(*given, *rules)
@@ -87,7 +98,9 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> 
 
 
 @torch.no_grad()
-def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
+def intersect_tiles(
+    screen: ScreenSplats, camera: Camera, settings: RasterSettings, fixed: FixedLists | None = None
+) -> TileIntersections:
     """Of every splat with every tile where its alpha may reach alpha_min.
 
     Raises:
@@ -99,13 +112,27 @@ def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettin
     order = torch.argsort(bits, stable=True)
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
     heights, placed, sides, starts = in_order(order, found.first, found.last, *shapes)
-    rank = torch.repeat_interleave(heights, output_size=refuse_too_many(heights, grid, settings))
+    size = fixed.rows if fixed else refuse_too_many(heights, grid, settings)
+    rank = owners(heights, size, fixed is not None)
     given = rank, placed, sides, starts
     compiled = min(len(rank), len(order)) > 1 and compiles(settings, rank.device.type)
     rules = grid.tile, reach_of(settings)
     row, begin, widths = compiled_spans(*rules)(*given) if compiled else spans(*given, *rules)
-    line = torch.repeat_interleave(widths, output_size=refuse_too_many(widths, grid, settings))
-    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, found.radii)
+    radii, needed = found.radii, None
+    if fixed:
+        widths, needed = counted_in_lists(widths, heights)
+    line = owners(widths, fixed.pairs if fixed else refuse_too_many(widths, grid, settings), fixed is not None)
+    if screen.shown is not None:
+        radii = torch.where(screen.shown, radii, 0)
+    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, radii, needed)
+
+
+@fused
+def counted_in_lists(widths: Int[Tensor, "R"], heights: Int[Tensor, "M"]) -> tuple[Int[Tensor, "R"], Int[Tensor, "2"]]:
+    """(widths of the rows of tiles that there are, 0 for those behind them; how many rows there are, and pairs)."""
+    rows = heights.sum()
+    widths = torch.where(torch.arange(widths.shape[0], device=widths.device) < rows, widths, 0)
+    return widths, torch.stack([rows, widths.sum()])
 
 
 @fused
@@ -144,25 +171,45 @@ def sorted_pairs(
     line: Int[Tensor, "P"],
     grid: TileGrid,
     radii: Int[Tensor, "M"],
+    needed: Int[Tensor, "2"] | None,
 ) -> TileIntersections:
     """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile.
 
-    `rank` names the splat of each span, `line` the span of each intersection.
+    `rank` names the splat of each span, `line` the span of each intersection; `needed` is given where some of these are
+    padding.
     """
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
-    tiles, slots = torch.sort(pair_tiles(line, row, begin, widths, columns).to(narrow), stable=True)
+    tiles = pair_tiles(line, row, begin, widths, columns)
+    if needed is not None:
+        tiles = torch.where(torch.arange(len(tiles), device=tiles.device) < needed[1], tiles, columns * rows)
+    tiles, slots = torch.sort(tiles.to(narrow), stable=True)
+    splats = order[rank].index_select(0, line).index_select(0, slots)
+    if needed is not None:
+        splats = torch.where(tiles < columns * rows, splats, len(order))
     counts = torch.zeros_like(order).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
     return TileIntersections(
-        splats=order[rank].index_select(0, line).index_select(0, slots),
+        splats=splats,
         tiles=tiles.int(),
         starts=torch.searchsorted(tiles.int(), edges),
         slots=slots,
         order=order,
         counts=counts,
         radii=radii,
+        needed=needed,
     )
+
+
+def sum_by_splat(
+    values: Float[Tensor, "E V"], intersections: TileIntersections, places: Int[Tensor, "P"], count: int
+) -> Float[Tensor, "count V"]:
+    """Sums over the entries of each splat, always in the same order; `places`: entry of each pair, pairs sorted by
+    splat."""
+    ends = intersections.counts.cumsum(0)
+    offsets = torch.cat([torch.zeros_like(ends[:1]), ends]).clamp_max(len(places)).to(places)
+    sums = torch.nn.functional.embedding_bag(places, values, offsets, mode="sum", include_last_offset=True)
+    return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 
 def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSettings) -> int:

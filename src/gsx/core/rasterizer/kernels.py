@@ -1,13 +1,13 @@
 """The loops of the compiled path, in plain torch: what `torch.compile` turns into one fused loop each.
 
-Every function works on blocks in lanes (see lanes.py): B blocks of K entries, P pixels of a tile, L lanes. The loop
-over the K entries is unrolled; sums over a tile's pixels are the only reductions, so nothing of size [B, K, P, L]
-need outlive a cache. Rules are constants of the compiled code.
+Every function works on B blocks of K entries and the P pixels of a tile: on a CPU in L lanes (see lanes.py), on a GPU
+without, where pixels lie side by side. The loop over the K entries is unrolled; sums over a tile's pixels are the only
+reductions. Rules are constants of the compiled code.
 """
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,8 +86,10 @@ def cut_exp(x: Tensor, rules: Rules) -> Tensor:
     return torch.where(x >= rules.least, value, 0.0)
 
 
-def log_alpha(row: Float[Tensor, "F B 1 L"], x: Float[Tensor, "P 1"], y: Float[Tensor, "P 1"], form: str) -> Tensor:
-    """ln alpha of one entry at every pixel, [B P L]; the columns of a row are those of `make_rows`."""
+def log_alpha(
+    row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], form: str
+) -> Tensor:
+    """ln alpha of one entry at every pixel, [B P *L]; the columns of a row are those of `make_rows`."""
     a, b, c, d, e, log_opacity = row[: ROW - 1]
     if form == "squares":
         s, r = a * x + (b * y + c), d * y + e
@@ -100,54 +102,70 @@ def log_alpha(row: Float[Tensor, "F B 1 L"], x: Float[Tensor, "P 1"], y: Float[T
 
 
 def gaussian(row: Tensor, x: Tensor, y: Tensor, rules: Rules) -> Tensor:
-    """o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max; [B P L]."""
+    """o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max; [B P *L]."""
     row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
     return cut_exp(log_alpha(row, x, y, rules.exponent), rules)
 
 
-def clamped(value: Tensor, row: Float[Tensor, "F B 1 L"]) -> Tensor:
+def clamped(value: Tensor, row: Float[Tensor, "F B 1 *L"]) -> Tensor:
     """min(value, highest), as a selection: cheaper than a minimum that honours NaN."""
     highest = row[ROW - 1].to(value.dtype)
     return torch.where(value > highest, highest, value)
 
 
-def entries(rows: Float[Tensor, "B K F L"]) -> list[Float[Tensor, "F B 1 L"]]:
+def entries(rows: Float[Tensor, "B K F *L"]) -> list[Float[Tensor, "F B 1 *L"]]:
     """The rows of each of the K entries."""
-    return list(rows.permute(1, 2, 0, 3)[:, :, :, None].unbind(0))
+    return list(rows.movedim(0, 2)[:, :, :, None].unbind(0))
 
 
 # -- loops ---------------------------------------------------------------------------------------------------------
 
 
-def blend(
-    rows: Float[Tensor, "B K F L"],
-    x: Float[Tensor, "P 1"],
-    y: Float[Tensor, "P 1"],
-    before: Float[Tensor, "B P L"],
-    after: Float[Tensor, "B P L"],
-    accumulated: list[Float[Tensor, "B P L"]],
+def blended(
+    rows: Float[Tensor, "B K F *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    before: Float[Tensor, "B P *L"],
+    sums: Sequence[Any],
     rules: Rules,
-) -> None:
-    """Blend one block of every group into `accumulated`, the channels and, last, the coverage.
+) -> tuple[Float[Tensor, "B P *L"], list[Tensor]]:
+    """(transmittance behind each block, `sums`, numbers or tensors, with what it adds to the channels and, last, the
+    coverage).
 
-    `before` is the transmittance in front of the block, `after` receives that behind it. It goes on falling below the
-    stop value, so that a pixel that has ended stays ended.
+    Transmittance goes on falling below the stop value, so that a pixel that has ended stays ended.
     """
-    t, sums = before, list(accumulated)
+    t, total = before, list(sums)
     for row in entries(rows):
         alpha = clamped(gaussian(row, x, y, rules), row).to(t.dtype)
         weight = alpha * t
         t = t - weight
         weight = torch.where(t >= rules.stop, weight, 0.0)
-        sums = [sums[c] + weight * row[ROW + c] for c in range(rules.channels)] + [sums[-1] + weight]
+        total = [total[c] + weight * row[ROW + c] for c in range(rules.channels)] + [total[-1] + weight]
+    return t, total
+
+
+def blend(
+    rows: Float[Tensor, "B K F *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    before: Float[Tensor, "B P *L"],
+    after: Float[Tensor, "B P *L"],
+    accumulated: list[Float[Tensor, "B P *L"]],
+    rules: Rules,
+) -> None:
+    """Blend one block of every group into `accumulated`, the channels and, last, the coverage.
+
+    `before` is the transmittance in front of the block, `after` receives that behind it.
+    """
+    t, sums = blended(rows, x, y, before, accumulated, rules)
     after.copy_(t)
     for target, value in zip(accumulated, sums, strict=True):
         target.copy_(value)
 
 
 def fade(
-    rows: Float[Tensor, "B K F L"], x: Float[Tensor, "P 1"], y: Float[Tensor, "P 1"], rules: Rules
-) -> Float[Tensor, "B P L"]:
+    rows: Float[Tensor, "B K F *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], rules: Rules
+) -> Float[Tensor, "B P *L"]:
     """Share of the light that passes each block, without regard to where pixels end."""
     passed = None
     for row in entries(rows):
@@ -158,18 +176,19 @@ def fade(
 
 
 def slopes(
-    rows: Float[Tensor, "B K F L"],
-    x: Float[Tensor, "P 1"],
-    y: Float[Tensor, "P 1"],
-    before: Float[Tensor, "B P L"],
-    behind: Float[Tensor, "B P L"],
-    gradient: list[Float[Tensor, "B P L"]],
+    rows: Float[Tensor, "B K F *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    before: Float[Tensor, "B P *L"],
+    behind: Float[Tensor, "B P *L"],
+    gradient: list[Float[Tensor, "B P *L"]],
     rules: Rules,
-) -> tuple[Float[Tensor, "B K P L"], Float[Tensor, "B K P L"]]:
-    """d loss / d ln alpha and the blending weight of every entry at every pixel.
+) -> tuple[Float[Tensor, "B K P *L"], Float[Tensor, "B K P *L"], Float[Tensor, "B P *L"]]:
+    """d loss / d ln alpha and the blending weight of every entry at every pixel, and what `behind` is in front of the
+    block.
 
-    `behind`, updated in place, is the picture behind the block as seen from there, weighted by the gradient; with it
-    the slope is weight (channels . gradient - behind): no division, and no difference of large sums.
+    `behind` is the picture behind the block as seen from there, weighted by the gradient; with it the slope is weight
+    (channels . gradient - behind): no division, and no difference of large sums.
     """
     kept, t = [], before
     for row in entries(rows):
@@ -187,20 +206,19 @@ def slopes(
             shade = shade + row[ROW + c] * gradient[c]
         out.append(raw_weight * (shade - rest))
         rest = rest + alpha * (shade - rest)
-    behind.copy_(rest)
-    return torch.stack(out[::-1], 1), torch.stack([weight for *_, weight in kept], 1)
+    return torch.stack(out[::-1], 1), torch.stack([weight for *_, weight in kept], 1), rest
 
 
 def sums_of(
-    rows: Float[Tensor, "B K F L"],
-    slope: Float[Tensor, "B K P L"],
-    weight: Float[Tensor, "B K P L"],
-    x: Float[Tensor, "P 1"],
-    y: Float[Tensor, "P 1"],
-    products: Float[Tensor, "3 P 1"],
-    gradient: list[Float[Tensor, "B P L"]],
+    rows: Float[Tensor, "B K F *L"],
+    slope: Float[Tensor, "B K P *L"],
+    weight: Float[Tensor, "B K P *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    products: Float[Tensor, "3 P *one"],
+    gradient: list[Float[Tensor, "B P *L"]],
     rules: Rules,
-) -> Float[Tensor, "B K V L"]:
+) -> Float[Tensor, "B K V *L"]:
     """Sums over a tile's pixels of slope d and weight for every entry.
 
     The V columns: d, d x, d y, d x^2, d x y, d y^2, weight times gradient per channel and, if asked, the absolute
@@ -214,25 +232,26 @@ def sums_of(
 
 
 def moments(
-    rows: Float[Tensor, "B K F L"],
-    x: Float[Tensor, "P 1"],
-    y: Float[Tensor, "P 1"],
-    products: Float[Tensor, "3 P 1"],
-    before: Float[Tensor, "B P L"],
-    behind: Float[Tensor, "B P L"],
-    gradient: list[Float[Tensor, "B P L"]],
-    out: Float[Tensor, "B K V L"],
+    rows: Float[Tensor, "B K F *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    products: Float[Tensor, "3 P *one"],
+    before: Float[Tensor, "B P *L"],
+    behind: Float[Tensor, "B P *L"],
+    gradient: list[Float[Tensor, "B P *L"]],
+    out: Float[Tensor, "B K V *L"],
     rules: Rules,
 ) -> None:
     """What `sums_of` makes of what `slopes` finds, into `out`; `behind` is moved in front of the blocks. Both are loops
     of one call: calls cost, and there are hundreds in a step."""
-    slope, weight = slopes(rows, x, y, before, behind, gradient, rules)
+    slope, weight, rest = slopes(rows, x, y, before, behind, gradient, rules)
+    behind.copy_(rest)
     out.copy_(sums_of(rows, slope, weight, x, y, products, gradient, rules))
 
 
 def absolute_moments(
-    rules: Rules, rows: Float[Tensor, "B K F L"], slope: Float[Tensor, "B K P L"], x: Tensor, y: Tensor
-) -> list[Float[Tensor, "B K L"]]:
+    rules: Rules, rows: Float[Tensor, "B K F *L"], slope: Float[Tensor, "B K P *L"], x: Tensor, y: Tensor
+) -> list[Float[Tensor, "B K *L"]]:
     """Sums over pixels of |d loss / d mean| per axis: minus the slope of ln alpha along x and y."""
     a, b, c, d, e = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
     if rules.exponent == "expanded":
@@ -248,8 +267,8 @@ def absolute_moments(
 
 
 def make_rows(
-    table: Float[Tensor, "N F"], places: Int[Tensor, "S K L"], centre: Float[Tensor, "S 2 1 L"], rules: Rules
-) -> Float[Tensor, "S K F L"]:
+    table: Float[Tensor, "N F"], places: Int[Tensor, "S K *L"], centre: Float[Tensor, "S 2 1 *L"], rules: Rules
+) -> Float[Tensor, "S K F *L"]:
     """What blending reads of every entry. `table`: mean x, mean y, u0, u1, u2, ln opacity, channels of every splat.
 
     The exponent's columns, in tile-centred coordinates, with ln alpha = ln o - ...
@@ -274,8 +293,8 @@ def make_rows(
     return torch.stack([*head, highest, *columns[TABLE:], *tail], 2)
 
 
-def shapes_of(rows: Float[Tensor, "S K F L"], rules: Rules) -> tuple[Tensor, ...]:
-    """(x, y, u0, u1, u2) of every entry, [S K L], its mean counted from the middle of the tile."""
+def shapes_of(rows: Float[Tensor, "S K F *L"], rules: Rules) -> tuple[Tensor, ...]:
+    """(x, y, u0, u1, u2) of every entry, [S K *L], its mean counted from the middle of the tile."""
     columns = rows.unbind(2)
     if rules.exponent == "squares":
         return (*columns[-2:], columns[0], columns[1], columns[3])
@@ -283,8 +302,8 @@ def shapes_of(rows: Float[Tensor, "S K F L"], rules: Rules) -> tuple[Tensor, ...
 
 
 def entry_gradients(
-    rows: Float[Tensor, "S K F L"], moments: Float[Tensor, "S K V L"], rules: Rules
-) -> Float[Tensor, "S K V L"]:
+    rows: Float[Tensor, "S K F *L"], moments: Float[Tensor, "S K V *L"], rules: Rules
+) -> Float[Tensor, "S K V *L"]:
     """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments."""
     x, y, u0, u1, u2 = shapes_of(rows, rules)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y

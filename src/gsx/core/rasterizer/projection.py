@@ -17,11 +17,13 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.path import compiles, goes_compiled
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
-from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
 FOCAL_LIMIT = 1e12
 """No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
+ELSEWHERE = (1.0, 1.0, 1.0, NOTHING, 0.0)
+"""Point, scales, quaternion, ln opacity and colours of what is not shown, where it is projected all the same."""
 Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
 """`geometry`, compiled or not."""
 
@@ -42,8 +44,10 @@ class ScreenSplats:
     log_opacities: Float[Tensor, "M"]
     """Compensated for dilation where the settings ask for it."""
     channels: Float[Tensor, "M C"]
-    dropped: int
+    dropped: int | Int[Tensor, ""]
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
+    shown: Bool[Tensor, "M"] | None = None
+    """Those that the camera may show, where all splats are here: the others draw nothing. None: all of these."""
 
 
 def intrinsics_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
@@ -88,28 +92,36 @@ def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[T
 
 
 def project(
-    splats: Splats, camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    intrinsics: Float[Tensor, "4"] | None = None,
+    lens: Float[Tensor, "16"] | None = None,
 ) -> ScreenSplats:
     """The usable splats in front of the near plane that the camera may show; differentiable in every input.
 
-    `intrinsics` (fx, fy, cx, cy) take the place of the camera's own, in px of its raster.
+    `intrinsics` (fx, fy, cx, cy) take the place of the camera's own, in px of its raster. With `lens`, on the device
+    and checked, the host need not hear how many there are: all splats are projected, those not shown from elsewhere.
 
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
-    intrinsics = intrinsics_of(camera, intrinsics)
-    refuse_unusable(camera, intrinsics, settings.jacobian_margin)
-    intrinsics = on_frame(intrinsics, camera.frame)
-    compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
-    dilation, drawn = settings.dilation, 0.0
-    if not settings.published_dilation:
-        dilation, drawn = settings.dilation_at(float(intrinsics[:2].max().detach()))
+    dilation, drawn = dilations_of(camera, intrinsics, settings)
     points = camera.to_camera(splats.means)
-    numbers = uploaded(lens_of(camera, intrinsics, dilation, settings), points.device)
-    ids, dropped = chosen_rows(*selected(splats, points, numbers, compiled))  # before any division
-    points, scales, quats, log_opacities, channels = (
-        take_rows(values, ids) for values in (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
-    )
+    numbers = uploaded(checked_lens(camera, settings, intrinsics), points.device) if lens is None else lens
+    compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
+    good, shown = selected(splats, points, numbers, compiled)
+    given = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
+    dropped: int | Tensor
+    if lens is None:
+        ids, dropped = chosen_rows(good, shown)  # before any division
+        points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in given)
+    else:
+        ids, dropped = torch.arange(len(splats), device=shown.device), (~good).sum()
+        points, scales, quats, log_opacities, channels = (
+            torch.where(shown.view(-1, *[1] * (values.dim() - 1)), values, elsewhere)
+            for values, elsewhere in zip(given, ELSEWHERE, strict=True)
+        )
     rules = tuple[Any, ...]((dilation, settings.compensate))
     if not settings.published_dilation:  # numbers that differ from camera to camera are no constants of compiled code
         rules = scales.new_full((), dilation), False, scales.new_full((), drawn) if drawn else None
@@ -132,7 +144,31 @@ def project(
         log_opacities=log_opacities if compensation is None else log_opacities + compensation,
         channels=channels,
         dropped=dropped,
+        shown=None if lens is None else shown,
     )
+
+
+def checked_lens(
+    camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
+) -> Float[Tensor, "16"]:
+    """The numbers of a camera's `Lens`, where `intrinsics` may take the place of its own; differentiable in them.
+
+    Raises:
+        InputError: no picture can be taken with the camera's numbers.
+    """
+    dilation, _ = dilations_of(camera, intrinsics, settings)
+    intrinsics = intrinsics_of(camera, intrinsics)
+    refuse_unusable(camera, intrinsics, settings.jacobian_margin)
+    return lens_of(camera, on_frame(intrinsics, camera.frame), dilation, settings)
+
+
+def dilations_of(
+    camera: Camera, intrinsics: Float[Tensor, "4"] | None, settings: RasterSettings
+) -> tuple[float, float]:
+    """(dilation, the dilation that opacities are compensated from or 0), px^2; by `intrinsics` where they are given."""
+    if settings.published_dilation:
+        return settings.dilation, 0.0
+    return settings.dilation_at(camera.focal if intrinsics is None else float(intrinsics[:2].max().detach()))
 
 
 class TakeRows(torch.autograd.Function):

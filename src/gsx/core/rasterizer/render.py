@@ -10,6 +10,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import composite, make_blocks
+from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.pixel_windows import composite_windows
@@ -61,6 +62,8 @@ class Rendering:
     """Splat-tile pairs blended."""
     dropped: int
     """Splats left out because a value of theirs is not finite."""
+    needed: Int[Tensor, "5"] | None = None
+    """The numbers of `Needed`, where lists have fixed sizes: then `intersections` is room, and `dropped` unknown."""
 
 
 def blend(
@@ -81,7 +84,7 @@ def blend(
             screen, inputs[0], channels, intersections, grid, settings, absgrad=absgrad, max_weight=max_weight
         )
     if takes(settings, channels.shape[1], len(intersections.splats), max_weight, means2d_offset.device.type):
-        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
+        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad)[0], None
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
     blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
@@ -127,13 +130,55 @@ def rasterize(
         alpha=alpha,
         depth=blended[count] if depth else None,
         intersections=len(intersections.splats),
-        dropped=screen.dropped,
+        dropped=int(screen.dropped),
         screen=ScreenStatistics(
             ids=screen.ids,
             radii=intersections.radii,
             means2d_offset=means2d_offset,
             absgrad=absgrad,
             max_weights=max_weights,
+            size=camera.size,
+        ),
+    )
+
+
+def rasterize_fixed(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    fixed: FixedLists,
+    *,
+    background: Float[Tensor, "C"],
+    absolute_gradient: bool = False,
+) -> Rendering:
+    """What `rasterize` draws by the segment schedule, and the host waits for nothing; right if `fixed` holds what is
+    needed.
+
+    The camera's pose lies where the splats do. No cap on lists, and pixels are samples.
+    """
+    screen = project(splats, camera, settings, lens=fixed.lens)
+    intersections = intersect_tiles(screen, camera, settings, fixed)
+    means2d_offset = torch.zeros_like(screen.means, requires_grad=True)
+    absgrad = torch.zeros_like(screen.means, requires_grad=True) if absolute_gradient else None
+    inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, screen.channels)
+    grid = TileGrid.of(camera, settings.tile_size)
+    blended, blocks = composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad, fixed=fixed)
+    assert intersections.needed is not None
+    assert blocks is not None
+    dropped = torch.as_tensor(screen.dropped)[None]
+    return Rendering(
+        image=blended[:-1] + (1 - blended[-1]) * background.to(blended)[:, None, None],
+        alpha=blended[-1],
+        depth=None,
+        intersections=fixed.pairs,
+        dropped=0,
+        needed=torch.cat([dropped, intersections.needed, blocks]),
+        screen=ScreenStatistics(
+            ids=screen.ids,
+            radii=intersections.radii,
+            means2d_offset=means2d_offset,
+            absgrad=absgrad,
+            max_weights=None,
             size=camera.size,
         ),
     )

@@ -11,6 +11,9 @@ CUTOFF_SLACK = 1e-3
 WINDOW_TILE = 16
 """Tile edge of the published rasterizer: its 3-sigma windows are whole numbers of these (3D-GS, forward.cu)."""
 
+NOTHING = -1e4
+"""Log-opacity of what draws nothing: exp of it is zero in every dtype."""
+
 CHOICES = {
     "cull": ("published", "tight"),
     "pixel": ("sample", "window"),
@@ -81,8 +84,8 @@ class RasterSettings:
     """Eager path: alpha values evaluated at once; bounds working memory and should fit the CPU's cache."""
     unrolled: Annotated[int, Range(1, 64)] = 8
     """Compiled path: splats composited per step of a tile, unrolled in one loop; compile time grows with it."""
-    compiled_values: Annotated[int, Range(1, LARGEST_BATCH)] = 1 << 22
-    """Compiled path: alpha values evaluated at once."""
+    compiled_values: Annotated[int, Range(0, LARGEST_BATCH)] = 0
+    """Compiled path: alpha values evaluated at once; 0: 2^22 on a CPU, 2^26 on a GPU."""
     max_pairs: Annotated[int, Range(1, 1 << 31)] = 100_000_000
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
     path: str = "eager"
@@ -154,11 +157,11 @@ class RasterSettings:
             raise ValueError(
                 f"rasterizer.tile_size is {self.tile_size}; with cull=published it must divide {WINDOW_TILE}"
             )
-        for name in ("chunk", "batch_values", "unrolled", "compiled_values", "max_pairs"):
+        for name in ("chunk", "batch_values", "unrolled", "max_pairs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"rasterizer.{name} is {getattr(self, name)}; give at least 1")
-        if self.compiled_values > LARGEST_BATCH:
-            raise ValueError(f"rasterizer.compiled_values is {self.compiled_values}; give at most {LARGEST_BATCH}")
+        if not 0 <= self.compiled_values <= LARGEST_BATCH:
+            raise ValueError(f"rasterizer.compiled_values is {self.compiled_values}; give 0 (auto) to {LARGEST_BATCH}")
         if self.tile_cap < 0:
             raise ValueError(f"rasterizer.tile_cap is {self.tile_cap}; give a number of splats, or 0 for no cap")
 

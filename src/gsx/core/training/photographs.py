@@ -40,9 +40,13 @@ class Photographs:
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """What `view.image()` is, on the device."""
+        return self.bytes_of(view).float() / 255.0
+
+    def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:
+        """The photograph, on the device."""
         picture = self.kept.get(view)
         if picture is None:
             picture = uploaded(view.source.image(view.camera), self.device)
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
-        return picture.float() / 255.0
+        return picture

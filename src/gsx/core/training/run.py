@@ -26,6 +26,7 @@ from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
 from gsx.core.training.poses import PoseOptions, Poses
 from gsx.core.training.pseudo_views import Term
+from gsx.core.training.recorded import Recorder
 from gsx.core.training.resolution import Resolution
 
 
@@ -39,6 +40,8 @@ class TrainingOptions:
     checkpoint_every: Interval = without_effect()
     checkpoints_kept: Interval = without_effect()
     test_points: Annotated[int, Range(0, 10**6)] = without_effect()
+    cuda_graphs: bool = without_effect(default=True)
+    """On a GPU steps are recorded and replayed where they can be (`core.training.recorded`): the same results."""
     batch: Annotated[int, Range(1, 10**6)] = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
     supersample: Annotated[int, Range(1, 16)] = 1
@@ -185,6 +188,8 @@ class Run:
     """Lines of metrics.jsonl so far."""
     photograph_bytes: int = 0
     """How many bytes photographs may take on the device (`core.training.photographs`)."""
+    recorder: Recorder | None = None
+    """Takes steps that can be recorded; None: all are launched one by one."""
     photographs: Photographs = field(init=False)
     exposures: Exposures = field(init=False)
     plateau: Plateau = field(init=False)

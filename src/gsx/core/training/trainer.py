@@ -26,6 +26,7 @@ from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
+from gsx.core.training.recorded import Learnt
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -145,6 +146,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     compared with its own render.
     """
     counted, seen = counted_in_loss(run, view, number), list[Observation]()
+    if counted is None and not terms and (learnt := recorded_loss(run, number, view, colour)) is not None:
+        return step_of(run, number, view, learnt)
     target = blacked(run.photographs.of(view), counted)
     divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
@@ -177,6 +180,29 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         loss=loss.detach() + sum(parts.values()),
         terms=named,
         seen=seen,
+        dropped=rendering.dropped,
+    )
+
+
+def recorded_loss(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> Learnt | None:
+    """The view's loss sent back by a recorded step; None where this one cannot be."""
+    alone = run.training.batch == 1 and run.ranks.size == 1
+    plain = run.exposures.matrices is None and run.resolution.supersample_at(number) == 1
+    if run.recorder is None or not (alone and plain):
+        return None
+    return run.recorder.learn(view.camera, run.photographs.bytes_of(view), colour, number)
+
+
+def step_of(run: Run, number: int, view: View, learnt: Learnt) -> Step:
+    """The step that was taken so."""
+    rendering = learnt.rendering
+    return Step(
+        number=number,
+        view=view,
+        target=run.photographs.of(view),
+        rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
+        loss=learnt.loss,
+        seen=[observation(run, learnt.drawn, rendering, number, 1.0)],
         dropped=rendering.dropped,
     )
 

@@ -21,6 +21,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.photographs import room_for_photographs
+from gsx.core.training.recorded import Recorder
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
@@ -172,6 +173,7 @@ def build(
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
         photograph_bytes=room_for_photographs(device) if training else 0,
+        recorder=recorder_of(backbone, settings.training, device) if training else None,
         augmenters=[augmenter for augmenter, _ in augmenters],
         tallies=[tally for _, tally in augmenters],
         idle=settings.idle,
@@ -186,6 +188,16 @@ def build(
 
     run.held_out = held_out if training else None
     return run
+
+
+def recorder_of(backbone: Backbone, training: TrainingOptions, device: torch.device) -> Recorder | None:
+    """What records the steps of a run; None where they are not launched from afar, or not by operations of one kind."""
+    raster = backbone.raster
+    segments = raster.path == "compiled" and raster.schedule in ("auto", "segments")
+    plain = raster.pixel == "sample" and raster.tile_cap == 0 and raster.accumulation in ("float32", "float64")
+    if device.type != "cuda" or not (training.cuda_graphs and segments and plain):
+        return None
+    return Recorder(backbone=backbone, raster=raster, ssim_weight=training.ssim_weight)
 
 
 def build_augmenters(settings: Settings, scene: Scene) -> list[tuple[Augmenter, Tally]]:
