@@ -4,7 +4,7 @@ Where the host would have to wait for a GPU is counted, as are the kernels that 
 devices in one operation are refused as CUDA refuses them. What would be compiled runs as it stands and counts as one
 launch, though it may be several.
 
-    python tests/stand_in_gpu.py [--recorded] OVERRIDES   # a few steps on the CPU, then there; losses and counts as JSON
+    python tests/stand_in_gpu.py [--recorded] OVERRIDES   # steps on the CPU, then there; losses and counts as JSON
 """
 
 import json
@@ -43,9 +43,8 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
         "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "narrow", "diagonal",
         "_local_scalar_dense"}  # fmt: skip
 """Operations that launch nothing."""
-STEPS = 3
-RECORDED_AFTER = 2
-"""More steps until one is replayed, whatever had to be made room for."""
+STEPS, RECORDED = 3, 15
+"""Steps taken, and steps where some are recorded: density control changes the model at the 12th of them."""
 
 
 @dataclass
@@ -238,7 +237,7 @@ class Again:
         """All that is read of a recorded step."""
         rendering, screen = made.rendering, made.rendering.screen
         moved = [screen.means2d_offset, *([] if screen.absgrad is None else [screen.absgrad])]
-        shown = [made.loss, rendering.image, rendering.alpha, rendering.needed, screen.ids, screen.radii]
+        shown = [made.loss, made.facts, rendering.image, rendering.alpha, rendering.needed, screen.ids, screen.radii]
         return [*(value.detach() for value in shown), *(value.grad for value in moved), *found.values()]
 
     def replay(self) -> None:
@@ -264,16 +263,21 @@ def recording(run: Run, tally: Tally) -> Recorder:
 
 
 def steps(
-    words: list[str], device: torch.device, begun: Callable[[], None] = lambda: None, tally: Tally | None = None
+    words: list[str],
+    device: torch.device,
+    count: int = STEPS,
+    begun: Callable[[], None] = lambda: None,
+    recorded: Tally | None = None,
 ) -> list[Tensor]:
-    """Losses of the first steps of a tiny run; `begun` is called before each. `tally`: of steps to be recorded."""
+    """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
+    be recorded."""
     loaded, losses = plugins(), list[Tensor]()
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
         run = build.build(settings, load_scene(settings), Path(folder), training=True)
-        run.recorder = recording(run, tally) if tally else None
+        run.recorder = recording(run, recorded) if recorded else None
         with loaded.listening([Guard()]):
-            for _ in range(STEPS + (RECORDED_AFTER if tally else 0)):
+            for _ in range(count):
                 begun()
                 losses.append(train_step(run, loaded).loss)
     return losses
@@ -282,11 +286,13 @@ def steps(
 def main(words: list[str]) -> None:
     """Losses on the CPU and there, and counts of the last step."""
     recorded, words = "--recorded" in words, [word for word in words if word != "--recorded"]
-    own = steps([*words, "rasterizer=eager"], torch.device("cpu"))
+    own, count = steps([*words, "rasterizer=eager"], torch.device("cpu")), RECORDED if recorded else STEPS
+    words = [*words, "rasterizer=compiled"]
     with stand_in() as tally, patch.object(build, "decide", lambda raster, *_: raster):
-        found = steps([*words, "rasterizer=compiled"], DEVICE, tally.begin, tally if recorded else None)
+        found = {"device": steps(words, DEVICE, count, tally.begin, tally if recorded else None)}
         waits, launches = (dict((+of).most_common()) for of in (tally.waits, tally.launches))
-        losses = {"cpu": [float(loss) for loss in own], "device": [float(loss) for loss in found[: len(own)]]}
+        found |= {"unrecorded": steps(words, DEVICE, count)} if recorded else {}
+        losses = {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()}
     print(json.dumps(losses | {"waits": waits, "launches": launches}, indent=1))
 
 

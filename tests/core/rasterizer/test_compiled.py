@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -10,9 +11,17 @@ import torch
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer import (
+    FixedLists,
+    Needed,
+    RasterSettings,
+    Rendering,
+    checked_lens,
+    rasterize,
+    rasterize_fixed,
+)
 from gsx.core.rasterizer.compiled import available, takes
-from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial
+from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial, thresholds
 from gsx.core.rasterizer.segments import parts
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
@@ -84,6 +93,49 @@ def test_absolute_gradient_is_that_of_the_eager_path() -> None:
     assert (compiled - eager).norm() <= 1e-5 * eager.norm()
 
 
+def learnt_by(draw: Callable[[Splats], Rendering]) -> tuple[Rendering, list[torch.Tensor]]:
+    """(a picture of splats some of which lie behind the camera and one nowhere, its gradients)."""
+    splats = random_splats(300, seed=4)
+    splats.means[:20, 2] -= 20
+    splats.means[20] = torch.nan
+    given = leaves(splats)
+    rendering = draw(given)
+    weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
+    (rendering.image * weights).sum().backward()
+    return rendering, [value.grad for value in vars(given).values() if value.grad is not None]
+
+
+@pytest.mark.parametrize("spare", [1, 400])
+def test_lists_of_fixed_sizes_draw_the_same_bits(spare: int) -> None:
+    camera, rules, black = front_camera(), replace(QUICK, schedule="segments"), torch.zeros(3)
+    usual, slopes = learnt_by(lambda given: rasterize(given, camera, rules, background=black))
+    room = {"rows": 1, "pairs": 1, "blocks": 1, "longest": 1}
+    for _ in range(5):  # what one list lacks hides what the next needs
+        fixed = FixedLists(lens=checked_lens(camera, rules), **room)
+        drawn, others = learnt_by(
+            lambda given, fixed=fixed: rasterize_fixed(given, camera, rules, fixed, background=black)
+        )
+        needed = Needed(*drawn.needed.tolist())
+        if fixed.hold(needed):
+            break
+        room = {name: getattr(needed, name) + spare for name in room}
+    assert fixed.hold(needed)
+    assert (needed.pairs, needed.dropped) == (usual.intersections, usual.dropped) == (usual.intersections, 1)
+    assert torch.equal(drawn.image, usual.image)
+    assert all(torch.equal(one, other) for one, other in zip(slopes, others, strict=True))
+    assert torch.equal(drawn.screen.radii[usual.screen.ids], usual.screen.radii)
+    assert int(drawn.screen.visible.sum()) == int(usual.screen.visible.sum())
+    moved = drawn.screen.means2d_offset.grad
+    assert torch.equal(moved[usual.screen.ids], usual.screen.means2d_offset.grad)
+
+
+def test_the_compilers_options_are_those_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = torch._inductor.list_options()
+    older = [name for name in every if name != "realize_cpu_opcount_threshold"]  # torch 2.11
+    monkeypatch.setattr(torch._inductor, "list_options", lambda: older)
+    assert thresholds() == ["realize_opcount_threshold"]
+
+
 def test_a_crop_is_the_crop_of_the_picture() -> None:
     splats, camera = random_splats(300, seed=4), front_camera()
     whole = rasterize(splats, camera, QUICK).image
@@ -143,7 +195,15 @@ def test_what_goes_the_eager_way() -> None:
 
 BROKEN = """
 import torch
-from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer import (
+    FixedLists,
+    Needed,
+    RasterSettings,
+    Rendering,
+    checked_lens,
+    rasterize,
+    rasterize_fixed,
+)
 from gsx.experiments.runs.rasterizer_path import decide, warm_splats
 from gsx.core.data.camera import look_at
 import logging

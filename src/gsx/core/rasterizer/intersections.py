@@ -111,7 +111,8 @@ def intersect_tiles(
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = torch.argsort(bits, stable=True)
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
-    heights, placed, sides, starts = in_order(order, found.first, found.last, *shapes)
+    heights, placed, sides = in_order(order, found.first, found.last, *shapes)
+    starts = heights.cumsum(0) - heights  # apart: compiled, a long running sum is one of a single group of threads
     size = fixed.rows if fixed else refuse_too_many(heights, grid, settings)
     rank = owners(heights, size, fixed is not None)
     given = rank, placed, sides, starts
@@ -143,21 +144,21 @@ def in_order(
     means: Float[Tensor, "M 2"],
     conic_factors: Float[Tensor, "M 3"],
     limits: Float[Tensor, "M"],
-) -> tuple[Int[Tensor, "M"], Float[Tensor, "6 M"], Int[Tensor, "3 M"], Int[Tensor, "M"]]:
-    """(rows of tiles of every splat, and its shape, sides and first row as `spans` wants them), nearest splats first;
-    none where a box has no columns."""
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "6 M"], Int[Tensor, "3 M"]]:
+    """(rows of tiles of every splat, and its shape and sides as `spans` wants them), nearest splats first; none where a
+    box has no columns."""
     sides = torch.stack([first[1], first[0], last[0], last[1]])[:, order]
     heights = (sides[3] - sides[0]).clamp_min(0) * (sides[2] > sides[1])
     shapes = torch.cat([means.T, conic_factors.T, limits[None]])[:, order]
-    return heights, shapes, sides[:3], heights.cumsum(0) - heights
+    return heights, shapes, sides[:3]
 
 
 @fused
 def pair_tiles(
-    line: Int[Tensor, "P"], row: Int[Tensor, "R"], begin: Int[Tensor, "R"], widths: Int[Tensor, "R"], columns: int
+    line: Int[Tensor, "P"], row: Int[Tensor, "R"], begin: Int[Tensor, "R"], before: Int[Tensor, "R"], columns: int
 ) -> Int[Tensor, "P"]:
-    """Tile of every pair, where pairs of a span follow each other from its column `begin` on."""
-    before = widths.cumsum(0) - widths
+    """Tile of every pair, where pairs of a span follow each other from its column `begin` on, the first of them pair
+    `before`."""
     place = torch.arange(line.shape[0], device=line.device)
     return place + (row * columns + begin - before).index_select(0, line)
 
@@ -180,7 +181,7 @@ def sorted_pairs(
     """
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
-    tiles = pair_tiles(line, row, begin, widths, columns)
+    tiles = pair_tiles(line, row, begin, widths.cumsum(0) - widths, columns)
     if needed is not None:
         tiles = torch.where(torch.arange(len(tiles), device=tiles.device) < needed[1], tiles, columns * rows)
     tiles, slots = torch.sort(tiles.to(narrow), stable=True)

@@ -183,9 +183,9 @@ def slopes(
     behind: Float[Tensor, "B P *L"],
     gradient: list[Float[Tensor, "B P *L"]],
     rules: Rules,
-) -> tuple[Float[Tensor, "B K P *L"], Float[Tensor, "B K P *L"], Float[Tensor, "B P *L"]]:
-    """d loss / d ln alpha and the blending weight of every entry at every pixel, and what `behind` is in front of the
-    block.
+) -> tuple[list[Float[Tensor, "B P *L"]], list[Float[Tensor, "B P *L"]], Float[Tensor, "B P *L"]]:
+    """d loss / d ln alpha of each entry at every pixel, the blending weight of each, and what `behind` is in front of
+    the block.
 
     `behind` is the picture behind the block as seen from there, weighted by the gradient; with it the slope is weight
     (channels . gradient - behind): no division, and no difference of large sums.
@@ -206,7 +206,7 @@ def slopes(
             shade = shade + row[ROW + c] * gradient[c]
         out.append(raw_weight * (shade - rest))
         rest = rest + alpha * (shade - rest)
-    return torch.stack(out[::-1], 1), torch.stack([weight for *_, weight in kept], 1), rest
+    return out[::-1], [weight for *_, weight in kept], rest
 
 
 def sums_of(
@@ -246,7 +246,7 @@ def moments(
     of one call: calls cost, and there are hundreds in a step."""
     slope, weight, rest = slopes(rows, x, y, before, behind, gradient, rules)
     behind.copy_(rest)
-    out.copy_(sums_of(rows, slope, weight, x, y, products, gradient, rules))
+    out.copy_(sums_of(rows, torch.stack(slope, 1), torch.stack(weight, 1), x, y, products, gradient, rules))
 
 
 def absolute_moments(

@@ -7,12 +7,14 @@ varies from tile to tile is read by the tile's number.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsx.core.compiling import WHOLE_LOOPS, sizes_free, with_last
+from gsx.core.gaussians.bands import sum_of_products
 from gsx.core.rasterizer.kernels import Rules, blended, entry_gradients, fade, make_rows, slopes, sums_of, thresholds
 from gsx.core.shapes import Float, Int
 
@@ -26,10 +28,9 @@ def light(
     x: Float[Tensor, "P"],
     y: Float[Tensor, "P"],
     rules: Rules,
-) -> Float[Tensor, "B C_1 P"]:
-    """What each block adds to the channels and, last, to the coverage."""
-    _, sums = blended(rows, x, y, before, [0.0] * (rules.channels + 1), rules)
-    return torch.stack(sums, 1)
+) -> list[Float[Tensor, "B P"]]:
+    """What each block adds to each channel and, last, to the coverage."""
+    return blended(rows, x, y, before, [0.0] * (rules.channels + 1), rules)[1]
 
 
 def passing(
@@ -40,17 +41,14 @@ def passing(
 
 
 def own_picture(
-    lights: Float[Tensor, "B C_1 P"],
+    lights: list[Float[Tensor, "B P"]],
     before: Float[Tensor, "B P"],
     tiles: Int[Tensor, "B"],
     gradient: Float[Tensor, "T C_1 P"],
     rules: Rules,
 ) -> Float[Tensor, "B P"]:
     """What each block shows by itself, as seen from before it, weighted by the gradient of the picture."""
-    channels, by_channel = lights.unbind(1), gradient[tiles].unbind(1)
-    shine = channels[0] * by_channel[0]
-    for channel, by in zip(channels[1:], by_channel[1:], strict=True):
-        shine = shine + channel * by
+    shine = sum_of_products(lights, gradient[tiles].unbind(1))
     return torch.where(before >= max(rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
 
 
@@ -63,15 +61,18 @@ def entry_slopes(
     x: Float[Tensor, "P"],
     y: Float[Tensor, "P"],
     rules: Rules,
-) -> tuple[Float[Tensor, "B K P"], Float[Tensor, "B K P"]]:
-    """`slopes` and weights of every entry at every pixel."""
-    return slopes(rows, x, y, before, behind, list(gradient[tiles].unbind(1)), rules)[:2]
+) -> Float[Tensor, "B 2_K P"]:
+    """`slopes` of every entry at every pixel, then the weights.
+
+    In one tensor: of few entries the compiler would keep what they are made from, and find each in a second walk.
+    """
+    slope, weight, _ = slopes(rows, x, y, before, behind, list(gradient[tiles].unbind(1)), rules)
+    return torch.stack([*slope, *weight], 1)
 
 
 def entry_sums(
     rows: Float[Tensor, "B K F"],
-    slope: Float[Tensor, "B K P"],
-    weight: Float[Tensor, "B K P"],
+    found: Float[Tensor, "B 2_K P"],
     tiles: Int[Tensor, "B"],
     gradient: Float[Tensor, "T C_1 P"],
     x: Float[Tensor, "P"],
@@ -79,7 +80,8 @@ def entry_sums(
     products: Float[Tensor, "3 P"],
     rules: Rules,
 ) -> Float[Tensor, "B K V"]:
-    """`sums_of` of them: apart, because a sum over pixels takes other threads than a walk through a block."""
+    """`sums_of` of what `entry_slopes` found: a sum over pixels takes other threads than a walk through a block."""
+    slope, weight = found.chunk(2, 1)
     return sums_of(rows, slope, weight, x, y, products, list(gradient[tiles].unbind(1)), rules)
 
 
@@ -89,37 +91,31 @@ class SegmentKernels:
 
     make_rows: Callable[..., Tensor]
     passing: Callable[..., Tensor]
-    light: Callable[..., Tensor]
+    light: Callable[..., list[Tensor]]
     own_picture: Callable[..., Tensor]
-    entry_slopes: Callable[..., tuple[Tensor, Tensor]]
+    entry_slopes: Callable[..., Tensor]
     entry_sums: Callable[..., Tensor]
     entry_gradients: Callable[..., Tensor]
 
 
-VARYING: dict[Callable[..., Any], tuple[int, ...]] = {
-    make_rows: (0, 1, 2),
-    passing: (0,),
-    light: (0, 1),
-    own_picture: (0, 1, 2, 3),
-    entry_slopes: (0, 1, 2, 3, 4),
-    entry_sums: (0, 1, 2, 3, 4),
-    entry_gradients: (0, 1),
-}
-"""Arguments whose number of rows varies: blocks, splats or tiles."""
+LOOPS = (make_rows, passing, light, own_picture, entry_slopes, entry_sums, entry_gradients)
+FIXED = {"x", "y", "products"}
+"""Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 
 
 @functools.lru_cache
 def segment_kernels(rules: Rules) -> SegmentKernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks and tiles."""
-    return SegmentKernels(**{loop.__name__: compiled(loop, rules) for loop in VARYING})
+    return SegmentKernels(**{loop.__name__: compiled(loop, rules) for loop in LOOPS})
 
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     """`loop` of these rules through torch.compile."""
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARED_AFTER)
-    places = VARYING[loop]
+    names = [name for name in signature(loop).parameters if name != "rules"]
 
-    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(arguments[place], 0) for place in places]
+    def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
+        given = [value for name, value in zip(names, arguments, strict=True) if name not in FIXED]
+        return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
 
     return sizes_free(torch.compile(with_last(loop, rules), fullgraph=True, options=options), varying)

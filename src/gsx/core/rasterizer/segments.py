@@ -50,7 +50,10 @@ def cut(
 ) -> tuple[Segments, Int[Tensor, "2"]]:
     """(lists in blocks of `chunk`, how many blocks they have in all and at most); `splats` is the number of screen
     splats."""
-    edges, needed, place = block_edges(intersections.starts, intersections.tiles, chunk)
+    counts = torch.div(intersections.starts.diff() + (chunk - 1), chunk, rounding_mode="floor")
+    ends = counts.cumsum(0)
+    edges, needed = torch.cat([torch.zeros_like(ends[:1]), ends]), torch.stack([ends[-1], counts.amax()])
+    place = entry_places(edges, intersections.starts, intersections.tiles, chunk)
     total, most = (fixed.blocks, fixed.longest) if fixed else needed.tolist()
     size = max(LEAST_BLOCKS, total)
     entries, tiles, number, left, places = blocks_of(
@@ -69,16 +72,11 @@ def cut(
 
 
 @fused
-def block_edges(
-    starts: Int[Tensor, "T_1"], tiles: Int[Tensor, "P"], chunk: int
-) -> tuple[Int[Tensor, "T_1"], Int[Tensor, "2"], Int[Tensor, "P"]]:
-    """(first block of each tile and one past the last, blocks in all and of the longest list, entry of each pair).
-    Pairs beyond the lists have no tile: theirs is one past the last."""
-    counts = torch.div(starts.diff() + (chunk - 1), chunk, rounding_mode="floor")
-    ends = counts.cumsum(0)
-    edges = torch.cat([torch.zeros_like(ends[:1]), ends])
-    place = torch.arange(tiles.shape[0], device=tiles.device) + (edges * chunk - starts)[tiles]
-    return edges, torch.stack([ends[-1], counts.amax()]), place
+def entry_places(
+    edges: Int[Tensor, "T_1"], starts: Int[Tensor, "T_1"], tiles: Int[Tensor, "P"], chunk: int
+) -> Int[Tensor, "P"]:
+    """Entry of each pair. Pairs beyond the lists have no tile: theirs is one past the last."""
+    return torch.arange(tiles.shape[0], device=tiles.device) + (edges * chunk - starts)[tiles]
 
 
 def blocks_of(
@@ -218,7 +216,7 @@ class Kept:
     rows: Float[Tensor, "S K F"]
     passed: Float[Tensor, "S P"]
     before: Float[Tensor, "S P"]
-    lights: Float[Tensor, "S C_1 P"]
+    lights: list[Float[Tensor, "S P"]]
 
 
 def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Float[Tensor, "T P C_1"], Kept]:
@@ -229,10 +227,13 @@ def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Floa
     passed = loops.passing(rows, job.x, job.y).to(dtype)
     before = before_blocks(passed, segments)
     lights = loops.light(rows, before, job.x, job.y)
-    blocks = torch.arange(len(lights), device=lights.device)
-    edges = segments.edges.clamp_max(len(lights))
-    tiles = embedding_bag(blocks, lights.flatten(1), edges, mode="sum", include_last_offset=True)
-    return tiles.view(len(tiles), *lights.shape[1:]).mT, Kept(rows, passed, before, lights)
+    return torch.stack([sum_by_tile(light, segments) for light in lights], 2), Kept(rows, passed, before, lights)
+
+
+def sum_by_tile(values: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "T P"]:
+    """Sums over the blocks of each tile."""
+    blocks = torch.arange(len(values), device=values.device)
+    return embedding_bag(blocks, values, segments.edges.clamp_max(len(values)), mode="sum", include_last_offset=True)
 
 
 def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 P"]) -> Float[Tensor, "S K V"]:
@@ -243,8 +244,8 @@ def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 
     found = []
     for part in parts(len(own), job.batch):
         rows, tiles = kept.rows[part], segments.tiles[part]
-        slope, weight = loops.entry_slopes(rows, kept.before[part], behind[part], tiles, gradient, job.x, job.y)
-        found.append(loops.entry_sums(rows, slope, weight, tiles, gradient, job.x, job.y, job.products))
+        slopes = loops.entry_slopes(rows, kept.before[part], behind[part], tiles, gradient, job.x, job.y)
+        found.append(loops.entry_sums(rows, slopes, tiles, gradient, job.x, job.y, job.products))
     return torch.cat(found) if len(found) > 1 else found[0]
 
 
@@ -256,7 +257,7 @@ class SegmentComposite(torch.autograd.Function):
         picture, kept = blend_segments(job, table.to(job.precision.exact))
         if any(ctx.needs_input_grad):
             ctx.kept = (job, intersections, len(table), kept, absgrad is not None)
-        return job.grid.to_raster(picture.contiguous()).to(table.dtype)
+        return job.grid.to_raster(picture).to(table.dtype)
 
     @staticmethod
     def backward(ctx, gradient):

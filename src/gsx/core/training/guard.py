@@ -8,10 +8,12 @@ import logging
 import math
 
 import torch
+from torch import Tensor
 
 from gsx.core.errors import Disagreement, LostModel, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
+from gsx.core.training.recorded import Told
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -63,16 +65,22 @@ class Guard:
 def culprit(run: Run, step: Step) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
     found = gradients(run.backbone.table)
-    loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in found.values())]).tolist()  # one wait
+    loss, sums = step.told or told_now(step, found)
     if not math.isfinite(loss):
         return f"the loss is {loss}"
-    for (name, gradient), total in zip(found.items(), sums, strict=True):
-        if not math.isfinite(total):
+    for name, gradient in found.items():
+        if not math.isfinite(sums[name]):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
             if rows == 0:  # every value is finite, only their sum overflowed
                 continue
             return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
     return None
+
+
+def told_now(step: Step, found: dict[str, Tensor]) -> Told:
+    """The loss and the sums of these gradients: a GPU is waited for once."""
+    loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in found.values())]).tolist()
+    return Told(loss, dict(zip(found, sums, strict=True)))
 
 
 class Agreement:

@@ -9,8 +9,8 @@ its host waits for, and is taken again if not. Pictures and gradients are those 
 
 import logging
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -57,6 +57,17 @@ class Inputs:
         return placed(like, rotation.view(3, 3), translation, centre), lens
 
 
+class Told(NamedTuple):
+    """What the host has heard of a step's gradients."""
+
+    loss: float
+    sums: dict[str, float]
+    """Of the gradient of each parameter that has one."""
+
+
+NEEDED = len(Needed._fields)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Learnt:
     """A render and its loss, sent back: gradients lie where parameters have them."""
@@ -64,6 +75,9 @@ class Learnt:
     drawn: Drawn
     rendering: Rendering
     loss: Float[Tensor, ""]
+    facts: Float[Tensor, "F"]
+    """The numbers of `Needed`, the loss, and the sum of each gradient, float64: what the host is told at once."""
+    told: Told | None = None
 
 
 class Graph(Protocol):
@@ -130,12 +144,12 @@ class Recorder:
             found = self.attempt(way, camera, photograph, background, step)
             if self.broken:
                 return None
-            assert found.rendering.needed is not None
-            needed = Needed(*found.rendering.needed.tolist())
+            facts = found.facts.tolist()
+            needed, (loss, *sums) = Needed(*map(int, facts[:NEEDED])), facts[NEEDED:]
             if self.fits(needed):
-                rendering = found.rendering
-                exact = {"intersections": needed.pairs, "dropped": needed.dropped}
-                return Learnt(drawn=found.drawn, rendering=with_numbers(rendering, **exact), loss=found.loss.clone())
+                exact = replace(found.rendering, intersections=needed.pairs, dropped=needed.dropped)
+                told = Told(loss, dict(zip(gradients(self.backbone.table), sums, strict=True)))
+                return replace(found, rendering=exact, loss=found.loss.clone(), told=told)
             self.make_room(needed)
         zero_grad(self.backbone.table)
         return None
@@ -214,7 +228,10 @@ class Recorder:
         extra = self.backbone.regulariser(drawn)
         loss = loss if extra is None else loss + extra
         loss.backward()
-        return Learnt(drawn=drawn, rendering=rendering, loss=loss.detach())
+        assert rendering.needed is not None
+        sums = torch.stack([loss.detach(), *(slope.sum() for slope in gradients(self.backbone.table).values())])
+        facts = torch.cat([rendering.needed.double(), sums.double()])
+        return Learnt(drawn=drawn, rendering=rendering, loss=loss.detach(), facts=facts)
 
     def lists(self, lens: Float[Tensor, "16"]) -> FixedLists:
         """Lists with the room of the moment."""
@@ -232,8 +249,3 @@ class Recorder:
         self.room = Needed(
             0, max(now.rows, rows), max(now.pairs, pairs), max(now.blocks, blocks), max(now.longest, longest)
         )
-
-
-def with_numbers(rendering: Rendering, intersections: int, dropped: int) -> Rendering:
-    """The rendering with what is known of it now."""
-    return Rendering(**(vars(rendering) | {"intersections": intersections, "dropped": dropped}))

@@ -26,7 +26,7 @@ from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
 from gsx.core.training.poses import PoseOptions, Poses
 from gsx.core.training.pseudo_views import Term
-from gsx.core.training.recorded import Recorder
+from gsx.core.training.recorded import Recorder, Told
 from gsx.core.training.resolution import Resolution
 
 
@@ -40,8 +40,8 @@ class TrainingOptions:
     checkpoint_every: Interval = without_effect()
     checkpoints_kept: Interval = without_effect()
     test_points: Annotated[int, Range(0, 10**6)] = without_effect()
-    cuda_graphs: bool = without_effect(default=True)
-    """On a GPU steps are recorded and replayed where they can be (`core.training.recorded`): the same results."""
+    cuda_graphs: bool = without_effect(default=False)
+    """On a GPU steps are recorded and replayed where they can be (`core.training.recorded`), with the same results."""
     batch: Annotated[int, Range(1, 10**6)] = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
     supersample: Annotated[int, Range(1, 16)] = 1
@@ -265,6 +265,8 @@ class Step:
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
     pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By augmenter, what became of the pictures that it asked for at this step (`Tally`); mostly none."""
+    told: Told | None = None
+    """What the host has heard of loss and gradients already; None: nothing."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 

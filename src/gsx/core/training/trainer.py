@@ -202,6 +202,7 @@ def step_of(run: Run, number: int, view: View, learnt: Learnt) -> Step:
         target=run.photographs.of(view),
         rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
         loss=learnt.loss,
+        told=learnt.told,
         seen=[observation(run, learnt.drawn, rendering, number, 1.0)],
         dropped=rendering.dropped,
     )
