@@ -4,7 +4,7 @@
     python benchmarks/rasterizer.py --only splats,limits       # some sections
     python benchmarks/rasterizer.py --quick                    # tiny sizes, to see that everything works
     python benchmarks/rasterizer.py --only step --run RUN      # training steps of a run folder from its checkpoint on
-    python benchmarks/rasterizer.py --device cuda
+    python benchmarks/rasterizer.py --device cuda --paths compiled --only truth,gpu,step   # some minutes on a GPU
 
 Prints tables; writes JSON, Markdown and a plot to benchmarks/results. Sections measured earlier are kept there, each
 with its machine. Measure alone: on a busy machine two threads can be tens of times slower.
@@ -28,9 +28,11 @@ from measuring.prototype import prototype_section
 from measuring.results import Section, read_sections, text_table, write_results
 from measuring.scaling import gpu_table, scale_overlap, scale_resolution, scale_splats, scale_tiles
 from measuring.steps import step_section
+from measuring.truth import truth_section
 from measuring.watches import Patience
 
 SECTIONS: dict[str, Callable[[Bench], Section]] = {
+    "truth": truth_section,
     "limits": limits_section,
     "splats": scale_splats,
     "resolution": scale_resolution,

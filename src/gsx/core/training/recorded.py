@@ -93,9 +93,9 @@ Recording = Callable[[Callable[[], Learnt]], tuple[Learnt, Graph]]
 
 
 def cuda_graph(work: Callable[[], Learnt]) -> tuple[Learnt, Graph]:
-    """By CUDA's own graphs."""
+    """By CUDA's own graphs. What other threads do meanwhile, a viewer's say, is not looked at."""
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         made = work()
     return made, graph
 
