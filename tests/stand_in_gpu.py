@@ -4,7 +4,7 @@ Where the host would have to wait for a GPU is counted, as are the kernels that 
 devices in one operation are refused as CUDA refuses them. What would be compiled runs as it stands and counts as one
 launch, though it may be several.
 
-    python tests/stand_in_gpu.py [--recorded] OVERRIDES   # steps on the CPU, then there; losses and counts as JSON
+    python tests/stand_in_gpu.py [--recorded|--broken] OVERRIDES   # steps on the CPU, then there: losses and counts
 """
 
 import json
@@ -55,6 +55,8 @@ class Tally:
     launches: Counter[str] = field(default_factory=Counter)
     inside: str = ""
     """Compiled function under way."""
+    recording: bool = False
+    """A graph is recorded or replayed: the host has no part in it."""
 
     def begin(self) -> None:
         """Count from here on."""
@@ -123,6 +125,7 @@ class Watched(TorchDispatchMode):
             kwargs["device"] = "cpu"
         moved = name in ("_to_copy", "copy_") and (not onto or len(ours) < len(tensors))
         if moved:
+            assert not self.tally.recording, f"{name} {asked_by()}: a copy between devices within a graph"
             waiting = not (kwargs.get("non_blocking") or (name == "copy_" and len(args) > 2 and args[2]))
             self.tally.waits[f"{name} {asked_by()}"] += waiting
         else:
@@ -230,8 +233,25 @@ class Again:
     """In place of a CUDA graph: does the work again, and copies what it makes to where it was made first."""
 
     def __init__(self, work: Callable[[], Learnt], table: ParameterTable, tally: Tally) -> None:
-        self.work, self.table, self.tally, self.made = work, table, tally, work()
-        self.gradients = gradients(table)
+        self.work, self.table, self.tally = work, table, tally
+        with self.as_graph():
+            self.made = work()
+        self.gradients, self.read = gradients(table), self.reads()
+
+    def reads(self) -> set[int]:
+        """Tensors of the table that the work reads: a graph goes on reading those that it was recorded with."""
+        return {id(tensor) for tensor in (*self.table.parameters.values(), *self.table.columns.values())}
+
+    @contextmanager
+    def as_graph(self) -> Iterator[None]:
+        """One launch, without any part of the host."""
+        waits, self.tally.recording = sum(self.tally.waits.values()), True
+        try:
+            with one_launch(self.tally, "graph"):
+                yield
+        finally:
+            self.tally.recording = False
+        assert sum(self.tally.waits.values()) == waits, f"recorded work waits: {+self.tally.waits}"
 
     def tensors(self, made: Learnt, found: dict[str, Tensor]) -> list[Tensor]:
         """All that is read of a recorded step."""
@@ -241,25 +261,25 @@ class Again:
         return [*(value.detach() for value in shown), *(value.grad for value in moved), *found.values()]
 
     def replay(self) -> None:
+        assert self.reads() == self.read, "a graph is replayed on a table that it was not recorded with"
         zero_grad(self.table)
-        waits = sum(self.tally.waits.values())
-        with one_launch(self.tally, "graph"):
-            places = self.tensors(self.made, self.gradients)
+        places = self.tensors(self.made, self.gradients)
+        with self.as_graph():
             for place, value in zip(places, self.tensors(self.work(), gradients(self.table)), strict=True):
                 place.copy_(value)
-        assert sum(self.tally.waits.values()) == waits, f"recorded work waits: {+self.tally.waits}"
 
 
-def recording(run: Run, tally: Tally) -> Recorder:
-    """A recorder whose graphs are no graphs."""
+def recording(run: Run, tally: Tally, broken: bool) -> Recorder:
+    """A recorder whose graphs are no graphs, or cannot be made."""
 
     def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
+        if broken:
+            work()
+            raise RuntimeError("operation not permitted when stream is capturing")
         again = Again(work, run.backbone.table, tally)
         return again.made, again
 
-    return Recorder(
-        backbone=run.backbone, raster=run.backbone.raster, ssim_weight=run.training.ssim_weight, record=record
-    )
+    return Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight, record=record)
 
 
 def steps(
@@ -268,14 +288,15 @@ def steps(
     count: int = STEPS,
     begun: Callable[[], None] = lambda: None,
     recorded: Tally | None = None,
+    broken: bool = False,
 ) -> list[Tensor]:
     """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
-    be recorded."""
+    be recorded; `broken`: which fails."""
     loaded, losses = plugins(), list[Tensor]()
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
         run = build.build(settings, load_scene(settings), Path(folder), training=True)
-        run.recorder = recording(run, recorded) if recorded else None
+        run.recorder = recording(run, recorded, broken) if recorded else None
         with loaded.listening([Guard()]):
             for _ in range(count):
                 begun()
@@ -285,13 +306,14 @@ def steps(
 
 def main(words: list[str]) -> None:
     """Losses on the CPU and there, and counts of the last step."""
-    recorded, words = "--recorded" in words, [word for word in words if word != "--recorded"]
-    own, count = steps([*words, "rasterizer=eager"], torch.device("cpu")), RECORDED if recorded else STEPS
+    flags, words = {word for word in words if word.startswith("--")}, [w for w in words if not w.startswith("--")]
+    broken, count = "--broken" in flags, RECORDED if flags else STEPS
+    own = steps([*words, "rasterizer=eager"], torch.device("cpu"))
     words = [*words, "rasterizer=compiled"]
     with stand_in() as tally, patch.object(build, "decide", lambda raster, *_: raster):
-        found = {"device": steps(words, DEVICE, count, tally.begin, tally if recorded else None)}
+        found = {"device": steps(words, DEVICE, count, tally.begin, tally if flags else None, broken)}
         waits, launches = (dict((+of).most_common()) for of in (tally.waits, tally.launches))
-        found |= {"unrecorded": steps(words, DEVICE, count)} if recorded else {}
+        found |= {"unrecorded": steps(words, DEVICE, count)} if flags else {}
         losses = {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()}
     print(json.dumps(losses | {"waits": waits, "launches": launches}, indent=1))
 

@@ -72,9 +72,9 @@ def step_section(bench: Bench) -> Section:
         view.image()  # decoded now, not in the first path's turn
     jobs = {path: stepping(run, loaded, raster_of(run, path)) for path in bench.paths}
     if bench.device.type == "cuda" and "compiled" in bench.paths:
-        raster = raster_of(run, "compiled")
-        recorder = Recorder(backbone=run.backbone, raster=raster, ssim_weight=run.training.ssim_weight)
-        jobs["recorded"] = stepping(run, loaded, raster, recorder)
+        recorder = Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight)
+        if recorder.alike(run.step + 1) is not None:
+            jobs["recorded"] = stepping(run, loaded, raster_of(run, "compiled"), recorder)
     patience = Patience(bench.pick(STEPS, QUICK_STEPS), 4 * bench.patience.seconds)
     rows = step_rows(take_turns(jobs, bench.device, patience))
     name = run.scene.name if bench.run is None else f"{run.scene.name}, run {bench.run.name}"

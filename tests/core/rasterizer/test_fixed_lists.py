@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsx.core.rasterizer import FixedLists, Needed
+from gsx.core.rasterizer import ListSizes, Needed
+from gsx.core.rasterizer.bags import SPARE, bag_sums
 from gsx.core.rasterizer.fixed_lists import owners
 
-ROOM = FixedLists(lens=torch.zeros(16), rows=10, pairs=20, blocks=6, longest=3)
+ROOM = ListSizes(rows=10, pairs=20, blocks=6, longest=3)
 ENOUGH = Needed(dropped=0, rows=10, pairs=20, blocks=5, longest=3)
 
 
@@ -17,6 +18,18 @@ def test_owners_of_a_list() -> None:
     assert owners(counts, 6, fixed=False).tolist() == [0, 0, 2, 2, 2, 3]
     assert owners(counts, 8, fixed=True).tolist() == [0, 0, 2, 2, 2, 3, 3, 3]
     assert owners(counts, 4, fixed=True).tolist() == [0, 0, 2, 2]
+
+
+def test_sums_of_bags_leave_out_what_is_spare() -> None:
+    values, places = torch.arange(1.0, 13.0)[:, None], torch.arange(12).flip(0)
+    edges = torch.tensor([0, 2, 2, 5])
+    expected = [[12.0 + 11], [0.0], [10.0 + 9 + 8]]
+    assert bag_sums(values, places, edges, spare=True).tolist() == expected
+    many = torch.cat([places, places.new_zeros(3 * SPARE)])
+    assert bag_sums(values, many, edges, spare=True).tolist() == expected
+    assert bag_sums(values, places[:5], edges, spare=False).tolist() == expected
+    beyond = torch.tensor([0, 2, 2, 99])  # too little room: nothing is read behind the last place
+    assert bag_sums(values, places, beyond, spare=True)[:2].tolist() == expected[:2]
 
 
 def test_what_just_fits() -> None:

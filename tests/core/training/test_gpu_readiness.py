@@ -42,10 +42,16 @@ def test_a_step_waits_for_a_gpu_seldom_and_launches_little(words: tuple[str, ...
 
 
 def test_a_recorded_step_waits_once_and_is_the_step_that_is_not_recorded() -> None:
-    """With Mip-Splatting's filter and density control in between; the stand-in asserts that what is recorded never
-    waits."""
-    told = told_by("--recorded", "backbone=mip_splatting")
+    """With Mip-Splatting's filter, density control and a change of resolution in between. The stand-in asserts that
+    what is recorded never waits, copies nothing from the host, and is replayed on the tensors that it has read."""
+    told = told_by("--recorded", "backbone=mip_splatting", "training.coarse=2", "training.coarse_until=0.05")
     assert told["device"] == told["unrecorded"]
     assert told["launches"].get("compiled graph") == 1
     for counts, most in zip((told["waits"], told["launches"]), MOST_RECORDED, strict=True):
         assert 0 < sum(counts.values()) <= most, counts
+
+
+def test_where_recording_fails_steps_go_on_without_it() -> None:
+    told = told_by("--broken", "backbone=gs3d")
+    assert told["device"] == told["unrecorded"]
+    assert "compiled graph" not in told["launches"]

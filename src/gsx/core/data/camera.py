@@ -158,7 +158,7 @@ class PlacedCamera(Camera):
         return self.stands_at
 
 
-def placed(
+def on_device(
     camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], centre: Float[Tensor, "3"]
 ) -> PlacedCamera:
     """The camera's raster and intrinsics with a pose that is read from these tensors."""

@@ -3,9 +3,9 @@
 import torch
 
 from gsx.core.rasterizer.batch import rasterize_batch
-from gsx.core.rasterizer.fixed_lists import FixedLists, Needed
+from gsx.core.rasterizer.fixed_lists import FixedLists, ListSizes, Needed
 from gsx.core.rasterizer.path import goes_compiled
-from gsx.core.rasterizer.projection import checked_lens, drawable, take_rows
+from gsx.core.rasterizer.projection import checked_lens, dilations_of, drawable, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize, rasterize_fixed
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
@@ -14,12 +14,14 @@ from gsx.core.rasterizer.visibility import touches, undilated_radii
 __all__ = [
     "TILE_PIXELS",
     "FixedLists",
+    "ListSizes",
     "Needed",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
     "TiledRendering",
     "checked_lens",
+    "dilations_of",
     "drawable",
     "goes_compiled",
     "rasterize",

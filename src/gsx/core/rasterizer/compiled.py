@@ -27,9 +27,8 @@ MOST_CHANNELS = 8
 """Channels are unrolled: beyond this number compilation takes longer than it saves."""
 CHECK_EVERY = 4
 """Chunks between looks at which groups have ended."""
-VALUES = {"cpu": 1 << 22}
-VALUES_OF_A_GPU = 1 << 26
-"""Alpha values at once where `compiled_values` leaves it to the device."""
+VALUES, VALUES_OF_A_GPU = 1 << 22, 1 << 26
+"""Alpha values at once where `compiled_values` leaves it to the device, a CPU or not."""
 WORTH_LEAVING = 0.75
 """Groups are picked out when at most this share of them is still going: picking costs a copy."""
 
@@ -265,7 +264,7 @@ def composite_compiled(
     tile). `absgrad` as there. There must be a pair."""
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
-    values = settings.compiled_values or VALUES.get(means.device.type, VALUES_OF_A_GPU)
+    values = settings.compiled_values or (VALUES if means.device.type == "cpu" else VALUES_OF_A_GPU)
     if settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"):
         table = padded_table(means, conic_factors, log_opacities, channels)
         segments, needed = cut(intersections, len(means), settings.unrolled, fixed)

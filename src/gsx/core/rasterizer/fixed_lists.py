@@ -9,12 +9,10 @@ from torch import Tensor
 from gsx.core.shapes import Float, Int
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FixedLists:
-    """Room for what a picture needs. Whether it was enough is told by `Needed`; if not, the picture is wrong."""
+@dataclass(frozen=True, kw_only=True)
+class ListSizes:
+    """Room in lists. Whether it was enough is told by `Needed`; if not, the picture is wrong."""
 
-    lens: Float[Tensor, "16"]
-    """`Lens` of the camera, whose pose lies where the splats do; its numbers have been checked."""
     rows: int
     """Rows of tiles that splats reach, in all."""
     pairs: int
@@ -27,6 +25,14 @@ class FixedLists:
         """Whether a picture that needs so much is right."""
         fits = needed.rows <= self.rows and needed.pairs <= self.pairs
         return fits and needed.blocks < self.blocks and needed.longest <= self.longest
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FixedLists(ListSizes):
+    """Room for what the picture of a camera needs."""
+
+    lens: Float[Tensor, "16"]
+    """`Lens` of the camera, whose pose lies where the splats do; its numbers have been checked."""
 
 
 class Needed(NamedTuple):

@@ -15,6 +15,7 @@ from gsx.core.compiling import fused
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
+from gsx.core.rasterizer.bags import bag_sums
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
 from gsx.core.rasterizer.fixed_lists import FixedLists, owners
 from gsx.core.rasterizer.grid import TileGrid
@@ -208,8 +209,8 @@ def sum_by_splat(
     """Sums over the entries of each splat, always in the same order; `places`: entry of each pair, pairs sorted by
     splat."""
     ends = intersections.counts.cumsum(0)
-    offsets = torch.cat([torch.zeros_like(ends[:1]), ends]).clamp_max(len(places)).to(places)
-    sums = torch.nn.functional.embedding_bag(places, values, offsets, mode="sum", include_last_offset=True)
+    edges = torch.cat([torch.zeros_like(ends[:1]), ends])
+    sums = bag_sums(values, places, edges, spare=intersections.needed is not None)
     return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 

@@ -1,8 +1,8 @@
 """The loops of the compiled path, in plain torch: what `torch.compile` turns into one fused loop each.
 
-Every function works on B blocks of K entries and the P pixels of a tile: on a CPU in L lanes (see lanes.py), on a GPU
-without, where pixels lie side by side. The loop over the K entries is unrolled; sums over a tile's pixels are the only
-reductions. Rules are constants of the compiled code.
+Every function works on B blocks of K entries and the P pixels of a tile: front to back in L lanes (see lanes.py), by
+segments without, where pixels lie side by side. The loop over the K entries is unrolled; sums over a tile's pixels are
+the only reductions. Rules are constants of the compiled code.
 """
 
 import functools
@@ -317,7 +317,7 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"blend": 30, "fade": 30, "moments": 50}
+SHARING = {"blend": 30, "moments": 50}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
@@ -335,7 +335,6 @@ class Kernels:
     """The compiled loops of one set of rules."""
 
     blend: Callable[..., None]
-    fade: Callable[..., Tensor]
     moments: Callable[..., None]
     make_rows: Callable[..., Tensor]
     entry_gradients: Callable[..., Tensor]
@@ -344,7 +343,7 @@ class Kernels:
 @functools.lru_cache
 def kernels(rules: Rules) -> Kernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (blend, fade, moments, make_rows, entry_gradients)
+    loops = (blend, moments, make_rows, entry_gradients)
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 

@@ -32,14 +32,10 @@ class Lanes:
     """Row of the screen splat; M, one past the last, is padding."""
     groups: Int[Tensor, "S"]
     """Group of each block."""
-    chunks: Int[Tensor, "S"]
-    """Number of each block within its group, from 0."""
     active: list[int]
     """Groups that have each chunk."""
     bases: list[int]
     """First block of each chunk."""
-    table: Int[Tensor, "2 N"]
-    """`active` and `bases`, where the entries are."""
     places: Int[Tensor, "P"]
     """Entry of each pair, pairs sorted by splat."""
 
@@ -64,10 +60,8 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
         tiles=tiles[: len(counts)],
         entries=entries.view(blocks, chunk, LANES),
         groups=torch.arange(blocks, device=chunks.device) - table[1][chunks],
-        chunks=chunks,
         active=active.tolist(),
         bases=bases.tolist(),
-        table=table,
         places=torch.empty_like(places).scatter_(0, intersections.slots, places),
     )
 

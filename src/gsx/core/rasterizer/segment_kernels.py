@@ -33,13 +33,6 @@ def light(
     return blended(rows, x, y, before, [0.0] * (rules.channels + 1), rules)[1]
 
 
-def passing(
-    rows: Float[Tensor, "B K F"], x: Float[Tensor, "P"], y: Float[Tensor, "P"], rules: Rules
-) -> Float[Tensor, "B P"]:
-    """Share of the light that passes each block."""
-    return fade(rows, x, y, rules)
-
-
 def own_picture(
     lights: list[Float[Tensor, "B P"]],
     before: Float[Tensor, "B P"],
@@ -90,7 +83,7 @@ class SegmentKernels:
     """The compiled loops of one set of rules."""
 
     make_rows: Callable[..., Tensor]
-    passing: Callable[..., Tensor]
+    fade: Callable[..., Tensor]
     light: Callable[..., list[Tensor]]
     own_picture: Callable[..., Tensor]
     entry_slopes: Callable[..., Tensor]
@@ -98,7 +91,7 @@ class SegmentKernels:
     entry_gradients: Callable[..., Tensor]
 
 
-LOOPS = (make_rows, passing, light, own_picture, entry_slopes, entry_sums, entry_gradients)
+LOOPS = (make_rows, fade, light, own_picture, entry_slopes, entry_sums, entry_gradients)
 FIXED = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
 from gsx.core.compiling import fused
+from gsx.core.rasterizer.bags import bag_sums
 from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
@@ -41,6 +41,8 @@ class Segments:
     """First block of each tile, then one past the last."""
     places: Int[Tensor, "P"]
     """Entry of each pair, pairs sorted by splat."""
+    spare: bool
+    """Whether there may be more blocks than are needed, because sizes were given."""
     doublings: int
     """How often 1 has to be doubled to reach the number of blocks of any tile."""
 
@@ -49,26 +51,34 @@ def cut(
     intersections: TileIntersections, splats: int, chunk: int, fixed: FixedLists | None
 ) -> tuple[Segments, Int[Tensor, "2"]]:
     """(lists in blocks of `chunk`, how many blocks they have in all and at most); `splats` is the number of screen
-    splats."""
+    splats.
+
+    Where a list has no room, because sizes were given, all that has none shares the last entry.
+    """
     counts = torch.div(intersections.starts.diff() + (chunk - 1), chunk, rounding_mode="floor")
     ends = counts.cumsum(0)
     edges, needed = torch.cat([torch.zeros_like(ends[:1]), ends]), torch.stack([ends[-1], counts.amax()])
-    place = entry_places(edges, intersections.starts, intersections.tiles, chunk)
     total, most = (fixed.blocks, fixed.longest) if fixed else needed.tolist()
     size = max(LEAST_BLOCKS, total)
-    entries, tiles, number, left, places = blocks_of(
-        edges, place, intersections.splats, intersections.slots, splats, size, chunk
-    )
+    place = entry_places(edges, intersections.starts, intersections.tiles, chunk).clamp_max(size * chunk - 1)
+    number, left, tiles = within_tiles(blocks_tiles(edges, size), edges)
+    listed = intersections.splats
     segments = Segments(
-        entries=entries,
+        entries=listed.new_full((size * chunk,), splats).scatter_(0, place, listed).view(size, chunk),
         tiles=tiles,
         number=number,
         left=left,
         edges=edges,
-        places=places,
+        places=torch.empty_like(place).scatter_(0, intersections.slots, place),
+        spare=fixed is not None,
         doublings=max(1, most - 1).bit_length(),
     )
     return segments, needed
+
+
+def blocks_tiles(edges: Int[Tensor, "T_1"], size: int) -> Int[Tensor, "S"]:
+    """Tile of each of `size` blocks; one past the last behind all."""
+    return torch.searchsorted(edges[1:], torch.arange(size, device=edges.device), right=True)
 
 
 @fused
@@ -77,27 +87,6 @@ def entry_places(
 ) -> Int[Tensor, "P"]:
     """Entry of each pair. Pairs beyond the lists have no tile: theirs is one past the last."""
     return torch.arange(tiles.shape[0], device=tiles.device) + (edges * chunk - starts)[tiles]
-
-
-def blocks_of(
-    edges: Int[Tensor, "T_1"],
-    place: Int[Tensor, "P"],
-    splats: Int[Tensor, "P"],
-    slots: Int[Tensor, "P"],
-    padding: int,
-    size: int,
-    chunk: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Entries, tile, number and blocks left of `size` blocks, and the entry of each pair by splat.
-
-    Where a list has no room, because sizes were given, all that has none shares the last entry.
-    """
-    place = place.clamp_max(size * chunk - 1)
-    entries = splats.new_full((size * chunk,), padding).scatter_(0, place, splats)
-    tile = torch.searchsorted(edges[1:], torch.arange(size, device=edges.device), right=True)
-    number, left, tile = within_tiles(tile, edges)
-    by_splat = torch.empty_like(place).scatter_(0, slots, place)
-    return entries.view(size, chunk), tile, number, left, by_splat
 
 
 @fused
@@ -224,7 +213,7 @@ def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Floa
     segments, loops, dtype = job.segments, job.loops, job.precision.accumulation
     centres = job.grid.centres(segments.tiles, table)[:, :, None]
     rows = loops.make_rows(table, segments.entries, centres)
-    passed = loops.passing(rows, job.x, job.y).to(dtype)
+    passed = loops.fade(rows, job.x, job.y).to(dtype)
     before = before_blocks(passed, segments)
     lights = loops.light(rows, before, job.x, job.y)
     return torch.stack([sum_by_tile(light, segments) for light in lights], 2), Kept(rows, passed, before, lights)
@@ -233,7 +222,7 @@ def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Floa
 def sum_by_tile(values: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "T P"]:
     """Sums over the blocks of each tile."""
     blocks = torch.arange(len(values), device=values.device)
-    return embedding_bag(blocks, values, segments.edges.clamp_max(len(values)), mode="sum", include_last_offset=True)
+    return bag_sums(values, blocks, segments.edges, segments.spare)
 
 
 def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 P"]) -> Float[Tensor, "S K V"]:

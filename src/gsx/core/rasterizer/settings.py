@@ -85,7 +85,8 @@ class RasterSettings:
     unrolled: Annotated[int, Range(1, 64)] = 8
     """Compiled path: splats composited per step of a tile, unrolled in one loop; compile time grows with it."""
     compiled_values: Annotated[int, Range(0, LARGEST_BATCH)] = 0
-    """Compiled path: alpha values evaluated at once; 0: 2^22 on a CPU, 2^26 on a GPU."""
+    """Compiled path: alpha values evaluated at once (by segments: slopes held at once); 0: 2^22 on a CPU, 2^26 on a
+    GPU."""
     max_pairs: Annotated[int, Range(1, 1 << 31)] = 100_000_000
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
     path: str = "eager"

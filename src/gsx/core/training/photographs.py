@@ -40,7 +40,7 @@ class Photographs:
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """What `view.image()` is, on the device."""
-        return self.bytes_of(view).float() / 255.0
+        return numbers_of(self.bytes_of(view))
 
     def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:
         """The photograph, on the device."""
@@ -50,3 +50,8 @@ class Photographs:
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
         return picture
+
+
+def numbers_of(photograph: UInt8[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """A photograph in [0, 1]."""
+    return photograph.float() / 255.0

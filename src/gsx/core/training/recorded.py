@@ -15,14 +15,25 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, PlacedCamera, placed
+from gsx.core.data.camera import Camera, PlacedCamera, on_device
 from gsx.core.device import uploaded
 from gsx.core.errors import first_line
+from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
-from gsx.core.rasterizer import FixedLists, Needed, RasterSettings, Rendering, checked_lens, rasterize_fixed
+from gsx.core.rasterizer import (
+    FixedLists,
+    ListSizes,
+    Needed,
+    RasterSettings,
+    Rendering,
+    checked_lens,
+    dilations_of,
+    rasterize_fixed,
+)
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.backbone import Backbone, Drawn
-from gsx.core.training.parameter_table import gradients, named_parameters, zero_grad
+from gsx.core.training.backbone import Backbone, DrawnSplats
+from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
+from gsx.core.training.photographs import numbers_of
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +45,8 @@ ATTEMPTS = 6
 
 @runtime_checkable
 class Recordable(Protocol):
-    """A backbone that draws all its rows for every camera, by the same operations for a while."""
+    """A backbone that draws all its rows for every camera, by the same operations for a while, and learns from a render
+    what `DrawnSplats` tells."""
 
     def drawn_alike(self, step: int) -> Hashable:
         """Equal for steps that are drawn by the same operations on the same tensors of the table; None: this step is
@@ -54,7 +66,7 @@ class Inputs:
     def camera(self, like: Camera) -> tuple[PlacedCamera, Float[Tensor, "16"]]:
         """(a camera whose pose is read from here, its lens)."""
         lens, rotation, translation, centre = self.pose.split([16, 9, 3, 3])
-        return placed(like, rotation.view(3, 3), translation, centre), lens
+        return on_device(like, rotation.view(3, 3), translation, centre), lens
 
 
 class Told(NamedTuple):
@@ -70,9 +82,9 @@ NEEDED = len(Needed._fields)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Learnt:
-    """A render and its loss, sent back: gradients lie where parameters have them."""
+    """A render and its loss, sent back: gradients lie where parameters have them, and nothing here has a graph."""
 
-    drawn: Drawn
+    drawn: DrawnSplats
     rendering: Rendering
     loss: Float[Tensor, ""]
     facts: Float[Tensor, "F"]
@@ -80,6 +92,7 @@ class Learnt:
     told: Told | None = None
 
 
+@runtime_checkable
 class Graph(Protocol):
     """Work that was recorded."""
 
@@ -94,9 +107,13 @@ Recording = Callable[[Callable[[], Learnt]], tuple[Learnt, Graph]]
 
 def cuda_graph(work: Callable[[], Learnt]) -> tuple[Learnt, Graph]:
     """By CUDA's own graphs. What other threads do meanwhile, a viewer's say, is not looked at."""
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        made = work()
+    graph, before = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
+    try:
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            made = work()
+    except BaseException:
+        torch.cuda.set_stream(before)  # torch leaves it where ending the capture fails
+        raise
     return made, graph
 
 
@@ -106,7 +123,6 @@ class Recorded:
 
     key: Hashable
     inputs: Inputs
-    fixed: FixedLists
     made: Learnt
     graph: Graph
     gradients: dict[str, Tensor]
@@ -119,133 +135,166 @@ class Recorder:
     """Takes the steps of a run that can be recorded."""
 
     backbone: Backbone[Any]
-    raster: RasterSettings
     ssim_weight: float
     record: Recording = cuda_graph
-    room: Needed = Needed(0, LEAST_ROOM, LEAST_ROOM, LEAST_ROOM, 1)
-    compiled: set[Hashable] = field(default_factory=set)
-    """Ways of drawing whose operations have run before: nothing may be compiled while a step is recorded."""
+    room: ListSizes = ListSizes(rows=LEAST_ROOM, pairs=LEAST_ROOM, blocks=LEAST_ROOM, longest=1)
+    done: set[Hashable] = field(default_factory=set)
+    """What has been done before without being recorded: nothing may be compiled, or copied there once and for all,
+    while a step is recorded."""
     last: Recorded | None = None
     broken: bool = False
     """Recording has failed: steps are launched one by one from there on."""
 
+    def forget(self) -> None:
+        """Let go of what is recorded, and its memory."""
+        self.last = None
+
+    def alike(self, step: int) -> Hashable:
+        """What steps have in common that may be recorded together with this one; None: it is not to be recorded."""
+        if self.broken or not isinstance(self.backbone, Recordable):
+            return None
+        drawn = self.backbone.drawn_alike(step)
+        return None if drawn is None else (drawn, self.backbone.absolute_gradient)
+
     def learn(
-        self, camera: Camera, photograph: UInt8[Tensor, "3 H W"], background: Float[Tensor, "3"], step: int
+        self,
+        camera: Camera,
+        photograph: UInt8[Tensor, "3 H W"],
+        background: Float[Tensor, "3"],
+        raster: RasterSettings,
+        step: int,
     ) -> Learnt | None:
         """Render a view, compare it with its photograph and send the loss back; None where that cannot be recorded.
 
         Parameters must have no gradients. `photograph` and `background` lie where the model does.
+
+        Raises:
+            InputError: no picture can be taken with the camera's numbers.
         """
-        alike = self.backbone.drawn_alike(step) if isinstance(self.backbone, Recordable) else None
-        if self.broken or alike is None:
-            return None
-        way = (alike, self.backbone.absolute_gradient)
-        for _ in range(ATTEMPTS):
-            found = self.attempt(way, camera, photograph, background, step)
-            if self.broken:
-                return None
+        for _ in range(ATTEMPTS if self.alike(step) is not None else 0):
+            found = self.attempt(camera, photograph, background, raster, step)
+            if found is None:
+                break
             facts = found.facts.tolist()
             needed, (loss, *sums) = Needed(*map(int, facts[:NEEDED])), facts[NEEDED:]
-            if self.fits(needed):
-                exact = replace(found.rendering, intersections=needed.pairs, dropped=needed.dropped)
+            if self.room.hold(needed):
                 told = Told(loss, dict(zip(gradients(self.backbone.table), sums, strict=True)))
-                return replace(found, rendering=exact, loss=found.loss.clone(), told=told)
+                return learnt_now(found, needed, told)
+            if max(needed.rows, needed.pairs) > raster.max_pairs:  # refused by name elsewhere
+                break
             self.make_room(needed)
         zero_grad(self.backbone.table)
         return None
 
     def attempt(
         self,
-        way: Hashable,
         camera: Camera,
         photograph: UInt8[Tensor, "3 H W"],
         background: Float[Tensor, "3"],
+        raster: RasterSettings,
         step: int,
-    ) -> Learnt:
-        """Replay what is recorded, record it, or, the first time, only do it."""
-        zero_grad(self.backbone.table)
-        lens = checked_lens(camera, self.raster)
-        host = [lens, *(x.double().flatten() for x in (camera.rotation, camera.translation, camera.centre))]
-        pose = uploaded(torch.cat(host), photograph.device)
+    ) -> Learnt | None:
+        """Replay what is recorded, record it, or, the first time, only do it; None where it cannot be recorded."""
         table = self.backbone.table
-        tensors = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
-        numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.size, camera.frame, camera.near)
-        key = (way, numbers, self.room, *(id(tensor) for tensor in tensors))
-        if self.last is None or self.last.key != key:
-            inputs = Inputs(pose=pose, photograph=photograph.clone(), background=background.clone())
-            fixed = self.lists(inputs.camera(camera)[1])
-            if way not in self.compiled:
-                self.compiled.add(way)
-                return self.work(inputs, camera, fixed, step)
-            self.begin(key, inputs, camera, fixed, step, tensors)
-        return self.replayed(pose, photograph, background)
+        zero_grad(table)
+        host = (checked_lens(camera, raster), camera.rotation, camera.translation, camera.centre)
+        pose = uploaded(torch.cat([numbers.double().flatten() for numbers in host]), photograph.device)
+        dilations = dilations_of(camera, None, raster)
+        way = (self.alike(step), camera.size, camera.frame, dilations, raster, self.room)
+        held = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
+        key = (way, *(id(tensor) for tensor in held))
+        if self.last is not None and self.last.key == key:
+            return replayed(self.last, table, pose, photograph, background)
+        self.forget()
+        inputs = Inputs(pose=pose, photograph=photograph.clone(), background=background.clone())
 
-    def begin(
-        self, key: Hashable, inputs: Inputs, camera: Camera, fixed: FixedLists, step: int, held: Sequence[Tensor]
-    ) -> None:
-        """Record a step; it has not been taken then."""
-        self.last = None  # its memory goes first
+        def work() -> Learnt:
+            return self.work(inputs, camera, raster, step)
+
+        if way not in self.done:
+            found = work()
+            self.done.add(way)
+            return found
+        self.last = self.recorded(key, inputs, held, work)
+        return None if self.last is None else replayed(self.last, table, pose, photograph, background)
+
+    def recorded(
+        self, key: Hashable, inputs: Inputs, held: Sequence[Tensor], work: Callable[[], Learnt]
+    ) -> Recorded | None:
+        """A record of the work, which has not been done then; None where that fails."""
         try:
-            made, graph = self.record(lambda: self.work(inputs, camera, fixed, step))
+            made, graph = self.record(work)
         except RuntimeError as error:
             self.broken = True
             logger.warning("steps are launched one by one: they cannot be recorded here (%s)", first_line(error))
-            zero_grad(self.backbone.table)
-            return
-        self.last = Recorded(
-            key=key,
-            inputs=inputs,
-            fixed=fixed,
-            made=made,
-            graph=graph,
-            gradients=gradients(self.backbone.table),
-            held=held,
-        )
+            return None
+        found = gradients(self.backbone.table)
+        return Recorded(key=key, inputs=inputs, made=made, graph=graph, gradients=found, held=held)
 
-    def replayed(
-        self, pose: Float[Tensor, "31"], photograph: UInt8[Tensor, "3 H W"], background: Float[Tensor, "3"]
-    ) -> Learnt:
-        """The recorded step on these inputs."""
-        assert self.last is not None
-        inputs = self.last.inputs
-        for place, value in ((inputs.pose, pose), (inputs.photograph, photograph), (inputs.background, background)):
-            place.copy_(value)
-        self.last.graph.replay()
-        for name, parameter in named_parameters(self.backbone.table):
-            parameter.grad = self.last.gradients.get(name)
-        return self.last.made
-
-    def work(self, inputs: Inputs, camera: Camera, fixed: FixedLists, step: int) -> Learnt:
+    def work(self, inputs: Inputs, camera: Camera, raster: RasterSettings, step: int) -> Learnt:
         """What is recorded."""
-        seen_by, _ = inputs.camera(camera)
-        drawn = self.backbone.draw(seen_by, step)
-        absolute, colour = self.backbone.absolute_gradient, inputs.background
+        seen_by, lens = inputs.camera(camera)
+        drawn, fixed = self.backbone.draw(seen_by, step), FixedLists(lens=lens, **vars(self.room))
+        absolute = self.backbone.absolute_gradient
         rendering = rasterize_fixed(
-            drawn.splats, seen_by, self.raster, fixed, background=colour, absolute_gradient=absolute
+            drawn.splats, seen_by, raster, fixed, background=inputs.background, absolute_gradient=absolute
         )
-        target = inputs.photograph.float() / 255.0
+        target = numbers_of(inputs.photograph)
         loss = photometric(rendering.image, target, self.ssim_weight, compiled=True)
         extra = self.backbone.regulariser(drawn)
         loss = loss if extra is None else loss + extra
         loss.backward()
         assert rendering.needed is not None
         sums = torch.stack([loss.detach(), *(slope.sum() for slope in gradients(self.backbone.table).values())])
-        facts = torch.cat([rendering.needed.double(), sums.double()])
-        return Learnt(drawn=drawn, rendering=rendering, loss=loss.detach(), facts=facts)
-
-    def lists(self, lens: Float[Tensor, "16"]) -> FixedLists:
-        """Lists with the room of the moment."""
-        _, rows, pairs, blocks, longest = self.room
-        return FixedLists(lens=lens, rows=rows, pairs=pairs, blocks=blocks, longest=longest)
-
-    def fits(self, needed: Needed) -> bool:
-        """Whether there was room for that."""
-        return self.lists(torch.empty(0)).hold(needed)
+        return Learnt(
+            drawn=DrawnSplats(splats=without_graph(drawn.splats), rows=drawn.rows),
+            rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
+            loss=loss.detach(),
+            facts=torch.cat([rendering.needed.double(), sums.double()]),
+        )
 
     def make_room(self, needed: Needed) -> None:
         """For as much, and some more."""
         rows, pairs, blocks = (int(SPARE * number) + LEAST_ROOM for number in needed[1:4])
         now, longest = self.room, 1 << needed.longest.bit_length()
-        self.room = Needed(
-            0, max(now.rows, rows), max(now.pairs, pairs), max(now.blocks, blocks), max(now.longest, longest)
+        self.room = ListSizes(
+            rows=max(now.rows, rows),
+            pairs=max(now.pairs, pairs),
+            blocks=max(now.blocks, blocks),
+            longest=max(now.longest, longest),
         )
+
+
+def replayed(
+    last: Recorded,
+    table: ParameterTable,
+    pose: Float[Tensor, "31"],
+    photograph: UInt8[Tensor, "3 H W"],
+    background: Float[Tensor, "3"],
+) -> Learnt:
+    """A recorded step on these inputs."""
+    inputs = last.inputs
+    for place, value in ((inputs.pose, pose), (inputs.photograph, photograph), (inputs.background, background)):
+        place.copy_(value)
+    last.graph.replay()
+    for name, parameter in named_parameters(table):
+        parameter.grad = last.gradients.get(name)
+    return last.made
+
+
+def learnt_now(found: Learnt, needed: Needed, told: Told) -> Learnt:
+    """What a step has made, with what the host has heard of it. What may be kept longer than it is copied: the next
+    replay writes to the same places."""
+    rendering = replace(
+        found.rendering,
+        image=found.rendering.image.clone(),
+        alpha=found.rendering.alpha.clone(),
+        intersections=needed.pairs,
+        dropped=needed.dropped,
+    )
+    return replace(found, rendering=rendering, loss=found.loss.clone(), told=told)
+
+
+def without_graph(splats: Splats) -> Splats:
+    """The same splats; what they were made from is not kept."""
+    return Splats(**{name: value.detach() for name, value in vars(splats).items()})

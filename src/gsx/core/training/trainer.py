@@ -25,8 +25,8 @@ from gsx.core.training.evidence import window_errors
 from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
+from gsx.core.training.photographs import numbers_of
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
-from gsx.core.training.recorded import Learnt
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -43,6 +43,8 @@ def train(run: Run, plugins: Plugins) -> None:
             break
         run.seconds += time.perf_counter() - begun
         plugins.emit.gsx_step_finished(run=run, step=step)
+    if run.recorder is not None:
+        run.recorder.forget()
     plugins.emit.gsx_training_finished(run=run)
 
 
@@ -146,8 +148,10 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     compared with its own render.
     """
     counted, seen = counted_in_loss(run, view, number), list[Observation]()
-    if counted is None and not terms and (learnt := recorded_loss(run, number, view, colour)) is not None:
-        return step_of(run, number, view, learnt)
+    if counted is None and not terms and may_be_recorded(run, number):
+        step = recorded_step(run, number, view, colour)
+        if step is not None:
+            return step
     target = blacked(run.photographs.of(view), counted)
     divided = [served_by_view(run, term, view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
@@ -184,27 +188,34 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     )
 
 
-def recorded_loss(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> Learnt | None:
-    """The view's loss sent back by a recorded step; None where this one cannot be."""
+def may_be_recorded(run: Run, number: int) -> bool:
+    """Whether views without pseudo views and masks are learnt by recorded work at a step."""
+    if run.recorder is None or run.recorder.alike(number) is None:
+        return False
     alone = run.training.batch == 1 and run.ranks.size == 1
-    plain = run.exposures.matrices is None and run.resolution.supersample_at(number) == 1
-    if run.recorder is None or not (alone and plain):
+    return alone and run.exposures.matrices is None and run.resolution.supersample_at(number) == 1
+
+
+def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> Step | None:
+    """The step of a view, by recorded work; None where this one cannot be recorded.
+
+    Raises:
+        InputError: no picture can be taken with the camera's numbers.
+    """
+    assert run.recorder is not None
+    photograph = run.photographs.bytes_of(view)
+    learnt = run.recorder.learn(view.camera, photograph, colour, run.raster, number)
+    if learnt is None:
         return None
-    return run.recorder.learn(view.camera, run.photographs.bytes_of(view), colour, number)
-
-
-def step_of(run: Run, number: int, view: View, learnt: Learnt) -> Step:
-    """The step that was taken so."""
-    rendering = learnt.rendering
     return Step(
         number=number,
         view=view,
-        target=run.photographs.of(view),
-        rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
+        target=numbers_of(photograph),
+        rendering=learnt.rendering,
         loss=learnt.loss,
         told=learnt.told,
-        seen=[observation(run, learnt.drawn, rendering, number, 1.0)],
-        dropped=rendering.dropped,
+        seen=[observation(run, learnt.drawn, learnt.rendering, number, 1.0)],
+        dropped=learnt.rendering.dropped,
     )
 
 

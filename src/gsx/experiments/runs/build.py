@@ -16,6 +16,7 @@ from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
@@ -191,13 +192,15 @@ def build(
 
 
 def recorder_of(backbone: Backbone, training: TrainingOptions, device: torch.device) -> Recorder | None:
-    """What records the steps of a run; None where they are not launched from afar, or not by operations of one kind."""
-    raster = backbone.raster
-    segments = raster.path == "compiled" and raster.schedule in ("auto", "segments")
-    plain = raster.pixel == "sample" and raster.tile_cap == 0 and raster.accumulation in ("float32", "float64")
-    if device.type != "cuda" or not (training.cuda_graphs and segments and plain):
+    """What records the steps of a run; None where that is not asked for, or cannot be done, which is said."""
+    if not training.cuda_graphs or device.type != "cuda":
         return None
-    return Recorder(backbone=backbone, raster=raster, ssim_weight=training.ssim_weight)
+    raster = backbone.raster
+    plain = raster.schedule != "chunks" and raster.pixel == "sample" and raster.tile_cap == 0
+    if plain and path_of(raster, device) == "compiled":
+        return Recorder(backbone=backbone, ssim_weight=training.ssim_weight)
+    logger.warning("training.cuda_graphs: steps are not recorded, since pictures are not blended by compiled segments")
+    return None
 
 
 def build_augmenters(settings: Settings, scene: Scene) -> list[tuple[Augmenter, Tally]]:

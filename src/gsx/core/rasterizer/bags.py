@@ -1,0 +1,24 @@
+"""Sums over the entries of a list, row by row, always in the same order."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from gsx.core.shapes import Float, Int
+
+SPARE = 64
+"""Entries behind a list are summed in bags of so many: a GPU walks through a bag by itself, whatever its length."""
+
+
+def bag_sums(
+    values: Float[Tensor, "E V"], places: Int[Tensor, "P"], edges: Int[Tensor, "N_1"], spare: bool
+) -> Float[Tensor, "N V"]:
+    """Row n is the sum of values[places[edges[n] : edges[n + 1]]]. `spare`: there may be places behind the last edge,
+    and edges behind the last place."""
+    count, edges = len(edges) - 1, edges.to(places)
+    if not spare:
+        return embedding_bag(places, values, edges[:-1], mode="sum")
+    edges = edges.clamp_max(len(places))
+    more = torch.arange(SPARE, max(SPARE + 1, len(places)), SPARE, device=edges.device, dtype=edges.dtype)
+    offsets = torch.cat([edges, more.maximum(edges[-1]).clamp_max(len(places))])
+    return embedding_bag(places, values, offsets, mode="sum")[:count]
