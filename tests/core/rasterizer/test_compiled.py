@@ -107,14 +107,13 @@ def learnt_by(draw: Callable[[Splats], Rendering]) -> tuple[Rendering, list[torc
 
 @pytest.mark.parametrize("spare", [1, 400])
 def test_lists_of_fixed_sizes_draw_the_same_bits(spare: int) -> None:
-    camera, rules, black = front_camera(), replace(QUICK, schedule="segments", unrolled=1), torch.zeros(3)
-    usual, slopes = learnt_by(lambda given: rasterize(given, camera, rules, background=black))
+    camera, rules = front_camera(), replace(QUICK, schedule="segments", unrolled=1)
+    wanted = {"background": torch.zeros(3), "absolute_gradient": True}
+    usual, slopes = learnt_by(lambda given: rasterize(given, camera, rules, **wanted))
     room = {"rows": 1, "pairs": 1, "blocks": 1, "longest": 1}
     for _ in range(5):  # what one list lacks hides what the next needs
         fixed = FixedLists(lens=checked_lens(camera, rules), **room)
-        drawn, others = learnt_by(
-            lambda given, fixed=fixed: rasterize_fixed(given, camera, rules, fixed, background=black)
-        )
+        drawn, others = learnt_by(lambda given, fixed=fixed: rasterize_fixed(given, camera, rules, fixed, **wanted))
         needed = Needed(*drawn.needed.tolist())
         if fixed.hold(needed):
             break
@@ -125,8 +124,9 @@ def test_lists_of_fixed_sizes_draw_the_same_bits(spare: int) -> None:
     assert all(torch.equal(one, other) for one, other in zip(slopes, others, strict=True))
     assert torch.equal(drawn.screen.radii[usual.screen.ids], usual.screen.radii)
     assert int(drawn.screen.visible.sum()) == int(usual.screen.visible.sum())
-    moved = drawn.screen.means2d_offset.grad
-    assert torch.equal(moved[usual.screen.ids], usual.screen.means2d_offset.grad)
+    for name in ("means2d_offset", "absgrad"):
+        moved = getattr(drawn.screen, name).grad
+        assert torch.equal(moved[usual.screen.ids], getattr(usual.screen, name).grad)
 
 
 def test_the_compilers_options_are_those_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,9 +106,9 @@ def project(
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
+    numbers = uploaded(checked_lens(camera, settings, intrinsics), splats.means.device) if lens is None else lens
     dilation, drawn = dilations_of(camera, intrinsics, settings)
     points = camera.to_camera(splats.means)
-    numbers = uploaded(checked_lens(camera, settings, intrinsics), points.device) if lens is None else lens
     compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
     good, shown = selected(splats, points, numbers, compiled)
     given = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
@@ -156,10 +156,10 @@ def checked_lens(
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
+    own = intrinsics_of(camera, intrinsics)
+    refuse_unusable(camera, own, settings.jacobian_margin)
     dilation, _ = dilations_of(camera, intrinsics, settings)
-    intrinsics = intrinsics_of(camera, intrinsics)
-    refuse_unusable(camera, intrinsics, settings.jacobian_margin)
-    return lens_of(camera, on_frame(intrinsics, camera.frame), dilation, settings)
+    return lens_of(camera, on_frame(own, camera.frame), dilation, settings)
 
 
 def dilations_of(

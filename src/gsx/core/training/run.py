@@ -243,8 +243,8 @@ class Run:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Step:
-    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first. Of a
-    recorded step the rendering's screen statistics last until the next step."""
+    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first.
+    Screen statistics of a recorded step last until the next step."""
 
     number: int
     view: View
