@@ -1,6 +1,6 @@
 """`rasterize`: splats and a camera in, a `Rendering` out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,6 +36,21 @@ class ScreenStatistics:
     size: tuple[int, int]
     """(width, height) of the raster."""
 
+    @staticmethod
+    def before_blending(
+        screen: ScreenSplats, radii: Int[Tensor, "M"], size: tuple[int, int], learning: bool, absolute: bool
+    ) -> "ScreenStatistics":
+        """Of splats on the screen, with zeros that are to gather gradients."""
+        zeros = [torch.zeros_like(screen.means, requires_grad=learning) for _ in range(1 + absolute)]
+        return ScreenStatistics(
+            ids=screen.ids,
+            radii=radii,
+            means2d_offset=zeros[0],
+            absgrad=zeros[1] if absolute else None,
+            max_weights=None,
+            size=size,
+        )
+
     @property
     def visible(self) -> Bool[Tensor, "M"]:
         """Splats that touch a tile; no pixel need have been shaded (3D-GS, forward.cu)."""
@@ -68,22 +83,23 @@ class Rendering:
 
 def blend(
     screen: ScreenSplats,
-    means2d_offset: Float[Tensor, "M 2"],
+    told: ScreenStatistics,
     channels: Float[Tensor, "M C"],
     intersections: TileIntersections,
     camera: Camera,
     settings: RasterSettings,
-    absgrad: Float[Tensor, "M 2"] | None,
     max_weight: bool,
 ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-    """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for."""
-    inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, channels)
+    """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for; `told`
+    gathers gradients."""
+    absgrad = told.absgrad
+    inputs = (screen.means + told.means2d_offset, screen.conic_factors, screen.log_opacities, channels)
     grid = TileGrid.of(camera, settings.tile_size)
     if settings.pixel == "window":
         return composite_windows(
             screen, inputs[0], channels, intersections, grid, settings, absgrad=absgrad, max_weight=max_weight
         )
-    if takes(settings, channels.shape[1], len(intersections.splats), max_weight, means2d_offset.device.type):
+    if takes(settings, channels.shape[1], len(intersections.splats), max_weight, screen.means.device.type):
         return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad)[0], None
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
@@ -117,10 +133,9 @@ def rasterize(
     screen = project(splats, camera, settings, intrinsics)
     intersections = capped(intersect_tiles(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
-    means2d_offset = torch.zeros_like(screen.means, requires_grad=learning)
-    absgrad = torch.zeros_like(screen.means, requires_grad=learning) if absolute_gradient else None
+    told = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, learning, absolute_gradient)
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
-    blended, max_weights = blend(screen, means2d_offset, channels, intersections, camera, settings, absgrad, max_weight)
+    blended, max_weights = blend(screen, told, channels, intersections, camera, settings, max_weight)
     count = splats.colours.shape[1]
     image, alpha = blended[:count], blended[-1]
     if background is not None:
@@ -131,14 +146,7 @@ def rasterize(
         depth=blended[count] if depth else None,
         intersections=len(intersections.splats),
         dropped=int(screen.dropped),
-        screen=ScreenStatistics(
-            ids=screen.ids,
-            radii=intersections.radii,
-            means2d_offset=means2d_offset,
-            absgrad=absgrad,
-            max_weights=max_weights,
-            size=camera.size,
-        ),
+        screen=replace(told, max_weights=max_weights),
     )
 
 
@@ -158,11 +166,10 @@ def rasterize_fixed(
     """
     screen = project(splats, camera, settings, lens=fixed.lens)
     intersections = intersect_tiles(screen, camera, settings, fixed)
-    means2d_offset = torch.zeros_like(screen.means, requires_grad=True)
-    absgrad = torch.zeros_like(screen.means, requires_grad=True) if absolute_gradient else None
-    inputs = (screen.means + means2d_offset, screen.conic_factors, screen.log_opacities, screen.channels)
+    told = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, True, absolute_gradient)
+    inputs = (screen.means + told.means2d_offset, screen.conic_factors, screen.log_opacities, screen.channels)
     grid = TileGrid.of(camera, settings.tile_size)
-    blended, blocks = composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad, fixed=fixed)
+    blended, blocks = composite_compiled(*inputs, intersections, grid, settings, absgrad=told.absgrad, fixed=fixed)
     assert intersections.needed is not None
     assert blocks is not None
     dropped = torch.as_tensor(screen.dropped)[None]
@@ -173,12 +180,5 @@ def rasterize_fixed(
         intersections=fixed.pairs,
         dropped=0,
         needed=torch.cat([dropped, intersections.needed, blocks]),
-        screen=ScreenStatistics(
-            ids=screen.ids,
-            radii=intersections.radii,
-            means2d_offset=means2d_offset,
-            absgrad=absgrad,
-            max_weights=None,
-            size=camera.size,
-        ),
+        screen=told,
     )

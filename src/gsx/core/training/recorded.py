@@ -81,6 +81,27 @@ NEEDED = len(Needed._fields)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ToLearn:
+    """A view to be learnt at a step, on the device of the model."""
+
+    camera: Camera
+    photograph: UInt8[Tensor, "3 H W"]
+    background: Float[Tensor, "3"]
+    raster: RasterSettings
+    step: int
+
+    def pose(self) -> Float[Tensor, "31"]:
+        """What `Inputs.pose` is for its camera.
+
+        Raises:
+            InputError: no picture can be taken with the camera's numbers.
+        """
+        camera = self.camera
+        host = (checked_lens(camera, self.raster), camera.rotation, camera.translation, camera.centre)
+        return uploaded(torch.cat([numbers.double().flatten() for numbers in host]), self.photograph.device)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Learnt:
     """A render and its loss, sent back: gradients lie where parameters have them, and nothing here has a graph."""
 
@@ -156,23 +177,15 @@ class Recorder:
         drawn = self.backbone.drawn_alike(step)
         return None if drawn is None else (drawn, self.backbone.absolute_gradient)
 
-    def learn(
-        self,
-        camera: Camera,
-        photograph: UInt8[Tensor, "3 H W"],
-        background: Float[Tensor, "3"],
-        raster: RasterSettings,
-        step: int,
-    ) -> Learnt | None:
+    def learn(self, view: ToLearn) -> Learnt | None:
         """Render a view, compare it with its photograph and send the loss back; None where that cannot be recorded.
-
-        Parameters must have no gradients. `photograph` and `background` lie where the model does.
+        Parameters must have no gradients.
 
         Raises:
             InputError: no picture can be taken with the camera's numbers.
         """
-        for _ in range(ATTEMPTS if self.alike(step) is not None else 0):
-            found = self.attempt(camera, photograph, background, raster, step)
+        for _ in range(ATTEMPTS if self.alike(view.step) is not None else 0):
+            found = self.attempt(view)
             if found is None:
                 break
             facts = found.facts.tolist()
@@ -180,43 +193,34 @@ class Recorder:
             if self.room.hold(needed):
                 told = Told(loss, dict(zip(gradients(self.backbone.table), sums, strict=True)))
                 return learnt_now(found, needed, told)
-            if max(needed.rows, needed.pairs) > raster.max_pairs:  # refused by name elsewhere
+            if max(needed.rows, needed.pairs) > view.raster.max_pairs:  # refused by name elsewhere
                 break
             self.make_room(needed)
         zero_grad(self.backbone.table)
         return None
 
-    def attempt(
-        self,
-        camera: Camera,
-        photograph: UInt8[Tensor, "3 H W"],
-        background: Float[Tensor, "3"],
-        raster: RasterSettings,
-        step: int,
-    ) -> Learnt | None:
+    def attempt(self, view: ToLearn) -> Learnt | None:
         """Replay what is recorded, record it, or, the first time, only do it; None where it cannot be recorded."""
-        table = self.backbone.table
+        table, pose = self.backbone.table, view.pose()
         zero_grad(table)
-        host = (checked_lens(camera, raster), camera.rotation, camera.translation, camera.centre)
-        pose = uploaded(torch.cat([numbers.double().flatten() for numbers in host]), photograph.device)
-        dilations = dilations_of(camera, None, raster)
-        way = (self.alike(step), camera.size, camera.frame, dilations, raster, self.room)
+        same = (self.alike(view.step), view.camera.size, view.camera.frame, view.raster, self.room)
+        way = (*same, dilations_of(view.camera, None, view.raster))
         held = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
         key = (way, *(id(tensor) for tensor in held))
         if self.last is not None and self.last.key == key:
-            return replayed(self.last, table, pose, photograph, background)
+            return replayed(self.last, table, pose, view)
         self.forget()
-        inputs = Inputs(pose=pose, photograph=photograph.clone(), background=background.clone())
+        inputs = Inputs(pose=pose, photograph=view.photograph.clone(), background=view.background.clone())
 
         def work() -> Learnt:
-            return self.work(inputs, camera, raster, step)
+            return self.work(inputs, view)
 
         if way not in self.done:
             found = work()
             self.done.add(way)
             return found
         self.last = self.recorded(key, inputs, held, work)
-        return None if self.last is None else replayed(self.last, table, pose, photograph, background)
+        return None if self.last is None else replayed(self.last, table, pose, view)
 
     def recorded(
         self, key: Hashable, inputs: Inputs, held: Sequence[Tensor], work: Callable[[], Learnt]
@@ -231,13 +235,13 @@ class Recorder:
         found = gradients(self.backbone.table)
         return Recorded(key=key, inputs=inputs, made=made, graph=graph, gradients=found, held=held)
 
-    def work(self, inputs: Inputs, camera: Camera, raster: RasterSettings, step: int) -> Learnt:
-        """What is recorded."""
-        seen_by, lens = inputs.camera(camera)
-        drawn, fixed = self.backbone.draw(seen_by, step), FixedLists(lens=lens, **vars(self.room))
-        absolute = self.backbone.absolute_gradient
+    def work(self, inputs: Inputs, view: ToLearn) -> Learnt:
+        """What is recorded; of what differs from view to view it reads the inputs alone."""
+        camera, lens = inputs.camera(view.camera)
+        drawn, fixed = self.backbone.draw(camera, view.step), FixedLists(lens=lens, **vars(self.room))
+        colour, absolute = inputs.background, self.backbone.absolute_gradient
         rendering = rasterize_fixed(
-            drawn.splats, seen_by, raster, fixed, background=inputs.background, absolute_gradient=absolute
+            drawn.splats, camera, view.raster, fixed, background=colour, absolute_gradient=absolute
         )
         target = numbers_of(inputs.photograph)
         loss = photometric(rendering.image, target, self.ssim_weight, compiled=True)
@@ -265,16 +269,10 @@ class Recorder:
         )
 
 
-def replayed(
-    last: Recorded,
-    table: ParameterTable,
-    pose: Float[Tensor, "31"],
-    photograph: UInt8[Tensor, "3 H W"],
-    background: Float[Tensor, "3"],
-) -> Learnt:
-    """A recorded step on these inputs."""
-    inputs = last.inputs
-    for place, value in ((inputs.pose, pose), (inputs.photograph, photograph), (inputs.background, background)):
+def replayed(last: Recorded, table: ParameterTable, pose: Float[Tensor, "31"], view: ToLearn) -> Learnt:
+    """A recorded step on this view."""
+    places = last.inputs.pose, last.inputs.photograph, last.inputs.background
+    for place, value in zip(places, (pose, view.photograph, view.background), strict=True):
         place.copy_(value)
     last.graph.replay()
     for name, parameter in named_parameters(table):

@@ -27,6 +27,7 @@ from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.photographs import numbers_of
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
+from gsx.core.training.recorded import ToLearn
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -204,7 +205,9 @@ def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"])
     """
     assert run.recorder is not None
     photograph = run.photographs.bytes_of(view)
-    learnt = run.recorder.learn(view.camera, photograph, colour, run.raster, number)
+    learnt = run.recorder.learn(
+        ToLearn(camera=view.camera, photograph=photograph, background=colour, raster=run.raster, step=number)
+    )
     if learnt is None:
         return None
     return Step(
