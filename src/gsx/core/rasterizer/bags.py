@@ -10,6 +10,12 @@ SPARE = 64
 """Entries behind a list are summed in bags of so many: a GPU walks through a bag by itself, whatever its length."""
 
 
+def edges_of(counts: Int[Tensor, "N"]) -> Int[Tensor, "N_1"]:
+    """Where each row of a list begins that has so many entries, and where the last one ends."""
+    ends = counts.cumsum(0)
+    return torch.cat([torch.zeros_like(ends[:1]), ends])
+
+
 def bag_sums(
     values: Float[Tensor, "E V"], places: Int[Tensor, "P"], edges: Int[Tensor, "N_1"], spare: bool
 ) -> Float[Tensor, "N V"]:

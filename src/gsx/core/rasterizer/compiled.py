@@ -4,7 +4,6 @@ Two schedules of the same mathematics. `chunks`: front to back, one chunk of all
 whose pixels have all ended leave. `segments`: all blocks of all tiles at once (segments.py).
 """
 
-import functools
 import math
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from gsx.core.compiling import available
 from gsx.core.rasterizer.fixed_lists import FixedLists
-from gsx.core.rasterizer.grid import TileGrid, pixel_centres
+from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
@@ -31,23 +30,6 @@ VALUES, VALUES_OF_A_GPU = 1 << 22, 1 << 26
 """Alpha values at once where `compiled_values` leaves it to the device, a CPU or not."""
 WORTH_LEAVING = 0.75
 """Groups are picked out when at most this share of them is still going: picking costs a copy."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Basis:
-    """Pixel centres of a tile relative to its middle, and their products."""
-
-    x: Float[Tensor, "P 1"]
-    y: Float[Tensor, "P 1"]
-    products: Float[Tensor, "3 P 1"]
-    """x^2, x y, y^2."""
-
-
-@functools.lru_cache
-def basis_of(tile: int, dtype: torch.dtype, device: torch.device) -> Basis:
-    """That of tiles of so many px."""
-    x, y = pixel_centres(tile, torch.empty(0, dtype=dtype, device=device))[:2, :, None].unbind(0)
-    return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

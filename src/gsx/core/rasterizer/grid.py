@@ -1,5 +1,6 @@
 """The tiles of a raster. They are laid on the camera's frame, so that a crop sees the same tiles as the whole."""
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -65,3 +66,20 @@ def pixel_centres(tile: int, like: Tensor) -> Float[Tensor, "3 P"]:
     offset = torch.arange(tile, device=like.device, dtype=like.dtype) + 0.5 - tile / 2
     y, x = torch.meshgrid(offset, offset, indexing="ij")
     return torch.stack([x.reshape(-1), y.reshape(-1), torch.ones_like(x).reshape(-1)])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Basis:
+    """Pixel centres of a tile relative to its middle, and their products."""
+
+    x: Float[Tensor, "P 1"]
+    y: Float[Tensor, "P 1"]
+    products: Float[Tensor, "3 P 1"]
+    """x^2, x y, y^2."""
+
+
+@functools.lru_cache
+def basis_of(tile: int, dtype: torch.dtype, device: torch.device) -> Basis:
+    """That of tiles of so many px."""
+    x, y = pixel_centres(tile, torch.empty(0, dtype=dtype, device=device))[:2, :, None].unbind(0)
+    return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))

@@ -15,7 +15,7 @@ from gsx.core.compiling import fused
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
-from gsx.core.rasterizer.bags import bag_sums
+from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
 from gsx.core.rasterizer.fixed_lists import FixedLists, owners
 from gsx.core.rasterizer.grid import TileGrid
@@ -208,9 +208,7 @@ def sum_by_splat(
 ) -> Float[Tensor, "count V"]:
     """Sums over the entries of each splat, always in the same order; `places`: entry of each pair, pairs sorted by
     splat."""
-    ends = intersections.counts.cumsum(0)
-    edges = torch.cat([torch.zeros_like(ends[:1]), ends])
-    sums = bag_sums(values, places, edges, spare=intersections.needed is not None)
+    sums = bag_sums(values, places, edges_of(intersections.counts), spare=intersections.needed is not None)
     return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 

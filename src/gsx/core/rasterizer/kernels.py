@@ -9,6 +9,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any
 
 import torch
@@ -323,6 +324,11 @@ SHARING = {"blend": 30, "moments": 50}
 Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
 """
 
+SHARED_AFTER = 50
+"""The same of all others: with more of them slopes by segments find weights twice."""
+OF_A_TILE = {"x", "y", "products"}
+"""Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
+
 
 def thresholds() -> list[str]:
     """The compiler's options that say when a value is shared: CPUs have one of their own since torch 2.12."""
@@ -349,16 +355,16 @@ def kernels(rules: Rules) -> Kernels:
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     """`loop` of these rules through torch.compile."""
-    options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, 50))
+    options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
     if loop.__name__ in SHARING:
         # no guards on symbols, which are the number of blocks, the same in all arguments, and where in storage a view
         # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one, and 32-bit
         # indices suffice (RasterSettings.compiled_values)
         options["guard_filter_fn"] = lambda guards: [guard.guard_type != "SHAPE_ENV" for guard in guards]
+    names = [name for name in signature(loop).parameters if name != "rules"]
+
+    def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
+        given = [value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE]
+        return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
+
     return sizes_free(torch.compile(with_last(loop, rules), fullgraph=True, options=options), varying)
-
-
-def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
-    """Blocks vary in number, and splats; pixels and products (at most three dimensions ending in one) do not."""
-    tensors = [tensor for argument in arguments for tensor in (argument if isinstance(argument, list) else [argument])]
-    return [(tensor, 0) for tensor in tensors if tensor.shape[-1] > 1]

@@ -7,19 +7,13 @@ varies from tile to tile is read by the tile's number.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from inspect import signature
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import WHOLE_LOOPS, sizes_free, with_last
 from gsx.core.gaussians.bands import sum_of_products
-from gsx.core.rasterizer.kernels import Rules, blended, entry_gradients, fade, make_rows, slopes, sums_of, thresholds
+from gsx.core.rasterizer.kernels import Rules, blended, compiled, entry_gradients, fade, make_rows, slopes, sums_of
 from gsx.core.shapes import Float, Int
-
-SHARED_AFTER = 50
-"""Operations after which the compiler shares an intermediate value: with more of them it computes weights twice."""
 
 
 def light(
@@ -92,23 +86,9 @@ class SegmentKernels:
 
 
 LOOPS = (make_rows, fade, light, own_picture, entry_slopes, entry_sums, entry_gradients)
-FIXED = {"x", "y", "products"}
-"""Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 
 
 @functools.lru_cache
 def segment_kernels(rules: Rules) -> SegmentKernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks and tiles."""
     return SegmentKernels(**{loop.__name__: compiled(loop, rules) for loop in LOOPS})
-
-
-def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
-    """`loop` of these rules through torch.compile."""
-    options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARED_AFTER)
-    names = [name for name in signature(loop).parameters if name != "rules"]
-
-    def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
-        given = [value for name, value in zip(names, arguments, strict=True) if name not in FIXED]
-        return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
-
-    return sizes_free(torch.compile(with_last(loop, rules), fullgraph=True, options=options), varying)

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import fused
-from gsx.core.rasterizer.bags import bag_sums
+from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.fixed_lists import FixedLists
-from gsx.core.rasterizer.grid import TileGrid, pixel_centres
+from gsx.core.rasterizer.grid import TileGrid, basis_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.kernels import TABLE, Rules
 from gsx.core.rasterizer.precision import Precision
@@ -56,8 +56,8 @@ def cut(
     Where a list has no room, because sizes were given, all that has none shares the last entry.
     """
     counts = torch.div(intersections.starts.diff() + (chunk - 1), chunk, rounding_mode="floor")
-    ends = counts.cumsum(0)
-    edges, needed = torch.cat([torch.zeros_like(ends[:1]), ends]), torch.stack([ends[-1], counts.amax()])
+    edges = edges_of(counts)
+    needed = torch.stack([edges[-1], counts.amax()])
     total, most = (fixed.blocks, fixed.longest) if fixed else needed.tolist()
     size = max(LEAST_BLOCKS, total)
     place = entry_places(edges, intersections.starts, intersections.tiles, chunk).clamp_max(size * chunk - 1)
@@ -184,13 +184,13 @@ def segment_job(
     segments: Segments, grid: TileGrid, rules: Rules, precision: Precision, values: int, device: torch.device
 ) -> SegmentJob:
     """What the schedule needs beside its lists; `values`: alphas at once."""
-    x, y = pixel_centres(grid.tile, torch.empty(0, dtype=precision.exact, device=device))[:2].unbind()
+    basis = basis_of(grid.tile, precision.exact, device)
     return SegmentJob(
         segments=segments,
         grid=grid,
-        x=x,
-        y=y,
-        products=torch.stack([x * x, x * y, y * y]),
+        x=basis.x[:, 0],
+        y=basis.y[:, 0],
+        products=basis.products[..., 0],
         loops=segment_kernels(rules),
         rules=rules,
         precision=precision,

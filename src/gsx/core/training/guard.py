@@ -8,12 +8,11 @@ import logging
 import math
 
 import torch
-from torch import Tensor
 
 from gsx.core.errors import Disagreement, LostModel, TrainingError
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
-from gsx.core.training.recorded import Told
+from gsx.core.training.recorded import loss_and_sums, told_of
 from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
@@ -65,7 +64,7 @@ class Guard:
 def culprit(run: Run, step: Step) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
     found = gradients(run.backbone.table)
-    loss, sums = step.told or told_now(step, found)
+    loss, sums = step.told or told_of(loss_and_sums(step.loss, found).tolist(), found)
     if not math.isfinite(loss):
         return f"the loss is {loss}"
     for name, gradient in found.items():
@@ -75,12 +74,6 @@ def culprit(run: Run, step: Step) -> str | None:
                 continue
             return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
     return None
-
-
-def told_now(step: Step, found: dict[str, Tensor]) -> Told:
-    """The loss and the sums of these gradients: a GPU is waited for once."""
-    loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in found.values())]).tolist()
-    return Told(loss, dict(zip(found, sums, strict=True)))
 
 
 class Agreement:

@@ -8,7 +8,7 @@ its host waits for, and is taken again if not. Pictures and gradients are those 
 """
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -75,6 +75,17 @@ class Told(NamedTuple):
     loss: float
     sums: dict[str, float]
     """Of the gradient of each parameter that has one."""
+
+
+def loss_and_sums(loss: Float[Tensor, ""], found: Mapping[str, Tensor]) -> Float[Tensor, "G_1"]:
+    """The numbers of `Told` in order, for gradients by name: a GPU is waited for once to hear them."""
+    return torch.stack([loss, *(gradient.sum() for gradient in found.values())])
+
+
+def told_of(numbers: Sequence[float], found: Mapping[str, Tensor]) -> Told:
+    """What `loss_and_sums` of these gradients says."""
+    loss, *sums = numbers
+    return Told(loss, dict(zip(found, sums, strict=True)))
 
 
 NEEDED = len(Needed._fields)
@@ -189,10 +200,9 @@ class Recorder:
             if found is None:
                 break
             facts = found.facts.tolist()
-            needed, (loss, *sums) = Needed(*map(int, facts[:NEEDED])), facts[NEEDED:]
+            needed = Needed(*map(int, facts[:NEEDED]))
             if self.room.hold(needed):
-                told = Told(loss, dict(zip(gradients(self.backbone.table), sums, strict=True)))
-                return learnt_now(found, needed, told)
+                return learnt_now(found, needed, told_of(facts[NEEDED:], gradients(self.backbone.table)))
             if max(needed.rows, needed.pairs) > view.raster.max_pairs:  # refused by name elsewhere
                 break
             self.make_room(needed)
@@ -249,7 +259,7 @@ class Recorder:
         loss = loss if extra is None else loss + extra
         loss.backward()
         assert rendering.needed is not None
-        sums = torch.stack([loss.detach(), *(slope.sum() for slope in gradients(self.backbone.table).values())])
+        sums = loss_and_sums(loss.detach(), gradients(self.backbone.table))
         return Learnt(
             drawn=DrawnSplats(splats=without_graph(drawn.splats), rows=drawn.rows),
             rendering=replace(rendering, image=rendering.image.detach(), alpha=rendering.alpha.detach()),
