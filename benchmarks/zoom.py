@@ -45,7 +45,10 @@ SUBJECTS = {
     "desk_bottle": ("scene=colmap", "scene.downscale=8", "iterations=1000"),
     "castle": ("scene=photos", "scene.downscale=8", "iterations=800"),
     "demo": ("scene=demo", "iterations=900"),
+    "room": ("scene=room", "iterations=1500"),
 }
+BUILT_IN = ("demo", "room")
+USUAL = "fox,lego,desk_bottle,castle,demo"
 RULES = ("none", "magnified", "resampled")
 """Values of backbone.filter that suit a model of plain 3D-GS."""
 ZOOMS = ("1", "2", "4")
@@ -127,7 +130,7 @@ def shared_arguments(description: str | None, only: str, kept: str) -> argparse.
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/zoom")
+    parser = shared_arguments(__doc__, USUAL, "outputs/zoom")
     parser.add_argument("--what", default="rules,compositions,parts,levels,pictures,afar", help="tables, by commas")
     parser.add_argument("--label", default="", help="of tables over other scenes or seeds: added to their names")
     return parser.parse_args(words)
@@ -142,9 +145,9 @@ def refuse_unknown(asked: str, known: Collection[str]) -> None:
 def scenes_at_hand(given: argparse.Namespace) -> list[str]:
     """Those asked for that are there; ends with a message where there are none."""
     refuse_unknown(given.only, SUBJECTS)
-    scenes = [name for name in given.only.split(",") if name == "demo" or given.scenes is not None]
+    scenes = [name for name in given.only.split(",") if name in BUILT_IN or given.scenes is not None]
     if not scenes:
-        sys.exit(f"--only {given.only}: all but demo need --scenes FOLDER")
+        sys.exit(f"--only {given.only}: all but {' and '.join(BUILT_IN)} need --scenes FOLDER")
     return scenes
 
 
@@ -160,7 +163,7 @@ def folder_of(scene: str, seed: int, given: argparse.Namespace, name: str = "") 
 
 def trained(scene: str, seed: int, given: argparse.Namespace, overrides: Sequence[str], name: str = "") -> Path:
     """The folder of a run, which is trained unless it is there; overrides win over the subject's own."""
-    where = () if scene == "demo" else (f"scene.path={given.scenes / scene}",)
+    where = () if scene in BUILT_IN else (f"scene.path={given.scenes / scene}",)
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
     folder = folder_of(scene, seed, given, name)
     print(time.strftime("%H:%M"), folder.name, flush=True)

@@ -6,6 +6,7 @@ from typing import Annotated
 from gsx.backbones.capacity_options import CapacityOptions
 from gsx.backbones.mip import MipOptions, checked_filter
 from gsx.core.ranges import Gradient, Interval, Range, Rate, Share, Steps
+from gsx.core.training.occasions import WHEN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,8 @@ class GS3DOptions(CapacityOptions):
     """Share of the run after which every Gaussian keeps the SH bands that are worth their numbers; 0: it keeps all."""
     sh_price: Annotated[float, Range(1e-6, 100)] = 0.8
     """dB that a doubling of all numbers of the model has to bring."""
+    sky: str = "never"
+    """Whether Gaussians far away stand behind the scene (`core.data.sky`); auto: where photographs look past it."""
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     rates: Rates
     density: Density
@@ -74,5 +77,7 @@ class GS3DOptions(CapacityOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         checked_filter(self.filter)
+        if self.sky not in WHEN:
+            raise ValueError(f"backbone.sky is '{self.sky}'; choose from {', '.join(WHEN)}")
         if not (self.rates.means_first > 0 and self.rates.means_last > 0):
             raise ValueError("backbone.rates.means_first and means_last must be positive: they decay log-linearly")

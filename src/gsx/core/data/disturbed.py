@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.movement import moved
 from gsx.core.data.scene import FromFile, ImageSource, Masked, Scene, View
 from gsx.core.data.taken import as_taken
 from gsx.core.errors import ConfigError
@@ -18,7 +19,7 @@ from gsx.core.shapes import Bool, Float, UInt8
 
 BALANCE = 0.25
 """Spread of a channel's own gain, of that of the exposure."""
-MOST = {"exposure": 2.0, "pose": 64.0, "covered": 0.9, "some": 1.0}
+MOST = {"exposure": 2.0, "pose": 64.0, "blur": 16.0, "covered": 0.9, "some": 1.0}
 """What photographs may suffer, and the largest value of each."""
 
 
@@ -51,16 +52,20 @@ class Patch:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Worse:
-    """A source of a photograph that was taken at another exposure, with something in the way."""
+    """A source of a photograph that was taken at another exposure, by a moving camera, with something in the way."""
 
     source: ImageSource
     gains: Float[Tensor, "3"] | None = None
     """Display values are multiplied by them, and saturate."""
     patch: Patch | None = None
+    movement: tuple[float, float] | None = None
+    """Across and down, as shares of the frame's sides, while it was exposed."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
         image = self.source.image(camera)
+        if self.movement is not None:
+            image = swept(image, camera, *self.movement)
         if self.gains is not None:
             image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
         return image if self.patch is None else self.patch.over(image, camera)
@@ -85,6 +90,12 @@ class WorseFile(Worse):
         return self.source.path
 
 
+def swept(image: UInt8[Tensor, "3 H W"], camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
+    """A picture as a camera takes it that moves by such shares of the frame's sides."""
+    px = across * camera.frame.width, down * camera.frame.height
+    return moved(image.float(), *px).round().clamp(0, 255).to(torch.uint8)
+
+
 # -- what one photograph suffers ---------------------------------------------------------------------------------------
 
 
@@ -103,6 +114,13 @@ def turn_of(name: str, spread: float) -> tuple[float, float]:
     """Px to the right and down by which the middle of the picture of that photograph moves, of that standard
     deviation."""
     across, down = (spread * torch.randn(2, generator=generator_of("pose", name)).double()).tolist()
+    return across, down
+
+
+def movement_of(name: str, spread: float) -> tuple[float, float]:
+    """Px to the right and down by which the camera's picture moved while that photograph was exposed, of that standard
+    deviation."""
+    across, down = (spread * torch.randn(2, generator=generator_of("blur", name)).double()).tolist()
     return across, down
 
 
@@ -134,12 +152,14 @@ def patch_of(name: str, share: float) -> Patch:
 
 def worse(view: View, by: Mapping[str, float]) -> View:
     """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken."""
-    exposure, pose, covered = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered"))
+    exposure, pose, covered, blur = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
+    across, down = movement_of(view.name, blur)
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
         patch=patch_of(view.name, covered) if covered else None,
+        movement=(across / view.camera.frame.width, down / view.camera.frame.height) if blur else None,
     )
     return replace(view, source=source, camera=turned(view.camera, view.name, pose) if pose else view.camera)
 
@@ -157,8 +177,9 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     """The scene with training photographs made worse, and a note that says so; test photographs stay as they are.
 
     by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
-    `pose`: of how far pictures move along each axis when cameras are turned, px. `covered`: share of each photograph
-    that something plain stands before. `some`: the share of photographs that suffer; 1 where it is not said.
+    `pose`: of how far pictures move along each axis when cameras are turned, px. `blur`: of how far they move while
+    they are exposed, px. `covered`: share of each photograph that something plain stands before. `some`: the share of
+    photographs that suffer; 1 where it is not said.
 
     Raises:
         ConfigError: there is no such disturbance, or it is too large.

@@ -12,6 +12,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.quality.alignment import aligned, usual_depth
 from gsx.core.quality.distractors import Difference, difference_of, distractors_in
+from gsx.core.quality.motion_blur import Movement, movement_between
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.distractors import share_of
@@ -32,6 +33,7 @@ def judge_photographs(run: Run) -> dict[str, float]:
     """Ask whatever is due before the next step; for its line of metrics.jsonl."""
     told = judge_poses(run) if run.poses.due(run.step + 1) else {}
     told |= judge_exposures(run) if run.exposures.due(run.step + 1) else {}
+    told |= judge_blur(run) if run.blur.due(run.step + 1) else {}
     return told | (judge_distractors(run) if run.distractors.due(run.step + 1) else {})
 
 
@@ -88,6 +90,28 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
     return run.poses.correct([view.camera for view in views], after, depth, run.step + 1)
 
 
+def judge_blur(run: Run) -> dict[str, float]:
+    """By how much the camera moved in photographs that are less sharp than others; for the line of the step."""
+    begun, found, number = time.perf_counter(), dict[str, Movement](), run.step + 1
+    suspects = run.blur.suspects(run.photographed)
+    for view in suspects:
+        run.refuse_if_stopping()
+        photograph, counted = view.image(), view.counted()
+        shown = render(run, view.camera, supersample=1).image
+        image = at_exposure(run.exposures.applied(shown, view.name).detach().cpu(), photograph, counted)
+        found[view.name] = movement_between(image, photograph, counted)
+    run.blur.move(found, number)
+    lengths = [found[name].length for name in run.blur.movements]
+    told = f", by {median(lengths):.1f} px in the middle of them" if lengths else ""
+    logger.info(
+        "step %d: the camera moved in %d of the %d photographs that were asked%s",
+        *(number, len(lengths), len(suspects), told),
+    )
+    seconds = round(time.perf_counter() - begun, 3)
+    told_of = {"blurred": len(lengths), "blur_suspects": len(suspects), "blur_seconds": seconds}
+    return told_of | ({"blur_length": median(lengths)} if lengths else {})
+
+
 def judge_distractors(run: Run) -> dict[str, float]:
     """Whether photographs show distractors, where that is asked first, and find those of all if so; for the line of
     the step."""
@@ -121,7 +145,7 @@ def differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         photograph, counted = small.image(), small.counted()
-        image = at_exposure(run.exposures.applied(shown.image, view.name).detach().cpu(), photograph, counted)
+        image = at_exposure(run.as_photographed(shown.image, view).detach().cpu(), photograph, counted)
         found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
     return found
 

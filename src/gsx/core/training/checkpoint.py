@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
 from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import restored_table, table_tensors
@@ -66,10 +67,11 @@ def write(run: Run, folder: Path) -> Path:
     return path
 
 
-def parts_of(run: Run) -> dict[str, Exposures | Plateau | Poses | Distractors]:
+def parts_of(run: Run) -> dict[str, Exposures | Blur | Plateau | Poses | Distractors]:
     """What a run learns beside its model, by how the names of its tensors begin."""
     return {
         "exposure.": run.exposures,
+        "blur.": run.blur,
         "plateau.": run.plateau,
         "poses.": run.poses,
         "distractors.": run.distractors,

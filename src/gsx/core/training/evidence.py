@@ -206,12 +206,12 @@ def some_of(views: Sequence[View], count: int, generator: torch.Generator) -> li
     return [views[index] for index in torch.randperm(len(views), generator=generator)[:count].tolist()]
 
 
-Exposed = Callable[[Float[Tensor, "3 H W"], str], Float[Tensor, "3 H W"]]
-"""A render as the photograph of that name would have it (`core.training.exposure`)."""
+Exposed = Callable[[Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
+"""A render as the photograph of that view shows it (`Run.as_photographed`)."""
 
 
-def as_it_is(image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
-    """For photographs of one exposure."""
+def as_it_is(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
+    """For photographs of one exposure, by cameras that stood still."""
     return image
 
 
@@ -249,6 +249,6 @@ def window_error(
     splats = model.draw(form(view.camera).drawn_for, step).splats
     raster, counted = form(window.of(view.camera)), view.counted()
     rendering = rasterize(splats, raster.camera, model.raster, background=background)
-    shown = exposed(raster.reduced(rendering.image), view.name)
+    shown = exposed(raster.reduced(rendering.image), view)
     off = shown - window.cut(view.image()).to(shown)
     return blacked(off, None if counted is None else counted[window.pixels]).double().square().sum()

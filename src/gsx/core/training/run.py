@@ -18,6 +18,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation, Settling
+from gsx.core.training.blur import Blur, BlurOptions
 from gsx.core.training.checked_regenerator import Tally
 from gsx.core.training.distractors import DistractorOptions, Distractors
 from gsx.core.training.distributed import Ranks
@@ -56,6 +57,7 @@ class TrainingOptions:
     """Share of the steps after which they are seen as they are."""
     exposure: ExposureOptions = field(default_factory=ExposureOptions)
     poses: PoseOptions = field(default_factory=PoseOptions)
+    blur: BlurOptions = field(default_factory=BlurOptions)
     distractors: DistractorOptions = field(default_factory=DistractorOptions)
     cooldown: Share = 0.0
     """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
@@ -192,12 +194,15 @@ class Run:
     """Takes steps that can be recorded; None: all are launched one by one."""
     photographs: Photographs = field(init=False)
     exposures: Exposures = field(init=False)
+    blur: Blur = field(init=False)
     plateau: Plateau = field(init=False)
 
     def __post_init__(self) -> None:
         self.photographs = Photographs(self.device, self.photograph_bytes)
         names = [view.name for view in self.scene.train]
         self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
+        widths = {view.name: view.camera.width for view in self.scene.train}
+        self.blur = Blur(self.training.blur, self.iterations, widths)
         passing = -(-len(names) // self.training.batch)
         self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 
@@ -220,6 +225,10 @@ class Run:
     def complete(self) -> bool:
         """All iterations are done."""
         return self.step >= self.iterations
+
+    def as_photographed(self, image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
+        """A render as the photograph of a training view shows it: by a camera that moved, at its exposure."""
+        return self.exposures.applied(self.blur.applied(image, view), view.name)
 
     def refuse_if_stopping(self) -> None:
         """To be called within long parts of a step that change nothing yet.
@@ -284,6 +293,7 @@ def settled_after(run: Run) -> int:
     steps = [
         run.exposures.first,
         *run.poses.steps(),
+        *run.blur.steps(),
         *run.distractors.steps(),
         run.resolution.coarse_until,
         run.resolution.finer_after,

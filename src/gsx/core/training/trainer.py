@@ -92,7 +92,7 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     """Squared error in each validation window by the rules of a step, the same on all ranks."""
     if not windows:
         return torch.zeros(0, dtype=torch.float64)
-    model, form, exposed = run.backbone, run.resolution.forming(step), run.exposures.applied
+    model, form, exposed = run.backbone, run.resolution.forming(step), run.as_photographed
 
     def look() -> Tensor:
         return window_errors(model, model.table, windows, form, run.background, run.model_step, exposed).cpu()
@@ -149,7 +149,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     compared with its own render.
     """
     counted, seen = counted_in_loss(run, view, number), list[Observation]()
-    if counted is None and not terms and may_be_recorded(run, number):
+    if counted is None and not terms and may_be_recorded(run, number, view):
         step = recorded_step(run, number, view, colour)
         if step is not None:
             return step
@@ -160,7 +160,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    shown = saturated(run.exposures.applied(rendering.image, view.name), target, run.exposures)
+    shown = saturated(run.as_photographed(rendering.image, view), target, run.exposures)
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
@@ -189,12 +189,13 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     )
 
 
-def may_be_recorded(run: Run, number: int) -> bool:
-    """Whether views without pseudo views and masks are learnt by recorded work at a step."""
+def may_be_recorded(run: Run, number: int, view: View) -> bool:
+    """Whether a view, if without pseudo views and masks, is learnt by recorded work at a step."""
     if run.recorder is None or run.recorder.alike(number) is None:
         return False
     alone = run.training.batch == 1 and run.ranks.size == 1
-    return alone and run.exposures.matrices is None and run.resolution.supersample_at(number) == 1
+    plain = run.exposures.matrices is None and view.name not in run.blur.movements
+    return alone and plain and run.resolution.supersample_at(number) == 1
 
 
 def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> Step | None:

@@ -119,7 +119,7 @@ def above_rounding(decibels: float) -> float:
 def shown(run: Run, view: View, gaussians: Gaussians | None) -> Float[Tensor, "3 H W"]:
     """A view by the model, or by other Gaussians, at the exposure of its photograph."""
     splats = None if gaussians is None else splats_of(gaussians, view.camera.centre)
-    return run.exposures.applied(render(run, view.camera, splats=splats).image, view.name).clamp(0, 1).cpu()
+    return run.as_photographed(render(run, view.camera, splats=splats).image, view).clamp(0, 1).cpu()
 
 
 # -- what is worth least -----------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ class CapNotice:
 
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What lines of metrics.jsonl tell of a whole run: what a cap has `withheld`, pictures of `pseudo` views, and
-    exposures, poses and distractors of photographs.
+    exposures, poses, distractors and blur of photographs.
 
     Only what there is.
     """
@@ -58,7 +58,7 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
     pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
     found = {"withheld": cap, "pseudo": pseudo, "exposures": judged_exposures(lines), "poses": judged_poses(lines)}
-    found["distractors"] = judged_distractors(lines)
+    found["distractors"], found["blur"] = judged_distractors(lines), judged_blur(lines)
     return {key: value for key, value in found.items() if value}
 
 
@@ -94,6 +94,17 @@ def judged_distractors(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"step": told[0]["step"], "share": (shares or [None])[0], "marked": marked, "seconds": seconds}
 
 
+def judged_blur(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """At which step movements of cameras were told first; at last of how many photographs of how many that were asked,
+    px of the middle one; and seconds of it all."""
+    told = [line for line in lines if "blur_seconds" in line]
+    if not told:
+        return {}
+    counts = {"step": told[0]["step"], "blurred": told[-1]["blurred"], "asked": told[-1]["blur_suspects"]}
+    seconds = sum(line["blur_seconds"] for line in told)
+    return counts | {"length": told[-1].get("blur_length", 0.0), "seconds": seconds}
+
+
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
     asked = added(event["asked"] for event in events)
@@ -115,7 +126,8 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
-    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, exposure_remarks, pose_remarks, distractor_remarks)
+    of_photographs = exposure_remarks, pose_remarks, distractor_remarks, blur_remarks
+    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, *of_photographs)
     return [remark for kind in kinds for remark in kind(evaluation)]
 
 
@@ -166,6 +178,16 @@ def distractor_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"{found['marked'][-1]:.1%} of the pixels of training photographs show what others do not, and do not "
             f"count from step {found['step']:,} on"
+        )
+
+
+def blur_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Photographs in which the camera moved."""
+    found = evaluation.get("blur") or {}
+    if found.get("blurred"):
+        yield (
+            f"the camera moved in {found['blurred']} training photographs, by {found['length']:.1f} px in the middle "
+            f"of them: renders are moved alike before they are compared, from step {found['step']:,} on"
         )
 
 

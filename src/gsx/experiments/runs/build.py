@@ -74,7 +74,7 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 
 def refuse_shared(training: TrainingOptions, ranks: Ranks) -> None:
     """Raise ConfigError where processes would have to find together what photographs have wrong."""
-    for key in ("exposure", "poses", "distractors"):
+    for key in ("exposure", "poses", "blur", "distractors"):
         when = getattr(training, key).when
         if ranks.size > 1 and when != "never":
             raise ConfigError(

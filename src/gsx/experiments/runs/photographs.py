@@ -94,8 +94,8 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
 
 
 def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """A render at the exposure that was learnt for its photograph, if any; on the CPU."""
-    return run.exposures.applied(image, view.name).clamp(0, 1).cpu()
+    """A render at the exposure and with the movement that were found for its photograph, if any; on the CPU."""
+    return run.as_photographed(image, view).clamp(0, 1).cpu()
 
 
 @torch.no_grad()

@@ -1,0 +1,43 @@
+"""Pictures of a camera that moves while they are taken.
+
+A turn of the camera moves all of a picture alike, whatever its depth, and in a short time about evenly along a line:
+what is taken is the mean of the sharp picture over that line.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from gsx.core.shapes import Float
+
+SAMPLES = 4
+"""Places along a movement, for each px of it."""
+
+
+def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
+    """Weights of the mean over a movement, its middle in the middle, float64: points along it, each shared out to the
+    four pixels around it."""
+    count = max(1, math.ceil(SAMPLES * math.hypot(across, down)))
+    along = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
+    radius = math.ceil(max(abs(across), abs(down)) / 2)
+    places = torch.stack([down * along, across * along], 1) + radius
+    first = places.floor()
+    (up, left), (low, right) = (part.unbind(1) for part in (1 - (places - first), places - first))
+    kernel = torch.zeros(2 * radius + 2, 2 * radius + 2, dtype=torch.float64)
+    row, column = first.long().unbind(1)
+    for rows, of_row in ((0, up), (1, low)):
+        for columns, of_column in ((0, left), (1, right)):
+            kernel.index_put_((row + rows, column + columns), of_row * of_column / count, accumulate=True)
+    return kernel[: 2 * radius + 1, : 2 * radius + 1]
+
+
+def moved(image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
+    """The mean of a picture over a movement, px; beyond its edges it goes on as it is there."""
+    kernel = line_kernel(across, down).to(image)
+    side = len(kernel) // 2
+    if side == 0:
+        return image
+    around = pad(image[None], (side, side, side, side), mode="replicate")[0]
+    return conv2d(around[:, None], kernel[None, None])[:, 0]
