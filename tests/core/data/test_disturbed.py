@@ -8,7 +8,8 @@ import torch
 from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.disturbed import disturbed, gains_of, turn_of
+from gsx.core.data.disturbed import disturbed, gains_of, movement_of, turn_of
+from gsx.core.data.movement import moved
 from gsx.core.data.scene import FromFile, Masked, View
 from gsx.core.errors import ConfigError
 
@@ -90,6 +91,30 @@ def test_what_stands_before_a_photograph_covers_its_share_at_every_size() -> Non
     assert torch.equal(one.source.image(crop), one.source.image(whole)[:, 30:70, 50:110])
 
 
+class Stripes(Grey):
+    """Columns, light and dark, an eighth of the frame each."""
+
+    def image(self, camera: Camera) -> torch.Tensor:
+        column = (torch.arange(camera.width) + camera.frame.left) * 8 // camera.frame.width
+        return (200 * (column % 2)).expand(3, camera.height, -1).to(torch.uint8)
+
+
+def test_a_camera_that_moves_sweeps_its_photograph_at_every_size_and_in_crops() -> None:
+    scene = small_scene(spread(5))
+    own = View("swept", scene.train[0].camera.zoom(8), Stripes())
+    [worse] = disturbed(replace(scene, train=[own]), {"blur": 3.0}).train
+    across, down = movement_of("swept", 3.0)
+    expected = moved(own.source.image(own.camera).float(), across, down).round()
+    assert torch.equal(worse.source.image(own.camera), expected.byte())
+    finer = own.camera.zoom(2)
+    twice = moved(own.source.image(finer).float(), 2 * across, 2 * down).round()
+    assert torch.equal(worse.source.image(finer), twice.byte())
+    part = own.camera.crop(50, 30, 60, 40)
+    assert torch.equal(worse.source.image(part), expected.byte()[:, 30:70, 50:110])
+    drawn = torch.tensor([movement_of(str(number), 3.0) for number in range(2000)])
+    assert (drawn.std(0) - 3).abs().max() < 0.15
+
+
 def test_turns_are_spread_as_asked() -> None:
     drawn = torch.tensor([turn_of(str(number), 3.0) for number in range(2000)])
     assert (drawn.std(0) - 3).abs().max() < 0.15
@@ -108,7 +133,7 @@ def test_some_photographs_suffer_the_same_in_every_run() -> None:
 
 
 def test_what_cannot_be_disturbed_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"scene\.disturb\.blur"):
-        disturbed(small_scene(spread(5)), {"blur": 1.0})
+    with pytest.raises(ConfigError, match=r"scene\.disturb\.rain"):
+        disturbed(small_scene(spread(5)), {"rain": 1.0})
     with pytest.raises(ConfigError, match=r"scene\.disturb\.covered is 1; give at most 0.9"):
         disturbed(small_scene(spread(5)), {"covered": 1.0})

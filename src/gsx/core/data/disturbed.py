@@ -63,9 +63,7 @@ class Worse:
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
-        image = self.source.image(camera)
-        if self.movement is not None:
-            image = swept(image, camera, *self.movement)
+        image = self.source.image(camera) if self.movement is None else swept(self.source, camera, *self.movement)
         if self.gains is not None:
             image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
         return image if self.patch is None else self.patch.over(image, camera)
@@ -90,10 +88,12 @@ class WorseFile(Worse):
         return self.source.path
 
 
-def swept(image: UInt8[Tensor, "3 H W"], camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
-    """A picture as a camera takes it that moves by such shares of the frame's sides."""
-    px = across * camera.frame.width, down * camera.frame.height
-    return moved(image.float(), *px).round().clamp(0, 255).to(torch.uint8)
+def swept(source: ImageSource, camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
+    """What a camera sees that moves by such shares of the frame's sides; of a crop the part of the whole frame."""
+    frame = camera.frame
+    whole = source.image(camera.crop(-frame.left, -frame.top, frame.width, frame.height)).float()
+    taken = moved(whole, across * frame.width, down * frame.height).round().clamp(0, 255).to(torch.uint8)
+    return taken[:, frame.top : frame.top + camera.height, frame.left : frame.left + camera.width]
 
 
 # -- what one photograph suffers ---------------------------------------------------------------------------------------

@@ -1,0 +1,146 @@
+"""Gaussians behind the scene: where they come from, what density control leaves alone, what a run keeps of them."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import published_options, small_gs3d, small_scene, spread
+from tiny import final_tensors, tiny_run
+from torch import Tensor
+
+from gsx.backbones import sky
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.sky import beneath_sky, sky_behind
+from gsx.builtin import plugins
+from gsx.core.data.scene import PointCloud, Scene
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+
+FAR = 200.0
+
+
+@pytest.fixture
+def two_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every scene has two points of sky in 3 % of its pixels."""
+
+    def found(scene: Scene) -> tuple[PointCloud, float]:
+        positions = torch.tensor([[0.0, FAR, 10.0], [10.0, FAR, 0.0]])
+        return PointCloud(positions, torch.tensor([[200, 210, 220]] * 2, dtype=torch.uint8)), 0.03
+
+    monkeypatch.setattr(sky, "sky_of", found)
+
+
+def with_sky(count: int = 3, capacity: str = "published") -> GS3D:
+    """So many Gaussians, all of them to be cloned or split at an event, and two far away."""
+    options = replace(published_options(), sky="auto", capacity=capacity)
+    backbone = small_gs3d(small_scene(spread(count)), options=options)
+    table, rows = backbone.table, len(backbone.table)
+    table.statistics |= {"gradient": torch.ones(rows), "count": torch.ones(rows)}
+    if "absolute" in table.statistics:
+        table.statistics["absolute"] = torch.ones(rows)
+    return backbone
+
+
+def far(backbone: GS3D) -> Tensor:
+    return backbone.table["means"].detach()[:, 1] == FAR
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_they_follow_the_scene_and_hide_what_is_behind_them_from_the_start() -> None:
+    backbone = with_sky()
+    assert backbone.table["sky"].tolist() == [0, 0, 0, 1, 1]
+    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+    opacities = backbone.table["opacity_logits"].detach().sigmoid()
+    torch.testing.assert_close(opacities, torch.tensor([0.1, 0.1, 0.1, 0.98, 0.98]))
+    colours = 0.5 + backbone.table["sh_dc"].detach()[3:, 0] * 0.28209479177387814
+    torch.testing.assert_close(colours, torch.tensor([[200.0, 210, 220]] * 2) / 255)
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_density_control_grows_prunes_and_resets_the_scene_alone() -> None:
+    backbone = with_sky()
+    done = backbone.densify_and_prune(3000)
+    assert (done["cloned"] + done["split"], done["opacity_resets"]) == (3, 1)
+    assert int(far(backbone).sum()) == 2
+    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+    opacities = backbone.table["opacity_logits"].detach().sigmoid()
+    torch.testing.assert_close(opacities[far(backbone)], torch.full((2,), 0.98))
+    assert float(opacities[~far(backbone)].max()) <= 0.01 + 1e-6
+    with torch.no_grad():
+        backbone.table["log_scales"].fill_(math.log(5.0))  # larger than a tenth of the extent
+    backbone.densify_and_prune(3100)
+    assert far(backbone).all()
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_adaptive_growth_leaves_the_sky_alone_though_it_draws_the_largest_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", lambda model, *_: 1.0 + torch.arange(len(model.table)))
+    backbone = with_sky(capacity="adaptive")
+    done = backbone.control.densification.densify(backbone.control, backbone, 600)
+    assert done["split"] == 1
+    assert int(far(backbone).sum()) == 2
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_the_sky_is_no_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    everywhere = torch.tensor([True, False, False, True, True])
+    monkeypatch.setattr("gsx.backbones.adaptive.in_empty_space", lambda *_: everywhere)
+    backbone = with_sky(capacity="adaptive")
+    assert backbone.densify_and_prune(1) == {"cleared": 1}
+    assert far(backbone).tolist() == [False, False, True, True]
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_auto_asks_for_a_hundredth_of_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene(spread(3))
+    assert [len(sky_behind(scene, when)) for when in ("never", "auto", "always")] == [0, 2, 2]
+    monkeypatch.setattr(sky, "OPEN", 0.04)
+    assert [len(sky_behind(scene, when)) for when in ("never", "auto", "always")] == [0, 0, 2]
+
+
+def test_rows_of_the_scene_are_all_where_there_is_no_sky() -> None:
+    backbone = small_gs3d(small_scene(spread(3)))
+    assert "sky" not in backbone.table.columns
+    assert beneath_sky(backbone.table).tolist() == [True] * 3
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_rows_keep_what_they_are_when_others_come_and_go() -> None:
+    backbone = with_sky()
+    append_rows(backbone.table, {name: value[:1] for name, value in detached_rows(backbone.table).items()})
+    keep_rows(backbone.table, torch.tensor([False, True, True, True, True, True]))
+    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+
+
+def test_what_cannot_have_a_sky_is_told_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"backbone\.sky is 'yes'; choose from never, auto, always"):
+        compose(["backbone.sky=yes"], plugins())
+    levels = ["backbone=octree_gs3d", "backbone.densification=clone_split", "backbone.sky=always"]
+    with pytest.raises(ConfigError, match=r"backbone\.sky"):
+        compose(levels, plugins())
+    backbone = small_gs3d(small_scene(spread(5)), options=replace(published_options(), sky="auto"))
+    with pytest.raises(InputError, match=r"leave backbone\.sky=never"):
+        backbone.go_on_from(backbone.explicit(None, 1))
+
+
+def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path) -> None:
+    words = ["backbone.sky=always", "iterations=60", "backbone.rates.shortened=0.4"]
+    whole = tiny_run(tmp_path / "whole", words)
+    tiny_run(tmp_path / "stopped", words, stop_after=40)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    execute(run, settings, plugins())
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    above = ~beneath_sky(whole.backbone.table)
+    assert 0 < int(above.sum()) < len(above)
+    distances = whole.backbone.table["means"].detach().norm(dim=1)
+    assert float(distances[above].min()) > 100 * whole.scene.extent
+    assert float(distances[~above].max()) < 100 * whole.scene.extent

@@ -1,0 +1,49 @@
+"""Pictures of moving cameras: against means worked by hand, and of pictures shifted one by one."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from gsx.core.data.movement import line_kernel, moved
+
+
+def shifted(image: Tensor, across: float, down: float) -> Tensor:
+    """The picture moved to the right and down by bilinear interpolation, its edges held."""
+    height, width = image.shape[1:]
+    x, y = (torch.arange(side, dtype=torch.float64) for side in (width, height))
+    u, v = 2 * (x - across) / (width - 1) - 1, 2 * (y - down) / (height - 1) - 1
+    grid = torch.stack([u.expand(height, -1), v[:, None].expand(-1, width)], 2)
+    return grid_sample(image[None], grid[None], padding_mode="border", align_corners=True)[0]
+
+
+def test_kernels_by_hand() -> None:
+    """A point between pixels is shared out by its distances: the mean over 2 px is a quarter, a half, a quarter."""
+    assert torch.equal(line_kernel(2.0, 0.0)[1], torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
+    assert torch.equal(line_kernel(0.0, 2.0)[:, 1], line_kernel(2.0, 0.0)[1])
+    assert torch.equal(line_kernel(0.0, 0.0), torch.ones(1, 1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("movement", [(3.0, 0.0), (-4.5, 2.0), (0.3, -0.2), (7.0, 11.0)])
+def test_kernels_are_means_without_a_direction(movement: tuple[float, float]) -> None:
+    kernel = line_kernel(*movement)
+    assert float(kernel.sum()) == pytest.approx(1, abs=1e-12)
+    assert torch.allclose(kernel, kernel.flip(0, 1), atol=1e-12)
+    assert torch.allclose(kernel, line_kernel(-movement[0], -movement[1]), atol=1e-12)
+
+
+@pytest.mark.parametrize("movement", [(5.0, 0.0), (-3.0, 4.0)])
+def test_it_is_the_mean_of_shifted_pictures(movement: tuple[float, float]) -> None:
+    image = torch.rand(3, 24, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    places = (torch.arange(500) + 0.5) / 500 - 0.5
+    truth = torch.stack([shifted(image, *(float(t) * part for part in movement)) for t in places]).mean(0)
+    assert (moved(image, *movement) - truth).abs().max() < 0.01
+    assert (moved(image, *movement) - image).abs().max() > 0.2
+
+
+def test_gradients_come_back_the_same_way() -> None:
+    """A mean without a direction is its own transpose, but for what the edges hold."""
+    image = torch.zeros(1, 21, 21, dtype=torch.float64, requires_grad=True)
+    pulled = pad(torch.ones(1, 1, 1, dtype=torch.float64), (10, 10, 10, 10))
+    moved(image, 3.0, 2.0).backward(pulled)
+    assert torch.allclose(image.grad, moved(pulled, 3.0, 2.0), atol=1e-12)

@@ -1,0 +1,140 @@
+"""Cameras that moved in runs: found where they did, absent where they did not, applied, kept and resumed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import Grey, small_scene, spread
+from tiny import final_tensors, tiny_run
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.core.data.camera import Camera
+from gsx.core.data.disturbed import movement_of
+from gsx.core.data.movement import moved
+from gsx.core.data.scene import View
+from gsx.core.quality.motion_blur import Movement
+from gsx.core.training.blur import Blur, BlurOptions
+from gsx.experiments.evaluation.remarks import gathered, remarks_of
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+
+LONG, SHORT, IDLE = Movement(3.0, 4.0, 0.2), Movement(0.5, 0.5, 0.2), Movement(3.0, 4.0, 0.001)
+
+
+def blur(when: str = "auto", **more: float) -> Blur:
+    widths = {f"view{number}": 24 for number in range(4)}
+    return Blur(BlurOptions(when=when, start=0.1, until=0.4, times=3, **more), 1000, widths)
+
+
+def test_it_is_asked_once_and_again_only_where_cameras_moved() -> None:
+    own = blur()
+    assert [number for number in range(1, 1001) if own.due(number)] == [101]
+    own.move({"view1": SHORT}, 101)
+    assert not any(own.due(number) for number in range(1, 1001))
+    own.move({"view1": LONG}, 101)
+    assert [number for number in range(1, 1001) if own.due(number)] == [201, 401]
+    assert not any(blur("never").due(number) for number in range(1, 1001))
+
+
+def test_short_movements_and_such_that_explain_nothing_do_not_count() -> None:
+    own = blur()
+    own.move({"view0": SHORT, "view1": LONG, "view2": IDLE}, 101)
+    assert own.movements == {"view1": (3.0, 4.0)}
+
+
+class Noise(Grey):
+    """Fine and coarse contrast; swept along rows where it is blurred."""
+
+    def __init__(self, blurred: bool) -> None:
+        self.blurred = blurred
+
+    def image(self, camera: Camera) -> Tensor:
+        image = 255 * torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(0))
+        return (moved(image, 5.0, 0.0) if self.blurred else image).byte()
+
+
+def noisy(blurred: int) -> list[View]:
+    """Seven photographs of 96 x 80 px, one of them blurred."""
+    camera = small_scene(spread(5)).train[0].camera.resize(96, 80)
+    return [View(f"view{number}", camera, Noise(number == blurred)) for number in range(7)]
+
+
+def test_suspects_are_less_sharp_than_their_neighbours_and_then_all() -> None:
+    views, own = noisy(blurred=3), blur()
+    assert [view.name for view in own.suspects(views)] == ["view3"]
+    assert blur(sharpness=0.0).suspects(views) == []
+    assert blur("always").suspects(views) == views
+    own.move({"view3": LONG}, 101)
+    assert own.suspects(views) == views
+
+
+def test_renders_move_by_as_much_as_their_photographs_at_any_size() -> None:
+    own, [view, other] = blur(), small_scene(spread(5), views=2).train
+    own.move({view.name: LONG}, 101)
+    image = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(own.applied(image, view), moved(image, 3.0, 4.0))
+    assert own.applied(image, other) is image
+    finer, smaller = (replace(view, camera=view.camera.resize(*size)) for size in ((48, 32), (12, 8)))
+    assert torch.equal(own.applied(image, finer), moved(image, 6.0, 8.0))
+    assert torch.equal(own.applied(image, smaller), moved(image, 1.5, 2.0))
+    part = replace(finer, camera=finer.camera.crop(0, 0, 24, 16))
+    assert torch.equal(own.applied(image, part), moved(image, 6.0, 8.0))
+
+
+def test_they_go_on_from_what_was_kept() -> None:
+    own, again = blur(), blur()
+    own.move({"view1": LONG, "of a b": LONG}, 201)
+    again.restore(own.tensors())
+    assert (again.movements, again.asked) == (own.movements, 201)
+    again.restore({})
+    assert (again.movements, again.asked) == ({}, 0)
+
+
+@pytest.mark.parametrize(("key", "value"), [("when", "maybe"), ("start", 0.0), ("until", 0.05)])
+def test_options_that_say_nothing_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ValueError, match=r"training\.blur"):
+        BlurOptions(**{"start": 0.1, key: value})
+
+
+# -- runs ------------------------------------------------------------------------------------------------------------
+
+SIZE = ("scene.width=96", "scene.height=80")
+MOVED = (
+    *(*SIZE, "scene.disturb.blur=4", "training.blur.when=always", "training.blur.start=0.5"),
+    *("iterations=80", "backbone.rates.shortened=0.4", "scene.points=3000"),
+)
+
+
+def test_a_run_resumes_as_if_never_stopped_and_finds_how_its_cameras_moved(tmp_path: Path) -> None:
+    whole = tiny_run(tmp_path / "whole", MOVED)
+    tiny_run(tmp_path / "stopped", MOVED, stop_after=55)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    assert run.blur.movements
+    execute(run, settings, plugins())
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert any(name.startswith("blur.of ") for name in a)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    unmoved = tiny_run(tmp_path / "unmoved", [*MOVED, "training.blur.when=never"])
+    assert not torch.equal(unmoved.backbone.table["means"], whole.backbone.table["means"])
+    told = [line for line in whole.curves if "blur_seconds" in line]
+    assert [line["step"] for line in told] == whole.blur.steps()
+    assert f"moved in {len(whole.blur.movements)} training photographs" in " ".join(remarks_of(gathered(whole.curves)))
+    for name, found in whole.blur.movements.items():
+        made = torch.tensor(movement_of(name, 4.0), dtype=torch.float64)
+        off = min(float((torch.tensor(found) - sign * made).norm()) for sign in (1, -1))
+        assert off < 0.5 * float(made.norm()) + 0.5, name
+
+
+def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
+    plain = tiny_run(tmp_path / "plain", [*SIZE, "iterations=12"])
+    words = ["training.blur.when=auto", "training.blur.sharpness=10", "training.blur.explained=0.5"]
+    judged = tiny_run(tmp_path / "judged", [*SIZE, "iterations=12", *words])
+    assert not plain.blur.movements
+    assert [line["blurred"] for line in judged.curves if "blur_seconds" in line] == [0]
+    assert [line["blur_suspects"] for line in judged.curves if "blur_seconds" in line] == [6]
+    a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
