@@ -100,9 +100,9 @@ def test_the_sky_is_no_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("two_behind")
 def test_auto_asks_for_a_hundredth_of_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = small_scene(spread(3))
-    assert [len(sky_behind(scene, when)) for when in ("never", "auto", "always")] == [0, 2, 2]
+    assert [len(sky_behind(scene, when)) for when in ("auto", "always")] == [2, 2]
     monkeypatch.setattr(sky, "OPEN", 0.04)
-    assert [len(sky_behind(scene, when)) for when in ("never", "auto", "always")] == [0, 0, 2]
+    assert [len(sky_behind(scene, when)) for when in ("auto", "always")] == [0, 2]
 
 
 def test_rows_of_the_scene_are_all_where_there_is_no_sky() -> None:
@@ -130,11 +130,24 @@ def test_what_cannot_have_a_sky_is_told_so(tmp_path: Path) -> None:
         backbone.go_on_from(backbone.explicit(None, 1))
 
 
-def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path) -> None:
+def test_without_need_training_is_bit_for_bit_that_without_a_sky(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sky, "OPEN", 1.0)
+    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
+    asked = tiny_run(tmp_path / "asked", ["iterations=12", "backbone.sky=auto"])
+    assert beneath_sky(asked.backbone.table).all()
+    for name, value in plain.backbone.table.parameters.items():
+        assert torch.equal(value, asked.backbone.table[name]), name
+
+
+def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["backbone.sky=always", "iterations=60", "backbone.rates.shortened=0.4"]
     whole = tiny_run(tmp_path / "whole", words)
     tiny_run(tmp_path / "stopped", words, stop_after=40)
-    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    with monkeypatch.context() as looking:
+        looking.setattr(sky, "sky_of", lambda scene: pytest.fail("a checkpoint tells what is sky"))
+        run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     execute(run, settings, plugins())
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()

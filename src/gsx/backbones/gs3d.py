@@ -17,7 +17,7 @@ from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Show
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
-from gsx.backbones.sky import SKY_OPACITY, sky_behind
+from gsx.backbones.sky import NO_POINTS, SKY_OPACITY, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -103,23 +103,12 @@ class GS3D:
         """A Gaussian for each point that visibility starts from, and for each of the sky, if there is one."""
         points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
-        sky = self.sky()
-        if len(sky):
+        if self.options.sky != "never":
+            sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NO_POINTS
             own = initial_parameters(sky, self.options.sh_degree, SKY_OPACITY)
             raw = {name: torch.cat([value, own[name]]) for name, value in raw.items()}
             columns = columns | {"sky": (torch.arange(len(raw["means"])) >= len(points)).to(torch.int8)}
         return self.table_of(raw, columns, device)
-
-    def sky(self) -> PointCloud:
-        """What lies behind the scene.
-
-        Raises:
-            InputError: the Gaussians have levels of detail, which nothing far away has.
-        """
-        when = self.options.sky
-        if when != "never" and not isinstance(self.visibility, AllVisible):
-            raise InputError("backbone.sky: what is far away has no level of detail: choose backbone=gs3d, or never")
-        return sky_behind(self.context.scene, when)
 
     def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
         """A table of raw parameters and columns that nothing is known of yet."""

@@ -20,9 +20,7 @@ NO_POINTS = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
 
 
 def sky_behind(scene: Scene, when: str) -> PointCloud:
-    """Points of what stands behind a scene; none where nobody asks, or photographs hardly look past it."""
-    if when == "never":
-        return NO_POINTS
+    """Points of what stands behind a scene; with `auto` none where photographs hardly look past it."""
     found, share = sky_of(scene)
     wanted = when == "always" or share >= OPEN
     verdict = f"{len(found):,} Gaussians far away stand behind it" if wanted else "nothing stands behind it"

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
+from gsx.core.data import filling
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.filling import filled, gaps_of, in_front, in_view, unprojected
 from gsx.core.data.scene import PointCloud, Scene, View
@@ -103,3 +105,13 @@ def test_nothing_is_added_where_masked_or_where_nothing_is_known() -> None:
     few = scene_of(wall(10))
     assert filled(few, 300, torch.Generator().manual_seed(0)) is few
     assert gaps_of(few.train[0], few.points, 5, torch.Generator().manual_seed(0)) is None
+
+
+def test_many_points_are_looked_at_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random points of NeRF-synthetic scenes are 100,000: all distances at once would be 40 GB."""
+    generator = torch.Generator().manual_seed(0)
+    pixels, depths = 100 * torch.rand(300, 2, generator=generator), 1 + torch.rand(300, generator=generator)
+    whole = in_front(pixels, depths)
+    monkeypatch.setattr(filling, "MOST_DISTANCES", 300 * 7)
+    assert torch.equal(in_front(pixels, depths), whole)
+    assert 0 < int(whole.sum()) < 300

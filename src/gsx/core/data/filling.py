@@ -19,6 +19,8 @@ COVERED = 8
 """Among so many nearest ones in the picture a point is hidden that lies much farther than the nearest of them."""
 BEHIND = 1.3
 """So many times as far."""
+MOST_DISTANCES = 1 << 28
+"""Between points of a picture, at a time: 1 GB."""
 TRIES = 8
 """Pixels that are tried for each point that is asked for."""
 FEWEST = 16
@@ -74,7 +76,9 @@ def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tens
 
 def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[Tensor, "M"]:
     """Points that are not much farther than what is seen beside them."""
-    _, nearest = torch.cdist(pixels, pixels).topk(min(COVERED, len(pixels)), largest=False)
+    rows = max(1, MOST_DISTANCES // max(1, len(pixels)))
+    count = min(COVERED, len(pixels))
+    nearest = torch.cat([torch.cdist(part, pixels).topk(count, largest=False)[1] for part in pixels.split(rows)])
     return depths <= BEHIND * depths[nearest].amin(1)
 
 

@@ -16,6 +16,8 @@ from gsx.core.shapes import Float, Int
 
 CHUNK = 256
 """Splats of a chunk."""
+FAR, MOST = 5.0, 0.9
+"""So many times the distance within which that share of the splats lies."""
 BOUNDS = [f"{end}_{name}" for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
           for end in ("min", "max") for name in names]  # fmt: skip
 """Properties of a chunk."""
@@ -36,7 +38,7 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
     count = len(arrays.means)
     if count == 0:
         raise InputError("compressed PLY holds no empty scenes: the model has no splats")
-    order = morton_order(arrays.means)
+    order = chunk_order(arrays.means)
     values = [
         arrays.means[order],
         arrays.log_scales[order].clip(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
@@ -67,6 +69,15 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
     ranges = np.concatenate([end for pair in bounds for end in pair], 1)
     body = [ranges.astype("<f4"), np.stack(packed, 1).astype("<u4"), coefficients]
     return header_of(elements, comments) + b"".join(part.tobytes() for part in body)
+
+
+def chunk_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
+    """Rows along a Morton curve; those that lie FAR beyond most others come after these, along one of their own: a few
+    would leave all others in one cell of it, and chunks as large as the scene."""
+    distance = np.abs(means - np.median(means, 0)).max(1)
+    near = distance <= FAR * np.quantile(distance, MOST)
+    parts = np.flatnonzero(near), np.flatnonzero(~near)
+    return np.concatenate([rows[morton_order(means[rows])] for rows in parts if len(rows)])
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:

@@ -24,9 +24,9 @@ STRIDES = (1 << 42, 1 << 21, 1)
 def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> Float[Tensor, "P"]:
     """Mean of the squared distances to the nearest other points, exact search (3D-GS, simple-knn).
 
-    With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0.
+    With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0, none nothing.
     """
-    count = min(neighbours, len(points) - 1)
+    count = max(0, min(neighbours, len(points) - 1))
     return nearest(points, count)[0].mean(1) if count else torch.zeros_like(points[:, 0])
 
 

@@ -41,6 +41,8 @@ class BackboneContext:
     """How finely training views are seen and rendered at each step."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
+    begins: bool = True
+    """Whether the model starts from the scene; otherwise a checkpoint is to take the place of its table."""
 
     def found_by_first(self, look: Callable[[], T]) -> T:
         """What the first process finds, on all of them, so that all decide alike: renders of others may differ in a

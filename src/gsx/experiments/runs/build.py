@@ -117,11 +117,17 @@ def keep_compiled_code() -> None:
 
 
 def build(
-    settings: Settings, scene: Scene, folder: Path, training: bool = False, start: Gaussians | None = None
+    settings: Settings,
+    scene: Scene,
+    folder: Path,
+    training: bool = False,
+    start: Gaussians | None = None,
+    begins: bool = True,
 ) -> Run:
     """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
     rasterizer that suits training. Looking at a run needs none of what its regenerators need. start: content of the
-    splat file that it begins with, where it does; None: a checkpoint is to take its place.
+    splat file that it begins with, where it does; None: a checkpoint is to take its place. begins: False where a
+    checkpoint is to take the place of any beginning.
 
     Raises:
         ConfigError: the backbone cannot begin with a file.
@@ -151,6 +157,7 @@ def build(
             generator=generator,
             resolution=resolution(scene, iterations),
             ranks=together,
+            begins=begins or scene is not own.scene,
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
 

@@ -152,7 +152,7 @@ def open_run(
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     loaded = ranks_here().rank0_first(lambda: verified(load_scene(settings)) if training else load_scene(settings))
-    run = build(settings, loaded, folder, training)
+    run = build(settings, loaded, folder, training, begins=False)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
