@@ -10,7 +10,7 @@ by two, with and without `training.poses.when=auto`, likewise. `covered`: someth
 training photograph, with and without `training.distractors.when=auto`, likewise; `passed`: somebody does in the
 built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx photographs` names is counted.
 `blur`: cameras move while they take photographs, with and without `training.blur.when=auto`, beside the scene as it
-is. `sky`: what plain `gsx` trains, with and without `backbone.sky=auto`.
+is. `sky`: what plain `gsx` trains, with and without `backbone.sky=auto`; `sky_growing`: adaptive growth likewise.
 Finished runs below --runs are not trained again.
 """
 
@@ -75,6 +75,9 @@ BLUR_ARMS = {
 DEFAULT = ("backbone=gs3d_zoom",)
 SKY_ARMS = {"gs3d_zoom": DEFAULT, "gs3d_zoom, sky=auto": (*DEFAULT, "backbone.sky=auto")}
 """What plain `gsx` trains, and the same with something behind the scene."""
+GROWING = ("backbone=gs3d", "backbone.capacity=adaptive")
+GROWING_ARMS = {"gs3d, adaptive": GROWING, "gs3d, adaptive, sky=auto": (*GROWING, "backbone.sky=auto")}
+"""The like of growth that pays for itself."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -377,6 +380,11 @@ def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Something behind the scene", *compared(SKY_ARMS, scenes, given)
 
 
+def sky_growing(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """The same beneath growth that pays for itself."""
+    return "Something behind the scene, and adaptive growth", *compared(GROWING_ARMS, scenes, given)
+
+
 WHAT: dict[str, Measure] = {
     "exposure": exposure,
     "poses": poses,
@@ -385,6 +393,7 @@ WHAT: dict[str, Measure] = {
     "faults": faults,
     "blur": blur,
     "sky": sky,
+    "sky_growing": sky_growing,
 }
 
 

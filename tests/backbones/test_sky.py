@@ -59,6 +59,7 @@ def test_they_follow_the_scene_and_hide_what_is_behind_them_from_the_start() -> 
     torch.testing.assert_close(opacities, torch.tensor([0.1, 0.1, 0.1, 0.98, 0.98]))
     colours = 0.5 + backbone.table["sh_dc"].detach()[3:, 0] * 0.28209479177387814
     torch.testing.assert_close(colours, torch.tensor([[200.0, 210, 220]] * 2) / 255)
+    assert backbone.plan()["sky"] == {"gaussians": 2}
 
 
 @pytest.mark.usefixtures("two_behind")

@@ -301,5 +301,6 @@ class GS3D:
                 "to": rates.means_last * self.extent,
                 "over": self.means_rate_steps(),
             },
+            **({"sky": {"gaussians": int((self.table["sky"] > 0).sum())}} if "sky" in self.table.columns else {}),
             **self.visibility.plan(self.table),
         }
