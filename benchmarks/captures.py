@@ -375,13 +375,21 @@ def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 # -- sky ---------------------------------------------------------------------------------------------------------------
 
 
+def refuse_share(given: argparse.Namespace) -> None:
+    """End with a message where other than all steps are asked for."""
+    if given.share != 1:
+        sys.exit(f"--share {given.share:g}: runs with a sky take all steps")
+
+
 def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """With something behind the scene, and without."""
+    refuse_share(given)
     return "Something behind the scene", *compared(SKY_ARMS, scenes, given)
 
 
 def sky_growing(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """The same beneath growth that pays for itself."""
+    refuse_share(given)
     return "Something behind the scene, and adaptive growth", *compared(GROWING_ARMS, scenes, given)
 
 

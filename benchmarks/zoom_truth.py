@@ -24,7 +24,7 @@ import torch
 from measuring.machine import commit, describe_machine, shown_command, told_load
 from measuring.results import Section, read_sections, stamped, text_table, write_results
 from measuring.runs import gsx
-from zoom import SUBJECTS, scenes_at_hand, shared_arguments, told
+from zoom import USUAL, scenes_at_hand, shared_arguments, told
 
 FILE, RUNS, TABLE = "zoom_truth_cpu", "runs", "table"
 """Of the results, and its sections."""
@@ -56,7 +56,7 @@ Row = dict[str, Any]
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/zoom_truth")
+    parser = shared_arguments(__doc__, USUAL, "outputs/zoom_truth")
     parser.add_argument("--share", type=float, default=0.4, help="of the steps of benchmarks/zoom.py (0.4)")
     parser.add_argument("--rows", default="", help="of the experiment, by commas; none given: all")
     given = parser.parse_args(words)

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from gsx.backbones import sky
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.sky import beneath_sky, sky_behind
+from gsx.backbones.sky import not_sky, sky_behind
 from gsx.builtin import plugins
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.data.sky import Sky
+from gsx.core.errors import ConfigError
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
@@ -28,9 +29,10 @@ FAR = 200.0
 def two_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every scene has two points of sky in 3 % of its pixels."""
 
-    def found(scene: Scene) -> tuple[PointCloud, float]:
+    def found(scene: Scene) -> Sky:
         positions = torch.tensor([[0.0, FAR, 10.0], [10.0, FAR, 0.0]])
-        return PointCloud(positions, torch.tensor([[200, 210, 220]] * 2, dtype=torch.uint8)), 0.03
+        points = PointCloud(positions, torch.tensor([[200, 210, 220]] * 2, dtype=torch.uint8))
+        return Sky(points=points, spacing=8.0, share=0.03)
 
     monkeypatch.setattr(sky, "sky_of", found)
 
@@ -54,11 +56,12 @@ def far(backbone: GS3D) -> Tensor:
 def test_they_follow_the_scene_and_hide_what_is_behind_them_from_the_start() -> None:
     backbone = with_sky()
     assert backbone.table["sky"].tolist() == [0, 0, 0, 1, 1]
-    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+    assert torch.equal(~not_sky(backbone.table), far(backbone))
     opacities = backbone.table["opacity_logits"].detach().sigmoid()
     torch.testing.assert_close(opacities, torch.tensor([0.1, 0.1, 0.1, 0.98, 0.98]))
     colours = 0.5 + backbone.table["sh_dc"].detach()[3:, 0] * 0.28209479177387814
     torch.testing.assert_close(colours, torch.tensor([[200.0, 210, 220]] * 2) / 255)
+    torch.testing.assert_close(backbone.table["log_scales"].detach()[3:].exp(), torch.full((2, 3), 8.0))
     assert backbone.plan()["sky"] == {"gaussians": 2}
 
 
@@ -68,7 +71,7 @@ def test_density_control_grows_prunes_and_resets_the_scene_alone() -> None:
     done = backbone.densify_and_prune(3000)
     assert (done["cloned"] + done["split"], done["opacity_resets"]) == (3, 1)
     assert int(far(backbone).sum()) == 2
-    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+    assert torch.equal(~not_sky(backbone.table), far(backbone))
     opacities = backbone.table["opacity_logits"].detach().sigmoid()
     torch.testing.assert_close(opacities[far(backbone)], torch.full((2,), 0.98))
     assert float(opacities[~far(backbone)].max()) <= 0.01 + 1e-6
@@ -101,15 +104,15 @@ def test_the_sky_is_no_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("two_behind")
 def test_auto_asks_for_a_hundredth_of_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = small_scene(spread(3))
-    assert [len(sky_behind(scene, when)) for when in ("auto", "always")] == [2, 2]
+    assert [len(sky_behind(scene, when).points) for when in ("auto", "always")] == [2, 2]
     monkeypatch.setattr(sky, "OPEN", 0.04)
-    assert [len(sky_behind(scene, when)) for when in ("auto", "always")] == [0, 2]
+    assert [len(sky_behind(scene, when).points) for when in ("auto", "always")] == [0, 2]
 
 
 def test_rows_of_the_scene_are_all_where_there_is_no_sky() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     assert "sky" not in backbone.table.columns
-    assert beneath_sky(backbone.table).tolist() == [True] * 3
+    assert not_sky(backbone.table).tolist() == [True] * 3
 
 
 @pytest.mark.usefixtures("two_behind")
@@ -117,18 +120,26 @@ def test_rows_keep_what_they_are_when_others_come_and_go() -> None:
     backbone = with_sky()
     append_rows(backbone.table, {name: value[:1] for name, value in detached_rows(backbone.table).items()})
     keep_rows(backbone.table, torch.tensor([False, True, True, True, True, True]))
-    assert torch.equal(~beneath_sky(backbone.table), far(backbone))
+    assert torch.equal(~not_sky(backbone.table), far(backbone))
 
 
-def test_what_cannot_have_a_sky_is_told_so(tmp_path: Path) -> None:
+def test_what_cannot_have_a_sky_is_told_so() -> None:
     with pytest.raises(ConfigError, match=r"backbone\.sky is 'yes'; choose from never, auto, always"):
         compose(["backbone.sky=yes"], plugins())
     levels = ["backbone=octree_gs3d", "backbone.densification=clone_split", "backbone.sky=always"]
     with pytest.raises(ConfigError, match=r"backbone\.sky"):
         compose(levels, plugins())
+
+
+@pytest.mark.usefixtures("two_behind")
+def test_what_lies_far_away_in_a_splat_file_is_sky_again() -> None:
+    gaussians = with_sky().explicit(None, 1)
     backbone = small_gs3d(small_scene(spread(5)), options=replace(published_options(), sky="auto"))
-    with pytest.raises(InputError, match=r"leave backbone\.sky=never"):
-        backbone.go_on_from(backbone.explicit(None, 1))
+    backbone.go_on_from(gaussians)
+    assert not_sky(backbone.table).tolist() == [True, True, True, False, False]
+    plain = small_gs3d(small_scene(spread(5)))
+    plain.go_on_from(gaussians)
+    assert "sky" not in plain.table.columns
 
 
 def test_without_need_training_is_bit_for_bit_that_without_a_sky(
@@ -137,7 +148,7 @@ def test_without_need_training_is_bit_for_bit_that_without_a_sky(
     monkeypatch.setattr(sky, "OPEN", 1.0)
     plain = tiny_run(tmp_path / "plain", ["iterations=12"])
     asked = tiny_run(tmp_path / "asked", ["iterations=12", "backbone.sky=auto"])
-    assert beneath_sky(asked.backbone.table).all()
+    assert not_sky(asked.backbone.table).all()
     for name, value in plain.backbone.table.parameters.items():
         assert torch.equal(value, asked.backbone.table[name]), name
 
@@ -153,7 +164,7 @@ def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatc
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)
-    above = ~beneath_sky(whole.backbone.table)
+    above = ~not_sky(whole.backbone.table)
     assert 0 < int(above.sum()) < len(above)
     distances = whole.backbone.table["means"].detach().norm(dim=1)
     assert float(distances[above].min()) > 100 * whole.scene.extent

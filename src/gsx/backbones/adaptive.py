@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import Growing, Undone, error_exponent, with_rows, worth_in_training
-from gsx.backbones.sky import beneath_sky
+from gsx.backbones.sky import not_sky
 from gsx.core.data.empty_space import in_empty_space
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
@@ -90,7 +90,7 @@ class Adaptive:
 
     def clear(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
         """Remove what lies where photographs show that nothing is: most of random points."""
-        empty = in_empty_space(positions.detach(), self.context.scene.train) & beneath_sky(table)
+        empty = in_empty_space(positions.detach(), self.context.scene.train) & not_sky(table)
         count = int(empty.sum())
         if count in (0, len(empty)):
             return {}

@@ -10,7 +10,7 @@ from gsx.backbones.capacity import Capacity, growing_of
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
 from gsx.backbones.mip import Filter
-from gsx.backbones.sky import beneath_sky
+from gsx.backbones.sky import not_sky
 from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import zero_statistics
@@ -70,7 +70,7 @@ class DensityControl:
         """Remove faint primitives, and after the first reset huge ones; returns how many."""
         doomed = table["opacity_logits"].sigmoid() < self.options.prune_opacity
         if step > self.reset_interval():
-            doomed |= (largest_scales(table) > self.options.prune_extent * self.extent) & beneath_sky(table)
+            doomed |= (largest_scales(table) > self.options.prune_extent * self.extent) & not_sky(table)
         if bool(doomed.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
             return 0
         keep_rows(table, ~doomed)
@@ -80,7 +80,7 @@ class DensityControl:
         """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting). The
         sky stays as it is."""
         logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
-        excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * beneath_sky(table)
+        excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * not_sky(table)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
         reset_column(table, "opacity_logits", lowered)
 

@@ -17,7 +17,7 @@ from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Show
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
-from gsx.backbones.sky import NO_POINTS, SKY_OPACITY, sky_behind
+from gsx.backbones.sky import NOTHING, SKY_OPACITY, far_away, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -104,8 +104,9 @@ class GS3D:
         points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
         if self.options.sky != "never":
-            sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NO_POINTS
-            own = initial_parameters(sky, self.options.sh_degree, SKY_OPACITY)
+            sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NOTHING
+            own = initial_parameters(sky.points, self.options.sh_degree, SKY_OPACITY)
+            own["log_scales"].fill_(math.log(sky.spacing))
             raw = {name: torch.cat([value, own[name]]) for name, value in raw.items()}
             columns = columns | {"sky": (torch.arange(len(raw["means"])) >= len(points)).to(torch.int8)}
         return self.table_of(raw, columns, device)
@@ -131,11 +132,12 @@ class GS3D:
         """
         if not isinstance(self.visibility, AllVisible):
             raise InputError("init: a splat file says nothing of levels: choose backbone=gs3d or mip_splatting")
-        if self.options.sky != "never":
-            raise InputError("init: a splat file does not say what is sky in it: leave backbone.sky=never")
         raw, device = raw_parameters(gaussians, self.options.sh_degree), self.table["means"].device
         self.first_degree = self.options.sh_degree
-        self.table = self.table_of(raw, {}, device)
+        columns = {}
+        if self.options.sky != "never":
+            columns["sky"] = far_away(raw["means"], self.context.scene).to(torch.int8)
+        self.table = self.table_of(raw, columns, device)
         self.filter.refresh(self.table, self.table["means"])
         if "filter" in self.table.columns:
             with torch.no_grad():

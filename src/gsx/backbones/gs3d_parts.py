@@ -11,7 +11,7 @@ from torch.nn.functional import logsigmoid
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.mip import Filter
 from gsx.backbones.sampling import quantile, sampled_means
-from gsx.backbones.sky import beneath_sky
+from gsx.backbones.sky import not_sky
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
@@ -137,7 +137,7 @@ class CloneSplit:
         """Split parents go; each leaves two children (3D-GS, densify_and_clone and densify_and_split)."""
         table = model.table
         options, gradient = control.options, mean_gradient(table)
-        wanted = candidates(table, gradient, options) & beneath_sky(table)
+        wanted = candidates(table, gradient, options) & not_sky(table)
         room = control.capacity.room(table, int(wanted.sum()), step)  # each adds one
         chosen = within_room(wanted, gradient, room)
         large = largest_scales(table) > options.split_extent * control.extent

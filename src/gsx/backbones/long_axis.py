@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import to_look_at
-from gsx.backbones.sky import beneath_sky
+from gsx.backbones.sky import not_sky
 from gsx.core.gaussians.merging import covariances, principal_axes
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
@@ -93,7 +93,7 @@ class LongAxis:
             return drawn_errors(model, views, context.resolution.forming(step), control.background, step).cpu()
 
         score = context.found_by_first(look).to(context.device) * mean_absolute(table)
-        wanted = (score > 0) & beneath_sky(table)
+        wanted = (score > 0) & not_sky(table)
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
         count = int(chosen.sum())
         split_along(table, chosen)

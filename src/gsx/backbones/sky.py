@@ -5,9 +5,10 @@ import logging
 import torch
 from torch import Tensor
 
+from gsx.core.data.camera import offsets_from
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.data.sky import sky_of
-from gsx.core.shapes import Bool
+from gsx.core.data.sky import DISTANCE, Sky, centre_of, sky_of
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import ParameterTable
 
 logger = logging.getLogger(__name__)
@@ -16,20 +17,26 @@ SKY_OPACITY = 0.98
 """At first: nothing near has to be made up in its place."""
 OPEN = 0.01
 """`sky=auto`: share of the pixels that look past the scene, from which on something stands behind it."""
-NO_POINTS = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+NOTHING = Sky(points=PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), spacing=1.0, share=0.0)
 
 
-def sky_behind(scene: Scene, when: str) -> PointCloud:
-    """Points of what stands behind a scene; with `auto` none where photographs hardly look past it."""
-    found, share = sky_of(scene)
-    wanted = when == "always" or share >= OPEN
-    verdict = f"{len(found):,} Gaussians far away stand behind it" if wanted else "nothing stands behind it"
-    logger.info("sky: %.1f %% of the pixels of training views look past the scene: %s", 100 * share, verdict)
-    return found if wanted else NO_POINTS
+def sky_behind(scene: Scene, when: str) -> Sky:
+    """What stands behind a scene; with `auto` nothing where photographs hardly look past it."""
+    found = sky_of(scene)
+    wanted = when == "always" or found.share >= OPEN
+    verdict = f"{len(found.points):,} Gaussians far away stand behind it" if wanted else "nothing stands behind it"
+    logger.info("sky: %.1f %% of the pixels of training views look past the scene: %s", 100 * found.share, verdict)
+    return found if wanted else NOTHING
 
 
-def beneath_sky(table: ParameterTable) -> Bool[Tensor, "N"]:
-    """Rows of the scene itself: those of the sky neither grow nor are too large."""
+def far_away(positions: Float[Tensor, "N 3"], scene: Scene) -> Bool[Tensor, "N"]:
+    """Which positions lie where a sky does."""
+    distance = offsets_from(positions, centre_of(scene.train)).norm(dim=1)
+    return distance > DISTANCE / 2 * scene.extent
+
+
+def not_sky(table: ParameterTable) -> Bool[Tensor, "N"]:
+    """Rows of the scene itself: density control neither splits sky nor prunes it for its size."""
     if "sky" in table.columns:
         return table["sky"] == 0
     return torch.ones(len(table), dtype=torch.bool, device=table["means"].device)

@@ -101,20 +101,20 @@ def test_compressed_ply_of_a_splat_by_hand() -> None:
     assert packed_11_10_11(np.array([[0.25, 0.5, 1.0]]))[0] == 0x401007FF
 
 
-def test_a_sky_takes_no_precision_from_compressed_ply(tmp_path: Path) -> None:
-    """Chunks of what is near are as small as without it."""
+@pytest.mark.parametrize("count", [100, 900])
+def test_a_sky_takes_no_precision_from_compressed_ply(tmp_path: Path, count: int) -> None:
+    """Chunks of what is near are as small as without it, but for one with the faintest."""
     near = many(2000)
-    scattered = torch.randn(100, 3, generator=torch.Generator().manual_seed(9))
-    sky = replace(many(100), means=1000 * scattered / scattered.norm(dim=1, keepdim=True))
+    scattered = torch.randn(count, 3, generator=torch.Generator().manual_seed(9))
+    sky = replace(many(count), means=1000 * scattered / scattered.norm(dim=1, keepdim=True))
     both = Gaussians(**{name: torch.cat([value, vars(sky)[name]]) for name, value in vars(near).items()})
-    errors = []
+    solid, errors = near.means[near.opacity_logits > 0], []
     for name, gaussians in (("near", near), ("both", both)):
         write_gaussians(tmp_path / f"{name}.compressed.ply", gaussians)
         back = read_gaussians(tmp_path / f"{name}.compressed.ply").means
-        inside = back[back.norm(dim=1) < 500]
-        assert len(inside) == 2000
-        errors.append(float((inside[:, None] - near.means).norm(dim=2).amin(1).median()))
-    assert errors[1] < 1.5 * errors[0]
+        errors.append((back[:, None] - solid).norm(dim=2).amin(0))
+    assert float(errors[1].median()) < 1.5 * float(errors[0].median())
+    assert float(errors[1].max()) < 1.5 * float(errors[0].max())
 
 
 def test_glb_of_a_splat_by_hand() -> None:

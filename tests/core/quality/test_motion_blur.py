@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsx.core.data.movement import moved
-from gsx.core.quality.motion_blur import movement_between
+from gsx.core.quality.motion_blur import MOST, movement_between
 
 
 def picture(seed: int = 0) -> Tensor:
@@ -44,3 +44,8 @@ def test_what_does_not_count_says_nothing() -> None:
     found = movement_between(sharp, photograph, counted)
     assert abs(found.across) == pytest.approx(6, abs=0.5)
     assert abs(found.down) < 0.5
+
+
+def test_no_movement_is_longer_than_the_longest() -> None:
+    found = movement_between(picture(), moved(picture(), 60.0, 0.0))
+    assert 12 < abs(found.across) <= MOST

@@ -8,7 +8,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import pad
 
 from gsx.core.shapes import Float
 
@@ -35,9 +35,12 @@ def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
 
 def moved(image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
     """The mean of a picture over a movement, px; beyond its edges it goes on as it is there."""
-    kernel = line_kernel(across, down).to(image)
-    side = len(kernel) // 2
+    kernel = line_kernel(across, down)
+    side, (height, width) = len(kernel) // 2, image.shape[1:]
     if side == 0:
         return image
-    around = pad(image[None], (side, side, side, side), mode="replicate")[0]
-    return conv2d(around[:, None], kernel[None, None])[:, 0]
+    around, total = pad(image[None], (side, side, side, side), mode="replicate")[0], torch.zeros_like(image)
+    for row, column in kernel.nonzero().tolist():
+        weight = float(kernel[row, column])
+        total = torch.add(total, around[:, row : row + height, column : column + width], alpha=weight)
+    return total

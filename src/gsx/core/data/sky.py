@@ -7,32 +7,46 @@ photographs show there: an environment behind the scene. Where something near tu
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.filling import FEWEST, in_view, unprojected
+from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.filling import FEWEST, in_view
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.shapes import Bool, Float, Int
 
 PIXELS = 4000
 """Pixels of a picture that are looked at, in rows and columns."""
 GAP = 1.5
-"""Sides of the squares in which points are looked for, times the mean distance of a picture's points."""
+"""Side of the squares in which points are looked for, in mean spacings of a picture's points."""
 CELLS = 8000
 """Directions of the whole sphere: 2.3 degrees apart."""
 SEEN = 2
 """Pixels that have to look in a direction."""
 DISTANCE = 200.0
-"""Radius of the sphere, times the scene's extent: who walks across that moves its picture by half a degree."""
+"""Radius of the sphere, times the scene's extent: walking from one side of the cameras to the other moves it by half a
+degree."""
 BEYOND = 2.0
 """And at least so many times the distance within which nearly all of the scene's points lie."""
 NEARLY_ALL = 0.99
 
 
-def sky_of(scene: Scene) -> tuple[PointCloud, float]:
-    """(points on a sphere around the training cameras, one for each direction that is open; the share of the pixels of
-    training views that are)."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sky:
+    """A part of a sphere around the training cameras."""
+
+    points: PointCloud
+    """One for each direction that is open."""
+    spacing: float
+    """Between neighbouring directions, scene units."""
+    share: float
+    """Of the pixels of training views that are open."""
+
+
+def sky_of(scene: Scene) -> Sky:
+    """What the photographs show behind the scene."""
     up, cells = upwards(scene.train), directions(CELLS)
     count, colour, looked = torch.zeros(CELLS), torch.zeros(CELLS, 3), 0
     for cell, shown, pixels in open_views(scene, up, cells):
@@ -40,10 +54,12 @@ def sky_of(scene: Scene) -> tuple[PointCloud, float]:
         colour.index_add_(0, cell, shown)
         looked += pixels
     seen = count >= SEEN
-    centre = centre_of(scene.train)
-    positions = centre + radius_of(scene, centre) * cells[seen]
+    centre, radius = centre_of(scene.train), radius_of(scene)
     colours = (255 * colour[seen] / count[seen, None]).round().byte()
-    return PointCloud(positions, colours), float(count.sum()) / max(1, looked)
+    points = PointCloud((centre + radius * cells[seen].double()).float(), colours)
+    return Sky(
+        points=points, spacing=radius * math.sqrt(4 * math.pi / CELLS), share=float(count.sum()) / max(1, looked)
+    )
 
 
 def open_views(
@@ -54,14 +70,13 @@ def open_views(
         pixels = grid(view)
         found = pixels[open_pixels(view, pixels, scene.points, up)]
         column, row = found.long().unbind(1)
-        rays = unprojected(view.camera, found, torch.ones(len(found))) - view.camera.centre.float()
-        yield (rays @ cells.T).argmax(1), view.image()[:, row, column].T, len(pixels)
+        yield (rays_of(view.camera, found) @ cells.T).argmax(1), view.image()[:, row, column].T, len(pixels)
 
 
 def grid(view: View) -> Float[Tensor, "P 2"]:
     """Centres of pixels in rows and columns, of which at most PIXELS are looked at in a square picture."""
     step = max(1, math.ceil(math.sqrt(view.camera.width * view.camera.height / PIXELS)))
-    columns, rows = (torch.arange(step // 2, side, step) + 0.5 for side in view.camera.size)
+    columns, rows = (torch.arange(min(step // 2, side - 1), side, step) + 0.5 for side in view.camera.size)
     return torch.cartesian_prod(columns, rows)
 
 
@@ -86,8 +101,8 @@ def open_pixels(
 def none_above(
     pixels: Float[Tensor, "P 2"], points: Float[Tensor, "M 2"], up: Float[Tensor, "2"], square: float
 ) -> Bool[Tensor, "P"]:
-    """Pixels that have no point farther up in the picture, in columns of squares of so many px: neither in their own
-    nor in those beside it, and from the square below theirs on."""
+    """Pixels that are at least two squares above the highest point in their own column of squares and in the two beside
+    it. The sides of a square are so many px, its columns go upwards in the picture."""
     axes = torch.stack([torch.stack([-up[1], up[0]]), up])
     ours, theirs = ((places @ axes.T / square).floor().long() for places in (pixels, points))
     first = min(int(ours[:, 0].min()), int(theirs[:, 0].min())) - 1
@@ -113,14 +128,20 @@ def upwards_in(view: View, up: Float[Tensor, "3"]) -> Float[Tensor, "2"]:
     return along / along.norm().clamp_min(1e-9)
 
 
+def rays_of(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+    """Directions in the world in which pixels look, at a depth of 1."""
+    x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+    return torch.stack([x, y, torch.ones_like(x)], 1) @ camera.rotation.float()
+
+
 def centre_of(views: Sequence[View]) -> Float[Tensor, "3"]:
-    """Mean of the cameras' places."""
-    return torch.stack([view.camera.centre.double() for view in views]).mean(0).float()
+    """Mean of the cameras' places, float64."""
+    return torch.stack([view.camera.centre.double() for view in views]).mean(0)
 
 
-def radius_of(scene: Scene, centre: Float[Tensor, "3"]) -> float:
+def radius_of(scene: Scene) -> float:
     """Of a sphere around all of the scene."""
-    distances = (scene.points.positions.float() - centre).norm(dim=1)
+    distances = offsets_from(scene.points.positions.float(), centre_of(scene.train)).norm(dim=1)
     last = max(1, round(NEARLY_ALL * len(distances)))
     within = float(distances.kthvalue(last).values) if len(distances) else 0.0
     return max(DISTANCE * scene.extent, BEYOND * within)

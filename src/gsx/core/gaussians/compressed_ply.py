@@ -16,8 +16,8 @@ from gsx.core.shapes import Float, Int
 
 CHUNK = 256
 """Splats of a chunk."""
-FAR, MOST = 5.0, 0.9
-"""So many times the distance within which that share of the splats lies."""
+FAR = 20.0
+"""Times the median distance of the splats from their middle."""
 BOUNDS = [f"{end}_{name}" for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
           for end in ("min", "max") for name in names]  # fmt: skip
 """Properties of a chunk."""
@@ -38,7 +38,7 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
     count = len(arrays.means)
     if count == 0:
         raise InputError("compressed PLY holds no empty scenes: the model has no splats")
-    order = chunk_order(arrays.means)
+    order = chunk_order(arrays.means, arrays.opacities)
     values = [
         arrays.means[order],
         arrays.log_scales[order].clip(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
@@ -71,13 +71,21 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
     return header_of(elements, comments) + b"".join(part.tobytes() for part in body)
 
 
-def chunk_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
-    """Rows along a Morton curve; those that lie FAR beyond most others come after these, along one of their own: a few
-    would leave all others in one cell of it, and chunks as large as the scene."""
+def chunk_order(means: Float[np.ndarray, "N 3"], opacities: Float[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
+    """Rows along a Morton curve; those FAR beyond most others, as a sky, come last, along one of their own.
+
+    On one curve a few of them would leave all others in a single cell, and chunks as large as the whole. The chunk in
+    which both meet is filled with the faintest of the others, whose places become coarse.
+    """
     distance = np.abs(means - np.median(means, 0)).max(1)
-    near = distance <= FAR * np.quantile(distance, MOST)
-    parts = np.flatnonzero(near), np.flatnonzero(~near)
-    return np.concatenate([rows[morton_order(means[rows])] for rows in parts if len(rows)])
+    far = distance > FAR * np.median(distance)
+    near_rows, far_rows = np.flatnonzero(~far), np.flatnonzero(far)
+    if not len(far_rows):
+        return morton_order(means)
+    faintest = near_rows[np.argsort(opacities[near_rows], kind="stable")[: len(near_rows) % CHUNK]]
+    near_rows = np.setdiff1d(near_rows, faintest)
+    parts = [rows[morton_order(means[rows])] for rows in (near_rows, far_rows) if len(rows)]
+    return np.concatenate([*parts[:-1], faintest, parts[-1]])
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:

@@ -1,7 +1,7 @@
 """Photographs taken by a camera that moved: their renders are moved alike before they are compared.
 
-Which photographs are less sharp than their neighbours is told before any training (`core.quality.sharpness`). What the
-model shows in the places of these says how the camera moved (`core.quality.motion_blur`), a few times as it gets
+Photographs that are less sharp than their neighbours are suspected (`core.quality.sharpness`). From what the model
+shows in their places the movement of the camera is estimated (`core.quality.motion_blur`), a few times as it gets
 better. The loss is that of the render as such a camera would have taken it, so that the model stays sharp where the
 photograph is not. Test photographs play no part.
 """
@@ -29,9 +29,9 @@ class BlurOptions:
     when: str = "never"
     """auto: where photographs that are less sharp than their neighbours are blurred; always: without asking."""
     start: Share = 0.2
-    """Share of the steps after which movements are told first."""
+    """Share of the steps after which movements are estimated first."""
     until: Share = 0.85
-    """Share of the steps after which they are told last."""
+    """Share of the steps after which they are last."""
     times: Annotated[int, Range(1, 1000)] = 6
     """How often they are, at shares that grow by the same factor."""
     sharpness: Annotated[float, Range(0, 10)] = 0.9
@@ -51,19 +51,17 @@ class Blur:
 
     options: BlurOptions
     iterations: int
-    widths: Mapping[str, int]
-    """Of the photographs, px, by name."""
     movements: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Px across and down, by name, of photographs that are blurred."""
+    """Across and down, as shares of the frame's sides, by name, of photographs that are blurred."""
     asked: int = 0
-    """The last step before which they were told: not again where that step is taken anew."""
+    """The last step before which they were estimated: not again where that step is taken anew."""
 
     def steps(self) -> list[int]:
-        """The steps before which movements are told."""
+        """The steps before which movements are estimated."""
         return occasions(self.options, self.iterations)
 
     def due(self, number: int) -> bool:
-        """Whether they are told before this step: after the first time only if there are any."""
+        """Whether they are estimated before this step: after the first time only if there are any."""
         return due_at(number, self.steps(), self.asked, bool(self.movements))
 
     def suspects(self, views: Sequence[View]) -> list[View]:
@@ -71,7 +69,7 @@ class Blur:
         these is blurred."""
         if self.options.when == "always" or self.movements:
             return list(views)
-        ordered = sorted(views, key=lambda view: view.name)
+        ordered = sorted({view.name: view for view in views}.values(), key=lambda view: view.name)
         fine = torch.stack([fineness((view.image() * 255).round().byte()) for view in ordered])
         found = zip(ordered, against_neighbours(fine).tolist(), strict=True)
         return [view for view, sharpness in found if sharpness < self.options.sharpness]
@@ -80,18 +78,20 @@ class Blur:
         """Whether a photograph is blurred, by what was found of it."""
         return movement.length >= self.options.length and movement.explained >= self.options.explained
 
-    def move(self, found: Mapping[str, Movement], number: int) -> None:
-        """These from a step on: what does not count is none."""
-        kept = {name: one for name, one in found.items() if self.counts(one)}
-        self.movements, self.asked = {name: (one.across, one.down) for name, one in kept.items()}, number
+    def move(self, found: Mapping[View, Movement], number: int) -> list[float]:
+        """These movements, px of their views, from a step on, as far as they count; returns the lengths of those."""
+        kept = {view: one for view, one in found.items() if self.counts(one)}
+        sizes = {view: view.camera.frame for view in kept}
+        self.movements = {v.name: (one.across / sizes[v].width, one.down / sizes[v].height) for v, one in kept.items()}
+        self.asked = number
+        return [one.length for one in kept.values()]
 
     def applied(self, image: Float[Tensor, "C H W"], view: View) -> Float[Tensor, "C H W"]:
         """A render as the camera of a photograph would have taken it, at whatever size it is."""
         if view.name not in self.movements:
             return image
-        finer = view.camera.frame.width / self.widths[view.name]
-        across, down = self.movements[view.name]
-        return moved(image, finer * across, finer * down)
+        (across, down), frame = self.movements[view.name], view.camera.frame
+        return moved(image, across * frame.width, down * frame.height)
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where there are none."""

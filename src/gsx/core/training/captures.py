@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 SMALLER = 2
 """By how much smaller pictures are than photographs that poses and distractors are told from: in a third of the time
 as well."""
+BLUR_PIXELS = 1 << 18
+"""Of pictures that movements are estimated from."""
 
 
 def judge_photographs(run: Run) -> dict[str, float]:
@@ -92,24 +94,32 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
 
 def judge_blur(run: Run) -> dict[str, float]:
     """By how much the camera moved in photographs that are less sharp than others; for the line of the step."""
-    begun, found, number = time.perf_counter(), dict[str, Movement](), run.step + 1
+    begun, number = time.perf_counter(), run.step + 1
     suspects = run.blur.suspects(run.photographed)
-    for view in suspects:
-        run.refuse_if_stopping()
-        photograph, counted = view.image(), view.counted()
-        shown = render(run, view.camera, supersample=1).image
-        image = at_exposure(run.exposures.applied(shown, view.name).detach().cpu(), photograph, counted)
-        found[view.name] = movement_between(image, photograph, counted)
-    run.blur.move(found, number)
-    lengths = [found[name].length for name in run.blur.movements]
+    lengths = run.blur.move({view: movement_of(run, view) for view in suspects}, number)
+    middle = {"blur_length": median(lengths)} if lengths else {}
     told = f", by {median(lengths):.1f} px in the middle of them" if lengths else ""
     logger.info(
         "step %d: the camera moved in %d of the %d photographs that were asked%s",
         *(number, len(lengths), len(suspects), told),
     )
     seconds = round(time.perf_counter() - begun, 3)
-    told_of = {"blurred": len(lengths), "blur_suspects": len(suspects), "blur_seconds": seconds}
-    return told_of | ({"blur_length": median(lengths)} if lengths else {})
+    return {"blurred": len(lengths), "blur_suspects": len(suspects), "blur_seconds": seconds} | middle
+
+
+def movement_of(run: Run, view: View) -> Movement:
+    """By how many px of a photograph its camera moved; from pictures of at most BLUR_PIXELS px."""
+    run.refuse_if_stopping()
+    small = view
+    while small.camera.width * small.camera.height > BLUR_PIXELS:
+        halved = coarser(small, run.scene.reduction, 2)
+        if halved is small:
+            break
+        small = halved
+    photograph, counted = small.image(), small.counted()
+    shown = render(run, small.camera, supersample=1).image
+    image = at_exposure(run.exposures.applied(shown, view.name).detach().cpu(), photograph, counted)
+    return movement_between(image, photograph, counted).times(view.camera.width / small.camera.width)
 
 
 def judge_distractors(run: Run) -> dict[str, float]:

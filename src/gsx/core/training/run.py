@@ -201,8 +201,7 @@ class Run:
         self.photographs = Photographs(self.device, self.photograph_bytes)
         names = [view.name for view in self.scene.train]
         self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
-        widths = {view.name: view.camera.width for view in self.scene.train}
-        self.blur = Blur(self.training.blur, self.iterations, widths)
+        self.blur = Blur(self.training.blur, self.iterations)
         passing = -(-len(names) // self.training.batch)
         self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 

@@ -126,8 +126,8 @@ def build(
 ) -> Run:
     """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
     rasterizer that suits training. Looking at a run needs none of what its regenerators need. start: content of the
-    splat file that it begins with, where it does; None: a checkpoint is to take its place. begins: False where a
-    checkpoint is to take the place of any beginning.
+    splat file that it begins with, if it does. begins: whether the model starts from the scene or a file; otherwise a
+    checkpoint is to take its place.
 
     Raises:
         ConfigError: the backbone cannot begin with a file.
@@ -148,7 +148,9 @@ def build(
         same = views.train is scene.train and iterations == general.iterations
         return own if same else settings.training.resolution(views, iterations)
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE) -> Backbone:
+    def anew(
+        scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE, begins: bool = True
+    ) -> Backbone:
         context = BackboneContext(
             scene=scene,
             iterations=iterations,
@@ -157,16 +159,16 @@ def build(
             generator=generator,
             resolution=resolution(scene, iterations),
             ranks=together,
-            begins=begins or scene is not own.scene,
+            begins=begins,
         )
         return settings.backbone.component.factory(settings.backbone.options, context)
 
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
-        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator, ranks)
+        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator, ranks, begins=False)
         go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
-        backbone = anew(scene, general.iterations, generator, ranks)
+        backbone = anew(scene, general.iterations, generator, ranks, begins)
     augmenters = build_augmenters(settings, scene) if training else []
     run = Run(
         config=settings.resolved,

@@ -22,6 +22,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
+from gsx.core.training.blur import BlurOptions
 from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.guard import Guard
 from gsx.core.training.poses import PoseOptions
@@ -65,7 +66,8 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
     for half in range(HALVES):
         model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
         numbers = range(half, len(views), HALVES)
-        shown |= {n: to_uint8(render(model, views[n].camera).image) for n in numbers}
+        drawn = {n: run.blur.applied(render(model, views[n].camera).image, views[n]) for n in numbers}
+        shown |= {n: to_uint8(image) for n, image in drawn.items()}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 
@@ -73,12 +75,12 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
 def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
     views = [view for number, view in enumerate(run.photographed) if number % HALVES != half]
-    unasked = replace(run.training, poses=PoseOptions(), distractors=DistractorOptions())
+    unasked = replace(run.training, poses=PoseOptions(), distractors=DistractorOptions(), blur=BlurOptions())
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
     backbone = anew(scene, steps, generator)
-    return Run(
+    half_run = Run(
         config=run.config,
         folder=run.folder,
         scene=scene,
@@ -91,6 +93,8 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         generator=generator,
         sampler=Sampler(len(views), own, batch=run.training.batch),
     )
+    half_run.blur.movements = dict(run.blur.movements)
+    return half_run
 
 
 def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.filling import unprojected
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.sky import DISTANCE, directions, none_above, sky_of
 
@@ -23,7 +22,8 @@ class ColouredSky:
     def image(self, camera: Camera) -> Tensor:
         column, row = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
         pixels = torch.stack([column, row], 2).reshape(-1, 2) + 0.5
-        rays = unprojected(camera, pixels, torch.ones(len(pixels))) - camera.centre.float()
+        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+        rays = torch.stack([x, y, torch.ones_like(x)], 1) @ camera.rotation.float()
         colours = (rays / rays.norm(dim=1, keepdim=True) + 1) / 2
         return (255 * colours.T.reshape(3, camera.height, camera.width)).round().byte()
 
@@ -74,8 +74,9 @@ def rolled(camera: Camera) -> Camera:
 
 def seen(scene: Scene) -> tuple[Tensor, Tensor, float]:
     """(directions, colours, share)."""
-    points, share = sky_of(scene)
-    return points.positions / points.positions.norm(dim=1, keepdim=True), points.colours, share
+    sky = sky_of(scene)
+    positions = sky.points.positions
+    return positions / positions.norm(dim=1, keepdim=True), sky.points.colours, sky.share
 
 
 @pytest.mark.parametrize("roll", [False, True])
@@ -90,10 +91,10 @@ def test_it_is_where_nothing_is_found_and_nothing_above_in_the_colours_of_the_ph
 
 def test_it_stands_far_behind_all_points() -> None:
     scene = scene_of(towers())
-    distance = sky_of(scene)[0].positions.norm(dim=1)
+    distance = sky_of(scene).points.positions.norm(dim=1)
     assert torch.allclose(distance, torch.tensor(DISTANCE * 1.1), rtol=1e-4)
-    far = sky_of(replace(scene, points=PointCloud(100 * towers(), scene.points.colours)))[0]
-    assert float(far.positions.norm(dim=1).min()) > 1.9 * 2000
+    far = sky_of(replace(scene, points=PointCloud(100 * towers(), scene.points.colours)))
+    assert float(far.points.positions.norm(dim=1).min()) > 1.9 * 2000
 
 
 @pytest.mark.parametrize("hidden", ["masked", "cut out"])
@@ -107,7 +108,7 @@ def test_what_does_not_count_and_what_is_cut_out_is_no_sky(hidden: str) -> None:
 def test_nothing_is_behind_a_scene_that_surrounds_its_cameras_or_shows_no_points() -> None:
     ball = torch.randn(20000, 3, generator=torch.Generator().manual_seed(0))
     assert seen(scene_of(10 * ball / ball.norm(dim=1, keepdim=True)))[2] < 0.01
-    assert len(sky_of(scene_of(torch.zeros(0, 3)))[0]) == 0
+    assert len(sky_of(scene_of(torch.zeros(0, 3))).points) == 0
 
 
 def test_points_above_and_beside_close_a_pixel() -> None:
@@ -115,6 +116,28 @@ def test_points_above_and_beside_close_a_pixel() -> None:
     up, point = torch.tensor([0.0, -1.0]), torch.tensor([[55.0, 45.0]])
     asked = torch.tensor([[55.0, 95.0], [45.0, 95.0], [65.0, 55.0], [75.0, 95.0], [55.0, 35.0], [55.0, 25.0]])
     assert none_above(asked, point, up, 10.0).tolist() == [False, False, False, True, False, True]
+
+
+def test_a_scene_far_from_the_origin_has_the_same_sky() -> None:
+    """As maps have it: float32 is half a unit there."""
+    scene, away = scene_of(towers()), torch.tensor([500000.0, 5600000.0, 100.0], dtype=torch.float64)
+    there = replace(
+        scene,
+        train=[
+            replace(view, camera=replace(view.camera, translation=shifted(view.camera, away))) for view in scene.train
+        ],
+        points=PointCloud((towers().double() + away).float(), scene.points.colours),
+    )
+    here, sky = sky_of(scene), sky_of(there)
+    assert abs(here.share - sky.share) < 0.03
+    rays = sky.points.positions.double() - away
+    rays = (rays / rays.norm(dim=1, keepdim=True)).float()
+    assert ((rays + 1) / 2 * 255 - sky.points.colours).abs().max() < 10
+
+
+def shifted(camera: Camera, by: Tensor) -> Tensor:
+    """The translation of the camera, moved in the world."""
+    return camera.translation.double() - camera.rotation.double() @ by
 
 
 def test_directions_are_evenly_over_the_sphere() -> None:
