@@ -78,7 +78,7 @@ class DensityControl:
 
     def reset_opacities(self, table: ParameterTable, filter_: Filter) -> None:
         """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting). The
-        sky stays as it is."""
+        sky stays as opaque as it is."""
         logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
         excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * not_sky(table)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)

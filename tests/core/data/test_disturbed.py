@@ -9,7 +9,7 @@ from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import disturbed, gains_of, movement_of, turn_of
-from gsx.core.data.movement import moved
+from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import FromFile, Masked, View
 from gsx.core.errors import ConfigError
 
@@ -99,15 +99,15 @@ class Stripes(Grey):
         return (200 * (column % 2)).expand(3, camera.height, -1).to(torch.uint8)
 
 
-def test_a_camera_that_moves_sweeps_its_photograph_at_every_size_and_in_crops() -> None:
+def test_a_camera_that_moves_blurs_its_photograph_at_every_size_and_in_crops() -> None:
     scene = small_scene(spread(5))
-    own = View("swept", scene.train[0].camera.zoom(8), Stripes())
+    own = View("blurred", scene.train[0].camera.zoom(8), Stripes())
     [worse] = disturbed(replace(scene, train=[own]), {"blur": 3.0}).train
-    across, down = movement_of("swept", 3.0)
-    expected = moved(own.source.image(own.camera).float(), across, down).round()
+    across, down = movement_of("blurred", 3.0)
+    expected = motion_blurred(own.source.image(own.camera).float(), across, down).round()
     assert torch.equal(worse.source.image(own.camera), expected.byte())
     finer = own.camera.zoom(2)
-    twice = moved(own.source.image(finer).float(), 2 * across, 2 * down).round()
+    twice = motion_blurred(own.source.image(finer).float(), 2 * across, 2 * down).round()
     assert torch.equal(worse.source.image(finer), twice.byte())
     part = own.camera.crop(50, 30, 60, 40)
     assert torch.equal(worse.source.image(part), expected.byte()[:, 30:70, 50:110])

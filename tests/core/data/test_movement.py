@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from gsx.core.data.movement import line_kernel, moved
+from gsx.core.data.movement import line_kernel, motion_blurred
 
 
 def shifted(image: Tensor, across: float, down: float) -> Tensor:
@@ -37,13 +37,13 @@ def test_it_is_the_mean_of_shifted_pictures(movement: tuple[float, float]) -> No
     image = torch.rand(3, 24, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     places = (torch.arange(500) + 0.5) / 500 - 0.5
     truth = torch.stack([shifted(image, *(float(t) * part for part in movement)) for t in places]).mean(0)
-    assert (moved(image, *movement) - truth).abs().max() < 0.01
-    assert (moved(image, *movement) - image).abs().max() > 0.2
+    assert (motion_blurred(image, *movement) - truth).abs().max() < 0.01
+    assert (motion_blurred(image, *movement) - image).abs().max() > 0.2
 
 
 def test_gradients_come_back_the_same_way() -> None:
     """A mean without a direction is its own transpose, but for what the edges hold."""
     image = torch.zeros(1, 21, 21, dtype=torch.float64, requires_grad=True)
     pulled = pad(torch.ones(1, 1, 1, dtype=torch.float64), (10, 10, 10, 10))
-    moved(image, 3.0, 2.0).backward(pulled)
-    assert torch.allclose(image.grad, moved(pulled, 3.0, 2.0), atol=1e-12)
+    motion_blurred(image, 3.0, 2.0).backward(pulled)
+    assert torch.allclose(image.grad, motion_blurred(pulled, 3.0, 2.0), atol=1e-12)

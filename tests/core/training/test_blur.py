@@ -12,7 +12,7 @@ from torch import Tensor
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import movement_of
-from gsx.core.data.movement import moved
+from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import View
 from gsx.core.quality.motion_blur import Movement
 from gsx.core.quality.sharpness import fineness
@@ -58,7 +58,7 @@ class Noise(Grey):
 
     def image(self, camera: Camera) -> Tensor:
         image = 255 * torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(0))
-        return (moved(image, 5.0, 0.0) if self.blurred else image).byte()
+        return (motion_blurred(image, 5.0, 0.0) if self.blurred else image).byte()
 
 
 def noisy(blurred: int) -> list[View]:
@@ -81,13 +81,13 @@ def test_renders_move_by_as_much_as_their_photographs_at_any_size() -> None:
     own, [view, other] = blur(), views(2)
     own.move({view: LONG}, 101)
     image = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(own.applied(image, view), moved(image, 3.0, 4.0))
+    assert torch.equal(own.applied(image, view), motion_blurred(image, 3.0, 4.0))
     assert own.applied(image, other) is image
     finer, smaller = (replace(view, camera=view.camera.resize(*size)) for size in ((48, 32), (12, 8)))
-    assert torch.equal(own.applied(image, finer), moved(image, 6.0, 8.0))
-    assert torch.equal(own.applied(image, smaller), moved(image, 1.5, 2.0))
+    assert torch.equal(own.applied(image, finer), motion_blurred(image, 6.0, 8.0))
+    assert torch.equal(own.applied(image, smaller), motion_blurred(image, 1.5, 2.0))
     part = replace(finer, camera=finer.camera.crop(0, 0, 24, 16))
-    assert torch.equal(own.applied(image, part), moved(image, 6.0, 8.0))
+    assert torch.equal(own.applied(image, part), motion_blurred(image, 6.0, 8.0))
 
 
 def test_they_go_on_from_what_was_kept() -> None:

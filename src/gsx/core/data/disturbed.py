@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.movement import moved
+from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import FromFile, ImageSource, Masked, Scene, View
 from gsx.core.data.taken import as_taken
 from gsx.core.errors import ConfigError
@@ -63,7 +63,11 @@ class Worse:
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """What was photographed."""
-        image = self.source.image(camera) if self.movement is None else swept(self.source, camera, *self.movement)
+        image = (
+            self.source.image(camera)
+            if self.movement is None
+            else with_motion_blur(self.source, camera, *self.movement)
+        )
         if self.gains is not None:
             image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
         return image if self.patch is None else self.patch.over(image, camera)
@@ -88,11 +92,11 @@ class WorseFile(Worse):
         return self.source.path
 
 
-def swept(source: ImageSource, camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
+def with_motion_blur(source: ImageSource, camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
     """What a camera sees that moves by such shares of the frame's sides; of a crop the part of the whole frame."""
     frame = camera.frame
     whole = source.image(camera.crop(-frame.left, -frame.top, frame.width, frame.height)).float()
-    taken = moved(whole, across * frame.width, down * frame.height).round().clamp(0, 255).to(torch.uint8)
+    taken = motion_blurred(whole, across * frame.width, down * frame.height).round().clamp(0, 255).to(torch.uint8)
     return taken[:, frame.top : frame.top + camera.height, frame.left : frame.left + camera.width]
 
 

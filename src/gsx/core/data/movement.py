@@ -33,7 +33,7 @@ def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
     return kernel[: 2 * radius + 1, : 2 * radius + 1]
 
 
-def moved(image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
+def motion_blurred(image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
     """The mean of a picture over a movement, px; beyond its edges it goes on as it is there."""
     kernel = line_kernel(across, down)
     side, (height, width) = len(kernel) // 2, image.shape[1:]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsx.core.data.masks import blacked
-from gsx.core.data.movement import moved
+from gsx.core.data.movement import motion_blurred
 from gsx.core.shapes import Bool, Float
 
 DIRECTIONS, LENGTHS = 8, (1.0, 2.5, 6.0)
@@ -67,7 +67,7 @@ def error_after(
     movement: tuple[float, float], pair: Float[Tensor, "2 H W"], counted: Bool[Tensor, "H W"] | None
 ) -> float:
     """Squared difference of the second picture from the first after a movement, px, over pixels that count."""
-    return float(blacked(moved(pair[:1], *movement) - pair[1:], counted).double().square().sum())
+    return float(blacked(motion_blurred(pair[:1], *movement) - pair[1:], counted).double().square().sum())
 
 
 def nearest(

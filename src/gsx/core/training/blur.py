@@ -1,4 +1,4 @@
-"""Photographs taken by a camera that moved: their renders are moved alike before they are compared.
+"""Photographs taken by a camera that moved: their renders are blurred alike before they are compared.
 
 Photographs that are less sharp than their neighbours are suspected (`core.quality.sharpness`). From what the model
 shows in their places the movement of the camera is estimated (`core.quality.motion_blur`), a few times as it gets
@@ -13,7 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from gsx.core.data.movement import moved
+from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import View
 from gsx.core.quality.motion_blur import Movement
 from gsx.core.quality.sharpness import against_neighbours, fineness
@@ -91,7 +91,7 @@ class Blur:
         if view.name not in self.movements:
             return image
         (across, down), frame = self.movements[view.name], view.camera.frame
-        return moved(image, across * frame.width, down * frame.height)
+        return motion_blurred(image, across * frame.width, down * frame.height)
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where there are none."""

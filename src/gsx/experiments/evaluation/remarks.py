@@ -187,7 +187,7 @@ def blur_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     if found.get("blurred"):
         yield (
             f"the camera moved in {found['blurred']} training photographs, by {found['length']:.1f} px in the middle "
-            f"of them: renders are moved alike before they are compared, from step {found['step']:,} on"
+            f"of them: renders are blurred alike before they are compared, from step {found['step']:,} on"
         )
 
 
