@@ -138,7 +138,7 @@ def test_a_run_resumes_as_if_never_stopped_and_finds_how_its_cameras_moved(tmp_p
 
 
 def test_halves_take_the_movements_that_were_found(tmp_path: Path) -> None:
-    """Models of half of the photographs learn from them as the run does, and their renders are moved alike."""
+    """Models of half of the photographs learn from them as the run does, and their renders are blurred alike."""
     run = tiny_run(tmp_path, [*MOVED, "iterations=60"])
     moved_view = next(view for view in run.photographed if view.name in run.blur.movements)
     shown, sharp = [], []
