@@ -17,9 +17,12 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.data.sky import Sky
 from gsx.core.errors import ConfigError
+from gsx.core.gaussians.splats import Splats
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
+from gsx.core.training.render import render, splats_for
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.flight import depth_and_coverage
 from gsx.experiments.runs.open import open_run
 
 FAR = 200.0
@@ -169,3 +172,21 @@ def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatc
     distances = whole.backbone.table["means"].detach().norm(dim=1)
     assert float(distances[above].min()) > 100 * whole.scene.extent
     assert float(distances[~above].max()) < 100 * whole.scene.extent
+
+
+def test_depth_is_that_of_the_scene_alone(tmp_path: Path) -> None:
+    """What is behind everything changes no weight before it: depth and alpha are those of a picture without it."""
+    run = tiny_run(tmp_path, ["backbone.sky=always", "iterations=12"])
+    camera = run.scene.test[0].camera
+    splats, near = splats_for(run, camera), not_sky(run.backbone.table)
+    shown = render(run, camera, depth=True, supersample=1)
+    alone = render(
+        run, camera, splats=Splats(**{name: value[near] for name, value in vars(splats).items()}), depth=True
+    )
+    assert float(alone.alpha.max()) > 0.5
+    torch.testing.assert_close(shown.alpha, alone.alpha, atol=1e-5, rtol=0)
+    torch.testing.assert_close(shown.depth, alone.depth, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(shown.image, render(run, camera, supersample=1).image, atol=1e-5, rtol=0)
+    summed, coverage = depth_and_coverage(run, camera, 1 << 20)
+    torch.testing.assert_close(summed, alone.depth, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(coverage, alone.alpha, atol=1e-5, rtol=0)

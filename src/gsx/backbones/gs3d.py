@@ -17,9 +17,10 @@ from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Show
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
-from gsx.backbones.sky import NOTHING, SKY_OPACITY, far_away, sky_behind
+from gsx.backbones.sky import NOTHING, SKY_OPACITY, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
+from gsx.core.data.sky import far_away
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.arrays import degree_of

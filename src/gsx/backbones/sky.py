@@ -5,10 +5,9 @@ import logging
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import offsets_from
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.data.sky import DISTANCE, Sky, centre_of, sky_of
-from gsx.core.shapes import Bool, Float
+from gsx.core.data.sky import Sky, sky_of
+from gsx.core.shapes import Bool
 from gsx.core.training.parameter_table import ParameterTable
 
 logger = logging.getLogger(__name__)
@@ -27,12 +26,6 @@ def sky_behind(scene: Scene, when: str) -> Sky:
     verdict = f"{len(found.points):,} Gaussians far away stand behind it" if wanted else "nothing stands behind it"
     logger.info("sky: %.1f %% of the pixels of training views look past the scene: %s", 100 * found.share, verdict)
     return found if wanted else NOTHING
-
-
-def far_away(positions: Float[Tensor, "N 3"], scene: Scene) -> Bool[Tensor, "N"]:
-    """Which positions lie where a sky does."""
-    distance = offsets_from(positions, centre_of(scene.train)).norm(dim=1)
-    return distance > DISTANCE / 2 * scene.extent
 
 
 def not_sky(table: ParameterTable) -> Bool[Tensor, "N"]:

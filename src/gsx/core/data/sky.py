@@ -128,6 +128,11 @@ def upwards_in(view: View, up: Float[Tensor, "3"]) -> Float[Tensor, "2"]:
     return along / along.norm().clamp_min(1e-9)
 
 
+def far_away(positions: Float[Tensor, "N 3"], scene: Scene) -> Bool[Tensor, "N"]:
+    """Which positions lie where a sky does: no camera of the scene can tell how far away that is."""
+    return offsets_from(positions, centre_of(scene.train)).norm(dim=1) > DISTANCE / 2 * scene.extent
+
+
 def rays_of(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
     """Directions in the world in which pixels look, at a depth of 1."""
     x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.sky import far_away
 from gsx.core.gaussians.splat_files import splats_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, TiledRendering, rasterize_tiled
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.core.training.run import Run
 from gsx.core.training.supersampling import finer_raster, times_as_fine
 
@@ -42,11 +43,28 @@ def render(
 
     Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
     `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
-    `depth`: with that, as finely as it was rendered.
+    `depth`: with that, as finely as it was rendered; where something stands behind the scene (`core.data.sky`), depth
+    and alpha are those of the scene alone: what shines through a wall does not move it away.
     """
     times = supersample or times_as_fine(camera, run.scene.train, run.resolution.supersample_at(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
-    tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, depth=depth, pixels=pixels)
+    far = far_away(drawn.means, run.scene) if depth else None
+    if far is not None and bool(far.any()):
+        tiled = with_depth_of_scene(drawn, far, raster.camera, run, pixels)
+    else:
+        tiled = rasterize_tiled(drawn, raster.camera, run.raster, background=run.background, depth=depth, pixels=pixels)
     image, alpha = (raster.reduced(part) for part in (tiled.image, tiled.alpha[None]))
     return replace(tiled, image=image.clamp_(0, 1), alpha=alpha[0])
+
+
+def with_depth_of_scene(
+    splats: Splats, far: Bool[Tensor, "M"], camera: Camera, run: Run, pixels: int
+) -> TiledRendering:
+    """The picture, with depth and alpha of the splats that are not far away: these are drawn as two more colours."""
+    near = (~far).to(splats.colours)[:, None]
+    z = camera.to_camera(splats.means)[:, 2:].to(near)
+    channels = replace(splats, colours=torch.cat([splats.colours, near, near * z], 1))
+    background = torch.cat([run.background, run.background.new_zeros(2)])
+    tiled = rasterize_tiled(channels, camera, run.raster, background=background, pixels=pixels)
+    return replace(tiled, image=tiled.image[:3], alpha=tiled.image[3], depth=tiled.image[4])

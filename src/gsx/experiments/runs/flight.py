@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
+from gsx.core.data.sky import far_away
 from gsx.core.rasterizer import rasterize_tiled
 from gsx.core.shapes import Float
 from gsx.core.training.render import render, splats_for
@@ -36,12 +37,15 @@ def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
 
 
 def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(blending-weighted sum of camera z, coverage): z is drawn in place of the three colours, for which loops are
-    compiled already."""
+    """(blending-weighted sum of camera z, coverage) of all but what stands behind the scene: drawn in place of colours,
+    for which loops are compiled already."""
     splats = splats_for(run, camera)
+    near = (~far_away(splats.means, run.scene)).to(splats.colours)[:, None]
     z = camera.to_camera(splats.means)[:, 2:].to(splats.colours)
-    drawn = rasterize_tiled(replace(splats, colours=z.repeat(1, 3)), camera, run.raster, pixels=pixels)
-    return drawn.image[0], drawn.alpha
+    drawn = rasterize_tiled(
+        replace(splats, colours=torch.cat([near * z, near, near], 1)), camera, run.raster, pixels=pixels
+    )
+    return drawn.image[0], drawn.image[1]
 
 
 def depth_colours(
