@@ -10,7 +10,7 @@ by two, with and without `training.poses.when=auto`, likewise. `covered`: someth
 training photograph, with and without `training.distractors.when=auto`, likewise; `passed`: somebody does in the
 built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx photographs` names is counted.
 `blur`: cameras move while they take photographs, with and without `training.blur.when=auto`, beside the scene as it
-is. `sky`: what plain `gsx` trains, with and without `backbone.sky=auto`; `sky_growing`: adaptive growth likewise.
+is. `sky`: what plain `gsx` trains, with and without `backbone.sky=auto`.
 Finished runs below --runs are not trained again.
 """
 
@@ -18,7 +18,7 @@ import argparse
 import math
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gsx.builtin import plugins
@@ -75,9 +75,6 @@ BLUR_ARMS = {
 DEFAULT = ("backbone=gs3d_zoom",)
 SKY_ARMS = {"gs3d_zoom": DEFAULT, "gs3d_zoom, sky=auto": (*DEFAULT, "backbone.sky=auto")}
 """What plain `gsx` trains, and the same with something behind the scene."""
-GROWING = ("backbone=gs3d", "backbone.capacity=adaptive")
-GROWING_ARMS = {"gs3d, adaptive": GROWING, "gs3d, adaptive, sky=auto": (*GROWING, "backbone.sky=auto")}
-"""The like of growth that pays for itself."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -120,6 +117,21 @@ def measured(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict
 
 Found = Sequence[Mapping[str, Any]]
 """What was measured with each seed."""
+Arms = Mapping[str, Sequence[str]]
+"""Overrides by the name of a row: what there is to win back, disturbed, and mended."""
+
+
+def rows_by_arm(
+    arms: Arms,
+    look: Callable[[str, int, str, argparse.Namespace], dict[str, Any]],
+    row: Callable[[str, str, Mapping[str, Found]], dict[str, Any]],
+    scenes: Sequence[str],
+    given: argparse.Namespace,
+) -> list[dict[str, Any]]:
+    """A row of each arm of each scene, of what was found with all seeds."""
+    found = over_seeds(lambda scene, seed: {arm: look(scene, seed, arm, given) for arm in arms}, scenes, given)
+    by_scene = {scene: {arm: [one[arm] for one in found[scene]] for arm in arms} for scene in scenes}
+    return [row(scene, arm, by_scene[scene]) for scene in scenes for arm in arms]
 
 
 def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
@@ -141,6 +153,12 @@ def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
 def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
     """PSNR by a protocol with each seed."""
     return [one[protocol][zoom]["psnr"] for one in found]
+
+
+def cost_of(found: Found, kind: str, form: str) -> str:
+    """Mean share of the training that went into what was asked of that kind, %; empty where nothing was."""
+    cost = [100 * one[kind]["seconds"] / one["seconds"] for one in found if one[kind]]
+    return f"{statistics.mean(cost):{form}}" if cost else ""
 
 
 def shares_won(arms: Sequence[Found], protocol: str, zoom: str) -> list[float]:
@@ -207,11 +225,7 @@ def faults(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """Exposures of their own, and what mends them."""
-    found = over_seeds(lambda scene, seed: {arm: measured(scene, seed, arm, given) for arm in ARMS}, scenes, given)
-    rows = []
-    for scene in scenes:
-        by_arm = {arm: [one[arm] for one in found[scene]] for arm in ARMS}
-        rows += [row_of(scene, arm, by_arm) for arm in ARMS]
+    rows = rows_by_arm(ARMS, measured, row_of, scenes, given)
     columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["spread", "spread found, %"]]
     columns += [["learnt", "learnt"], ["asking", "asking, % of training"], ["fitted1", "x1"], ["fitted4", "x4"]]
     columns += [["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as rendered"], ["x4", "x4 as rendered"]]
@@ -238,8 +252,7 @@ def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
     asked = [one["poses"] for one in found if one["poses"]]
     row["spread"] = told([one["spread"] for one in asked], ".2f") if asked else ""
     row["corrected"] = f"{sum(one['corrected'] > 0 for one in asked)} of {len(found)}" if asked else ""
-    cost = [100 * one["poses"]["seconds"] / one["seconds"] for one in found if one["poses"]]
-    row["cost"] = f"{statistics.mean(cost):.0f}" if cost else ""
+    row["cost"] = cost_of(found, "poses", ".0f")
     for zoom in ZOOMS:
         row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
         if arm.endswith("px, auto"):
@@ -250,11 +263,7 @@ def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
 
 def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """Poses that are wrong, and what mends them."""
-    found = over_seeds(lambda scene, seed: {arm: posed(scene, seed, arm, given) for arm in POSE_ARMS}, scenes, given)
-    rows = []
-    for scene in scenes:
-        by_arm = {arm: [one[arm] for one in found[scene]] for arm in POSE_ARMS}
-        rows += [pose_row(scene, arm, by_arm) for arm in POSE_ARMS]
+    rows = rows_by_arm(POSE_ARMS, posed, pose_row, scenes, given)
     columns = [["scene", "scene"], ["name", "training poses"], ["seeds", "seeds"], ["spread", "spread found, px"]]
     columns += [["corrected", "corrected"], ["cost", "% of training"], ["aligned1", "x1"], ["aligned4", "x4"]]
     columns += [["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as given"], ["x4", "x4 as given"]]
@@ -267,10 +276,6 @@ def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 
 # -- distractors -------------------------------------------------------------------------------------------------------
-
-
-Arms = Mapping[str, Sequence[str]]
-"""Overrides by the name of a row: what there is to win back, disturbed, and mended."""
 
 
 def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Namespace) -> dict[str, Any]:
@@ -286,8 +291,7 @@ def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
     asked = [one["distractors"] for one in found if one["distractors"]]
     row["share"] = told([100 * one["share"] for one in asked], ".1f") if asked else ""
     row["marked"] = told([100 * (one["marked"] or [0])[-1] for one in asked], ".1f") if asked else ""
-    cost = [100 * one["distractors"]["seconds"] / one["seconds"] for one in found if one["distractors"]]
-    row["cost"] = f"{statistics.mean(cost):.1f}" if cost else ""
+    row["cost"] = cost_of(found, "distractors", ".1f")
     for zoom in ZOOMS:
         row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
         if arm == mended:
@@ -305,9 +309,11 @@ PAST_COLUMNS = [
 
 def past(arms: Arms, scenes: Sequence[str], given: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of something in the way, and of what sees past it."""
-    found = over_seeds(lambda scene, seed: {a: seen_past(scene, seed, a, arms, given) for a in arms}, scenes, given)
-    by_scene = {scene: {arm: [one[arm] for one in found[scene]] for arm in arms} for scene in scenes}
-    return [past_row(scene, arm, by_scene[scene]) for scene in scenes for arm in arms]
+
+    def look(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+        return seen_past(scene, seed, arm, arms, given)
+
+    return rows_by_arm(arms, look, past_row, scenes, given)
 
 
 PAST_NOTE = (
@@ -335,14 +341,18 @@ def passed(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 # -- blur --------------------------------------------------------------------------------------------------------------
 
 
+def steadied(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Figures of a run, and what it found of how cameras moved."""
+    return figures(scene, seed, f"blur {arm}", BLUR_ARMS[arm], "blur", given)
+
+
 def blur_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     """Figures of one arm over seeds."""
     found = by_arm[arm]
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     asked = [one["blur"] for one in found if one["blur"]]
     row["blurred"] = told([one["blurred"] for one in asked], ".1f", ".1f") if asked else ""
-    cost = [100 * one["blur"]["seconds"] / one["seconds"] for one in found if one["blur"]]
-    row["cost"] = f"{statistics.mean(cost):.1f}" if cost else ""
+    row["cost"] = cost_of(found, "blur", ".1f")
     for zoom in ZOOMS:
         row[f"x{zoom}"] = told(psnr_of(found, "own", zoom), ".2f")
         if arm.endswith("blurred, auto"):
@@ -353,15 +363,7 @@ def blur_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
 
 def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """Photographs by cameras that moved, and what mends them."""
-
-    def look(scene: str, seed: int) -> dict[str, Any]:
-        return {arm: figures(scene, seed, f"blur {arm}", words, "blur", given) for arm, words in BLUR_ARMS.items()}
-
-    found = over_seeds(look, scenes, given)
-    rows = []
-    for scene in scenes:
-        by_arm = {arm: [one[arm] for one in found[scene]] for arm in BLUR_ARMS}
-        rows += [blur_row(scene, arm, by_arm) for arm in BLUR_ARMS]
+    rows = rows_by_arm(BLUR_ARMS, steadied, blur_row, scenes, given)
     columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["blurred", "found to be blurred"]]
     columns += [["cost", "% of training"], ["x1", "x1"], ["back1", "won back at x1"], ["x4", "x4"], ["back4", "at x4"]]
     note = (
@@ -375,22 +377,11 @@ def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 # -- sky ---------------------------------------------------------------------------------------------------------------
 
 
-def refuse_share(given: argparse.Namespace) -> None:
-    """End with a message where other than all steps are asked for."""
-    if given.share != 1:
-        sys.exit(f"--share {given.share:g}: runs with a sky take all steps")
-
-
 def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """With something behind the scene, and without."""
-    refuse_share(given)
+    if given.share != 1:
+        sys.exit(f"--share {given.share:g}: runs with a sky take all steps")
     return "Something behind the scene", *compared(SKY_ARMS, scenes, given)
-
-
-def sky_growing(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
-    """The same beneath growth that pays for itself."""
-    refuse_share(given)
-    return "Something behind the scene, and adaptive growth", *compared(GROWING_ARMS, scenes, given)
 
 
 WHAT: dict[str, Measure] = {
@@ -401,7 +392,6 @@ WHAT: dict[str, Measure] = {
     "faults": faults,
     "blur": blur,
     "sky": sky,
-    "sky_growing": sky_growing,
 }
 
 

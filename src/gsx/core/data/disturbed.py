@@ -128,6 +128,12 @@ def movement_of(name: str, spread: float) -> tuple[float, float]:
     return across, down
 
 
+def movement_shares(view: View, spread: float) -> tuple[float, float]:
+    """The movement of a photograph (`movement_of`), as shares of the sides of its view's frame."""
+    (across, down), frame = movement_of(view.name, spread), view.camera.frame
+    return across / frame.width, down / frame.height
+
+
 def turned(camera: Camera, name: str, spread: float) -> Camera:
     """The camera turned about its centre, so that its picture moves so (`turn_of`)."""
     across, down = turn_of(name, spread)
@@ -157,13 +163,12 @@ def patch_of(name: str, share: float) -> Patch:
 def worse(view: View, by: Mapping[str, float]) -> View:
     """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken."""
     exposure, pose, covered, blur = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
-    across, down = movement_of(view.name, blur)
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
         patch=patch_of(view.name, covered) if covered else None,
-        movement=(across / view.camera.frame.width, down / view.camera.frame.height) if blur else None,
+        movement=movement_shares(view, blur) if blur else None,
     )
     return replace(view, source=source, camera=turned(view.camera, view.name, pose) if pose else view.camera)
 

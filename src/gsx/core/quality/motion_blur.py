@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from gsx.core.data.camera import Frame
 from gsx.core.data.masks import blacked
 from gsx.core.data.movement import motion_blurred
 from gsx.core.shapes import Bool, Float
@@ -42,6 +43,10 @@ class Movement:
     def times(self, factor: float) -> "Movement":
         """In px so many times as small."""
         return Movement(self.across * factor, self.down * factor, self.explained)
+
+    def shares_of(self, frame: Frame) -> tuple[float, float]:
+        """Across and down, as shares of the sides of the frame that it is in px of."""
+        return self.across / frame.width, self.down / frame.height
 
 
 def movement_between(

@@ -81,8 +81,7 @@ class Blur:
     def move(self, found: Mapping[View, Movement], number: int) -> list[float]:
         """These movements, px of their views, from a step on, as far as they count; returns the lengths of those."""
         kept = {view: one for view, one in found.items() if self.counts(one)}
-        sizes = {view: view.camera.frame for view in kept}
-        self.movements = {v.name: (one.across / sizes[v].width, one.down / sizes[v].height) for v, one in kept.items()}
+        self.movements = {view.name: one.shares_of(view.camera.frame) for view, one in kept.items()}
         self.asked = number
         return [one.length for one in kept.values()]
 

@@ -62,9 +62,13 @@ def with_depth_of_scene(
     splats: Splats, far: Bool[Tensor, "M"], camera: Camera, run: Run, pixels: int
 ) -> TiledRendering:
     """The picture, with depth and alpha of the splats that are not far away: these are drawn as two more colours."""
-    near = (~far).to(splats.colours)[:, None]
-    z = camera.to_camera(splats.means)[:, 2:].to(near)
-    channels = replace(splats, colours=torch.cat([splats.colours, near, near * z], 1))
+    channels = replace(splats, colours=torch.cat([splats.colours, coverage_and_depth(splats, far, camera)], 1))
     background = torch.cat([run.background, run.background.new_zeros(2)])
     tiled = rasterize_tiled(channels, camera, run.raster, background=background, pixels=pixels)
     return replace(tiled, image=tiled.image[:3], alpha=tiled.image[3], depth=tiled.image[4])
+
+
+def coverage_and_depth(splats: Splats, far: Bool[Tensor, "M"], camera: Camera) -> Float[Tensor, "M 2"]:
+    """1 and camera z, scene units, of each splat, to be blended as colours are; 0 of those far away."""
+    near = (~far).to(splats.colours)[:, None]
+    return torch.cat([near, near * camera.to_camera(splats.means)[:, 2:].to(near)], 1)

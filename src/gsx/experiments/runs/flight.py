@@ -10,7 +10,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.sky import far_away
 from gsx.core.rasterizer import rasterize_tiled
 from gsx.core.shapes import Float
-from gsx.core.training.render import render, splats_for
+from gsx.core.training.render import coverage_and_depth, render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import Pictures, colour_ramp
 
@@ -40,12 +40,10 @@ def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Ten
     """(blending-weighted sum of camera z, coverage) of all but what stands behind the scene: drawn in place of colours,
     for which loops are compiled already."""
     splats = splats_for(run, camera)
-    near = (~far_away(splats.means, run.scene)).to(splats.colours)[:, None]
-    z = camera.to_camera(splats.means)[:, 2:].to(splats.colours)
-    drawn = rasterize_tiled(
-        replace(splats, colours=torch.cat([near * z, near, near], 1)), camera, run.raster, pixels=pixels
-    )
-    return drawn.image[0], drawn.image[1]
+    both = coverage_and_depth(splats, far_away(splats.means, run.scene), camera)
+    shown = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
+    coverage, summed, _ = rasterize_tiled(shown, camera, run.raster, pixels=pixels).image
+    return summed, coverage
 
 
 def depth_colours(

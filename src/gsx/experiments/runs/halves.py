@@ -66,8 +66,7 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
     for half in range(HALVES):
         model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
         numbers = range(half, len(views), HALVES)
-        drawn = {n: run.blur.applied(render(model, views[n].camera).image, views[n]) for n in numbers}
-        shown |= {n: to_uint8(image) for n, image in drawn.items()}
+        shown |= {n: to_uint8(run.blur.applied(render(model, views[n].camera).image, views[n])) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 
