@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 from raster_scenes import front_camera, random_splats
+from small_scene import small_scene
 
 from gsx.core.data.camera import look_at
 from gsx.core.errors import InputError, TooManyPairs
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.experiments.reports.pictures import colour_ramp
 from gsx.experiments.runs import evaluate as evaluation
@@ -42,13 +44,24 @@ def test_a_window_at_the_border_stays_inside():
         assert -1 <= -low <= high - camera.width + 1
 
 
-def test_depth_is_that_of_the_rasterizer(monkeypatch: pytest.MonkeyPatch):
+def test_depth_is_that_of_the_rasterizer_without_what_stands_behind_the_scene(monkeypatch: pytest.MonkeyPatch):
+    """One large splat a thousand units behind 200 others, which cover some of the picture half."""
     splats, camera, rules = random_splats(200, seed=3), front_camera(), RasterSettings(path="eager")
-    monkeypatch.setattr(drawing, "splats_for", lambda run, camera: splats)
-    depth, coverage = drawing.depth_and_coverage(SimpleNamespace(raster=rules), camera, 1 << 20)
+    middle = camera.centre + 1000.0 * camera.rotation[2]
+    with_sky = Splats(
+        means=torch.cat([splats.means, middle[None].float()]),
+        scales=torch.cat([splats.scales, torch.full((1, 3), 500.0)]),
+        quats=torch.cat([splats.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]])]),
+        log_opacities=torch.cat([splats.log_opacities, torch.tensor([-0.01])]),
+        colours=torch.cat([splats.colours, torch.ones(1, 3)]),
+    )
+    monkeypatch.setattr(drawing, "splats_for", lambda run, camera: with_sky)
+    run = SimpleNamespace(raster=rules, scene=small_scene(splats.means))
+    depth, coverage = drawing.depth_and_coverage(run, camera, 1 << 20)
     drawn = rasterize(splats, camera, rules, depth=True)
     torch.testing.assert_close(depth, drawn.depth, rtol=1e-5, atol=1e-5)
-    assert torch.equal(coverage, drawn.alpha)
+    torch.testing.assert_close(coverage, drawn.alpha, rtol=1e-5, atol=1e-6)
+    assert 0.1 < coverage.mean() < 0.9, "near splats cover some of the sky"
 
 
 def test_depth_is_coloured_by_its_inverse():
