@@ -17,7 +17,7 @@ from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Show
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
-from gsx.backbones.sky import NOTHING, SKY_OPACITY, sky_behind
+from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.sky import far_away
@@ -107,7 +107,7 @@ class GS3D:
         if self.options.sky != "never":
             sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NOTHING
             own = initial_parameters(sky.points, self.options.sh_degree, SKY_OPACITY)
-            own["log_scales"].fill_(math.log(sky.spacing))
+            own["log_scales"].clamp_(math.log(sky.spacing), math.log(WIDEST * sky.spacing))
             raw = {name: torch.cat([value, own[name]]) for name, value in raw.items()}
             columns = columns | {"sky": (torch.arange(len(raw["means"])) >= len(points)).to(torch.int8)}
         return self.table_of(raw, columns, device)
