@@ -539,6 +539,24 @@ def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None
     assert starts.seen_in_training(tmp_path) == sum(range(91, 101)) / 10
 
 
+def test_runs_in_fewer_steps_are_compared_with_published_ones_in_all_of_theirs() -> None:
+    import sooner
+
+    def run(psnr: float, gap: float, seconds: float) -> dict[str, object]:
+        zooms = {zoom: {"psnr": psnr - float(zoom)} for zoom in ("1", "2", "4")}
+        return {"zoom": zooms, "gap": gap, "primitives": 100, "train_seconds": seconds}
+
+    published, short = ("gs3d", 1.0), ("gs3d_zoom", 0.5)
+    found = [
+        {arm: run(30.0, 0.8, 20.0) for arm in sooner.ARMS} | {short: run(31.0 + seed, 0.2, 11.0)} for seed in (0, 1)
+    ]
+    rows = {(row["arm"], row["steps"]): row for row in sooner.rows_of("room", found)}
+    assert set(rows) == {("gs3d", 1500), ("gs3d_zoom", 1125), ("gs3d_zoom", 750)}
+    assert rows["gs3d_zoom", 750]["more4"] == "+1.50 ± 0.50"
+    assert (rows["gs3d_zoom", 750]["times"], rows["gs3d_zoom", 750]["gap"]) == ("0.55", "+0.20 ± 0.00")
+    assert (sooner.steps_of("demo", published[1]), sooner.steps_of("fox_4", short[1])) == (900, 750)
+
+
 def test_a_stage_within_another_stops_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter([0.0, 1.0, 3.0, 6.0, 6.5, 10.0])
     monkeypatch.setattr(stages.time, "perf_counter", lambda: next(now))
