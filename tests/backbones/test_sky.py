@@ -64,8 +64,18 @@ def test_they_follow_the_scene_and_hide_what_is_behind_them_from_the_start() -> 
     torch.testing.assert_close(opacities, torch.tensor([0.1, 0.1, 0.1, 0.98, 0.98]))
     colours = 0.5 + backbone.table["sh_dc"].detach()[3:, 0] * 0.28209479177387814
     torch.testing.assert_close(colours, torch.tensor([[200.0, 210, 220]] * 2) / 255)
-    torch.testing.assert_close(backbone.table["log_scales"].detach()[3:].exp(), torch.full((2, 3), 8.0))
     assert backbone.plan()["sky"] == {"gaussians": 2}
+
+
+@pytest.mark.parametrize(("spacing", "size"), [(20.0, 20.0), (12.0, 200**0.5), (8.0, 12.0)])
+def test_sizes_are_distances_to_neighbours_between_one_spacing_and_one_and_a_half(
+    spacing: float, size: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two directions whose points are 14.1 apart."""
+    points = PointCloud(torch.tensor([[0.0, FAR, 10.0], [10.0, FAR, 0.0]]), torch.zeros(2, 3, dtype=torch.uint8))
+    monkeypatch.setattr(sky, "sky_of", lambda scene: Sky(points=points, spacing=spacing, share=0.03))
+    table = with_sky().table
+    torch.testing.assert_close(table["log_scales"].detach()[3:].exp(), torch.full((2, 3), size))
 
 
 @pytest.mark.usefixtures("two_behind")

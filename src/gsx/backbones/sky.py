@@ -14,8 +14,9 @@ logger = logging.getLogger(__name__)
 
 SKY_OPACITY = 0.98
 """At first: nothing near has to be made up in its place."""
-WIDEST = 3.0
-"""Size of a Gaussian of the sky at first, in spacings of its directions, where its neighbours are far from it."""
+WIDEST = 1.5
+"""Largest size of a Gaussian of the sky at first, in spacings of directions: where neighbours are far off, it would lie
+before others."""
 OPEN = 0.01
 """`sky=auto`: share of the pixels that look past the scene, from which on something stands behind it."""
 NOTHING = Sky(points=PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), spacing=1.0, share=0.0)

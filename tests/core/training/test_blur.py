@@ -1,5 +1,6 @@
 """Cameras that moved in runs: found where they did, absent where they did not, applied, kept and resumed."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from gsx.core.data.scene import View
 from gsx.core.quality.motion_blur import Movement
 from gsx.core.quality.sharpness import fineness
 from gsx.core.training.blur import Blur, BlurOptions
+from gsx.core.training.run import Run
+from gsx.core.training.trainer import view_loss
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import made
@@ -109,42 +112,67 @@ def test_options_that_say_nothing_are_refused(key: str, value: object) -> None:
 
 SIZE = ("scene.width=96", "scene.height=80")
 MOVED = (
-    *(*SIZE, "scene.disturb.blur=4", "training.blur.when=always", "training.blur.start=0.5"),
-    *("iterations=80", "backbone.rates.shortened=0.4", "scene.points=3000"),
+    *(*SIZE, "scene.disturb.blur=8", "training.blur.when=always", "training.blur.start=0.5"),
+    *("iterations=60", "backbone.rates.shortened=0.4", "scene.points=3000", "backbone.max_primitives=14000"),
 )
 
 
-def test_a_run_resumes_as_if_never_stopped_and_finds_how_its_cameras_moved(tmp_path: Path) -> None:
-    whole = tiny_run(tmp_path / "whole", MOVED)
-    tiny_run(tmp_path / "stopped", MOVED, stop_after=55)
-    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    assert run.blur.movements
-    execute(run, settings, plugins())
-    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
-    assert a.keys() == b.keys()
-    assert any(name.startswith("blur.of ") for name in a)
-    assert all(torch.equal(a[name], b[name]) for name in a)
-    unmoved = tiny_run(tmp_path / "unmoved", [*MOVED, "training.blur.when=never"])
-    assert not torch.equal(unmoved.backbone.table["means"], whole.backbone.table["means"])
-    told = [line for line in whole.curves if "blur_seconds" in line]
-    assert [line["step"] for line in told] == whole.blur.steps()
-    assert f"moved in {len(whole.blur.movements)} training photographs" in " ".join(remarks_of(gathered(whole.curves)))
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
+    """(a finished run whose cameras moved, its folder)."""
+    folder = tmp_path_factory.mktemp("moved") / "run"
+    return tiny_run(folder, MOVED), folder
+
+
+def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
+    run, _ = moved
+    told = [line for line in run.curves if "blur_seconds" in line]
+    assert [line["step"] for line in told] == run.blur.steps()
+    assert f"moved in {len(run.blur.movements)} training photographs" in " ".join(remarks_of(gathered(run.curves)))
     size, far = torch.tensor([96.0, 80.0], dtype=torch.float64), 0
-    for view in whole.scene.train:
-        made = torch.tensor(movement_of(view.name, 4.0), dtype=torch.float64)
-        found = size * torch.tensor(whole.blur.movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
+    for view in run.scene.train:
+        made = torch.tensor(movement_of(view.name, 8.0), dtype=torch.float64)
+        found = size * torch.tensor(run.blur.movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
         far += min(float((found - sign * made).norm()) for sign in (1, -1)) > 0.25 * float(made.norm()) + 1
     assert far <= 1
 
 
-def test_halves_take_the_movements_that_were_found(tmp_path: Path) -> None:
+def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(
+    moved: tuple[Run, Path], tmp_path: Path
+) -> None:
+    tiny_run(tmp_path / "stopped", MOVED, stop_after=40)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    assert run.blur.movements
+    execute(run, settings, plugins())
+    a, b = final_tensors(moved[1]), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert any(name.startswith("blur.of ") for name in a)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_renders_are_blurred_before_they_are_compared(moved: tuple[Run, Path]) -> None:
+    """A sharp model is nearer to blurred photographs so."""
+    run, _ = moved
+    found = dict(run.blur.movements)
+    view = max(run.photographed, key=lambda view: math.hypot(*found.get(view.name, (0.0, 0.0))))
+    losses = []
+    for movements in (found, {}):
+        run.blur.movements = movements
+        losses.append(float(view_loss(run, run.step, view, [], run.scene.background).loss))
+    run.blur.movements = found
+    assert losses[0] < 0.8 * losses[1]
+
+
+def test_halves_take_the_movements_that_were_found(moved: tuple[Run, Path]) -> None:
     """Models of half of the photographs learn from them as the run does, and their renders are blurred alike."""
-    run = tiny_run(tmp_path, [*MOVED, "iterations=60"])
+    run, _ = moved
     moved_view = next(view for view in run.photographed if view.name in run.blur.movements)
+    found = dict(run.blur.movements)
     shown, sharp = [], []
-    for pictures, movements in ((shown, dict(run.blur.movements)), (sharp, {})):
+    for pictures, movements in ((shown, found), (sharp, {})):
         run.blur.movements = movements
         pictures += made(run, lambda scene, steps, generator: run.backbone, 1, 0)
+    run.blur.movements = found
     number = list(run.photographed).index(moved_view)
     assert fineness(shown[number]).min() < 0.9 * fineness(sharp[number]).min()
 
