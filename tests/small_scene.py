@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 from importlib.resources import as_file, files
+from typing import Any
 
 import torch
 from omegaconf import OmegaConf
@@ -52,7 +53,7 @@ def published_options(**density: float) -> GS3DOptions:
     return replace(options, density=replace(options.density, **density))
 
 
-def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **more: int) -> BackboneContext:
+def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **more: Any) -> BackboneContext:
     """What a backbone on the CPU is built from; `more`: of its resolution."""
     return BackboneContext(
         scene=scene,

@@ -15,7 +15,7 @@ from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
-from gsx.backbones.capacity import Budget, BudgetOptions, Growing
+from gsx.backbones.capacity import Budget, BudgetOptions, Growing, with_rows, worth_in_training
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.builtin import plugins
@@ -23,7 +23,10 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
+from gsx.core.rasterizer import rasterize
 from gsx.core.training.distributed import Ranks
+from gsx.core.training.evidence import drawn_errors, rounding_of
+from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
@@ -279,6 +282,43 @@ def test_the_rate_follows_the_gain(had: float, price: float, rate: float, monkey
     assert model.table.record["trials"][0, :3].tolist() == [700, 50, 25]
 
 
+@dataclass(frozen=True)
+class Printed:
+    """A photograph that was taken before."""
+
+    picture: Tensor
+
+    def image(self, camera: Camera) -> Tensor:
+        return self.picture
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_photographs_are_compared_with_what_they_would_show_of_the_model(known: bool) -> None:
+    """They show the model itself at half its brightness: with their exposures known it has no error to speak of, others
+    draw none, and half of it does far worse."""
+    bare = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=0.5)
+    model = small_gs3d(bare, options=options_of("adaptive"))
+    drawn = [(view.camera, model.draw(view.camera, 700).splats) for view in bare.train]
+    whole = [rasterize(splats, camera, model.raster, background=bare.background).image for camera, splats in drawn]
+    shown = [(127.5 * image.detach()).round().byte() for image in whole]
+    scene = replace(bare, train=[replace(v, source=Printed(p)) for v, p in zip(bare.train, shown, strict=True)])
+    exposures = Exposures(names=[view.name for view in scene.train])
+    if known:
+        exposures.begin(torch.cat([0.5 * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(scene.train), 1, 1))
+    context = small_context(scene, exposures=exposures)
+    half = with_rows(model.table, torch.arange(40) < 20)
+    gain = Adaptive(AdaptiveOptions(), context, PUBLISHED, 0).gain(model, model.table, half, 700)[0]
+    found = worth_in_training(model, context, 700)
+    form, background = context.resolution.forming(700), scene.background
+    errors = drawn_errors(model, scene.train, form, background, 700, context.resolution.as_photographed)
+    assert (gain > 10) is known
+    assert (found.error_share < 2 * found.rounding_share) is known
+    assert (float(errors.sum()) < 2 * sum(rounding_of(view) for view in scene.train)) is known
+
+
 def half_of_it_faint() -> tuple[Scene, GS3D]:
     """40 Gaussians before a grey background, of which half are too faint to be seen."""
     scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
@@ -303,7 +343,7 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
 
 def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an error, a share of it would be a price that nothing is below."""
-    monkeypatch.setattr("gsx.core.training.evidence.difference", lambda image, view: torch.zeros_like(image))
+    monkeypatch.setattr("gsx.core.training.evidence.difference", lambda image, *_: torch.zeros_like(image))
     scene, model = half_of_it_faint()
     assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())

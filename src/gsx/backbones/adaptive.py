@@ -149,10 +149,13 @@ class Adaptive:
     ) -> tuple[float, float]:
         """(dB by which validation windows are better drawn with one table than with another, its standard error)."""
         windows = self.windows(step)
-        form, floor = self.context.resolution.forming(step), rounding_in(windows)
+        resolution, floor = self.context.resolution, rounding_in(windows)
+        form, exposed = resolution.forming(step), resolution.as_photographed
 
         def look() -> tuple[float, float]:
-            both = (window_errors(model, rows, windows, form, self.background, step) for rows in (table, before))
+            both = (
+                window_errors(model, rows, windows, form, self.background, step, exposed) for rows in (table, before)
+            )
             return decibels(*(errors.cpu() + floor for errors in both))
 
         return self.context.found_by_first(look)

@@ -90,7 +90,8 @@ class LongAxis:
         views = some_of(context.resolution.views(step), self.views, control.generator)
 
         def look() -> Tensor:
-            return drawn_errors(model, views, context.resolution.forming(step), control.background, step).cpu()
+            form, exposed = context.resolution.forming(step), context.resolution.as_photographed
+            return drawn_errors(model, views, form, control.background, step, exposed).cpu()
 
         score = context.found_by_first(look).to(context.device) * mean_absolute(table)
         wanted = (score > 0) & not_sky(table)

@@ -94,6 +94,14 @@ def test_equal_photographs_have_none_unless_asked_for() -> None:
     assert not Exposures(options(when="never"), list("abcd"), 1000, CPU).due(201)
 
 
+def test_looking_at_a_photograph_teaches_nothing() -> None:
+    image, found = 0.2 + 0.3 * noise(3, 16, 24), Exposures(options(), ["a", "b"], 100, CPU)
+    found.begin(torch.eye(3, 4).repeat(2, 1, 1))
+    assert found.applied(image, "a", learning=True).requires_grad
+    assert not found.applied(image, "b").requires_grad
+    assert found.shown == {0}
+
+
 def test_they_are_learnt_and_go_on_from_what_was_kept() -> None:
     image, truth = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4).repeat(2, 1, 1)
     truth[0, 0, 3], truth[1, 0, 3] = 0.1, -0.1
@@ -104,7 +112,7 @@ def test_they_are_learnt_and_go_on_from_what_was_kept() -> None:
         for number in range(first, last):
             name = "ab"[number % 2]
             wanted = transformed(image, truth["ab".index(name)])
-            (exposures.applied(image, name) - wanted).square().mean().backward()
+            (exposures.applied(image, name, learning=True) - wanted).square().mean().backward()
             exposures.update(number)
 
     go_on(found, 21, 60)
@@ -126,13 +134,13 @@ def test_each_photograph_takes_steps_of_its_own_by_a_rate_that_falls() -> None:
     assert [found.rate(number) for number in (200, 600, 1000)] == pytest.approx([0.01, math.sqrt(1e-5), 0.001])
     found.begin(torch.eye(3, 4).repeat(4, 1, 1))
     image, still = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4)
-    found.applied(image, "a").sum().backward()
+    found.applied(image, "a", learning=True).sum().backward()
     found.update(200)  # Adam's first step is one rate: down, and up by a quarter of it for the mean's sake
     assert found.matrices is not None
     torch.testing.assert_close(found.matrices[0].detach(), still - 0.01 * 3 / 4, atol=1e-6, rtol=0)
     torch.testing.assert_close(found.matrices[1].detach(), still + 0.01 / 4, atol=1e-6, rtol=0)
     before = found.matrices.detach().clone()
-    found.applied(image, "b").sum().backward()
+    found.applied(image, "b", learning=True).sum().backward()
     found.update(200)  # what was shown before does not go on moving
     torch.testing.assert_close((found.matrices - before)[0].detach(), torch.full((3, 4), 0.01 / 4), atol=1e-6, rtol=0)
 
@@ -183,6 +191,7 @@ def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> Non
     assert a.keys() == b.keys()
     assert "exposure.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
+    assert a["exposure.visits"].sum() == 10, "the steps after they were judged, and no look at a photograph beside"
 
 
 def test_without_need_training_is_bit_for_bit_that_without_exposures(tmp_path: Path) -> None:

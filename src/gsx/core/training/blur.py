@@ -49,8 +49,8 @@ class BlurOptions:
 class Blur:
     """Of a run's training photographs. Renders stay as they are before `move`."""
 
-    options: BlurOptions
-    iterations: int
+    options: BlurOptions = field(default_factory=BlurOptions)
+    iterations: int = 0
     movements: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Across and down, as shares of the frame's sides, by name, of photographs that are blurred."""
     asked: int = 0

@@ -62,9 +62,19 @@ def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background:
     return Look(rendering=rendering, image=image, camera=raster.drawn_for, **leaves)
 
 
-def difference(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
-    """A render less the photograph of its view; 0 where that does not count."""
-    return blacked(image.detach() - view.image().to(image), view.counted())
+Exposed = Callable[[Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
+"""A render as the photograph of that view shows it (`Resolution.as_photographed`)."""
+
+
+def as_it_is(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
+    """For photographs of one exposure, by cameras that stood still."""
+    return image
+
+
+def difference(image: Float[Tensor, "3 H W"], view: View, exposed: Exposed = as_it_is) -> Float[Tensor, "3 H W"]:
+    """A render as the photograph of its view shows it, less that; 0 where that does not count."""
+    shown = exposed(image.detach(), view)
+    return blacked(shown - view.image().to(shown), view.counted())
 
 
 def rounding_of(view: View, window: Window | None = None) -> float:
@@ -126,13 +136,18 @@ def looked_at(
 
 
 def drawn_errors(
-    model: Backbone[Any], views: Sequence[View], form: Forming, background: Float[Tensor, "3"], step: int
+    model: Backbone[Any],
+    views: Sequence[View],
+    form: Forming,
+    background: Float[Tensor, "3"],
+    step: int,
+    exposed: Exposed = as_it_is,
 ) -> Float[Tensor, "N"]:
     """Of each row the squared error that it draws in the views, by blending weights."""
     sums = background.new_zeros(len(model.table))
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)
-        sums += by_row(drawn, error_sums(seen, difference(seen.image, view)), len(sums))
+        sums += by_row(drawn, error_sums(seen, difference(seen.image, view, exposed)), len(sums))
     return sums
 
 
@@ -170,6 +185,7 @@ def worth_of_rows(
     background: Float[Tensor, "3"],
     step: int,
     generator: torch.Generator,
+    exposed: Exposed = as_it_is,
 ) -> Removal:
     """What the pictures of the views lose without each row."""
     count, draws = len(model.table), draws_of_each(views)
@@ -178,7 +194,7 @@ def worth_of_rows(
         drawn, seen = looked_at(model, view.camera, form, background, step)
         squares += squared_changes(drawn, seen, view.counted(), count, draws, generator)
         shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view).double().square().sum())
+        error += float(difference(seen.image, view, exposed).double().square().sum())
         rounding += rounding_of(view)
     all_shown = max(1.0, float(shown.sum()))
     shares = {"error_share": error / all_shown, "rounding_share": rounding / all_shown}
@@ -204,15 +220,6 @@ def squared_changes(
 def some_of(views: Sequence[View], count: int, generator: torch.Generator) -> list[View]:
     """At most so many of the views, at random."""
     return [views[index] for index in torch.randperm(len(views), generator=generator)[:count].tolist()]
-
-
-Exposed = Callable[[Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
-"""A render as the photograph of that view shows it (`Run.as_photographed`)."""
-
-
-def as_it_is(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
-    """For photographs of one exposure, by cameras that stood still."""
-    return image
 
 
 @torch.no_grad()

@@ -25,6 +25,7 @@ BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a photograph is seen a few dozen times in a short run."""
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
+CPU = torch.device("cpu")
 FEWEST_PIXELS, FEWEST_VIEWS = 64, 3
 """That tell a gain; that tell a spread."""
 
@@ -92,11 +93,11 @@ def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> fl
 class Exposures:
     """Of a run's training photographs. Nothing is learnt, and no picture changed, before `begin`."""
 
-    options: ExposureOptions
-    names: Sequence[str]
+    options: ExposureOptions = field(default_factory=ExposureOptions)
+    names: Sequence[str] = ()
     """Of the photographs."""
-    iterations: int
-    device: torch.device
+    iterations: int = 0
+    device: torch.device = CPU
     matrices: Float[Tensor, "N 3 4"] | None = None
     moments: Float[Tensor, "2 N 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 3, 4))
     """Adam's means of gradients and of their squares."""
@@ -130,14 +131,16 @@ class Exposures:
         self.matrices = matrices.to(self.device).requires_grad_()
         self.moments, self.visits = torch.zeros(2, *matrices.shape, device=self.device), torch.zeros(len(matrices))
 
-    def applied(self, image: Float[Tensor, "3 H W"], name: str) -> Float[Tensor, "3 H W"]:
+    def applied(self, image: Float[Tensor, "3 H W"], name: str, learning: bool = False) -> Float[Tensor, "3 H W"]:
         """The render as the photograph of that name would have it, on the device that learns; as it is where there are
-        no exposures."""
+        no exposures. learning: the photograph is one of the step under way."""
         if self.matrices is None:
             return image
         index = self.names.index(name)
-        self.shown.add(index)
-        return transformed(image.to(self.device), self.matrices[index])
+        if learning:
+            self.shown.add(index)
+        matrix = self.matrices[index] if learning else self.matrices[index].detach()
+        return transformed(image.to(self.device), matrix)
 
     def rate(self, number: int) -> float:
         """Of step `number`."""

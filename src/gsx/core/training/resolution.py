@@ -12,8 +12,10 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
-from gsx.core.shapes import Bool, UInt8
+from gsx.core.shapes import Bool, Float, UInt8
+from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
+from gsx.core.training.exposure import Exposures
 from gsx.core.training.poses import Poses
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
@@ -84,6 +86,10 @@ class Resolution:
     """Where photographs were taken: where their views say, unless that is corrected."""
     distractors: Distractors = field(default_factory=Distractors)
     """Parts of photographs that do not count: none unless they are found."""
+    exposures: Exposures = field(default_factory=Exposures)
+    """Of the photographs: all alike unless they are found to differ."""
+    blur: Blur = field(default_factory=Blur)
+    """Movements of their cameras: none unless they are found."""
     closer: dict[str, Sequence[PseudoView]] = field(default_factory=dict)
     """Pseudo views that are trained on at the moment, by augmenter."""
 
@@ -106,6 +112,13 @@ class Resolution:
         if times not in self.coarse_views:
             self.coarse_views[times] = [coarser(view, self.scene.reduction, times) for view in self.scene.train]
         return self.distractors.views(self.poses.views(self.coarse_views[times]))
+
+    def as_photographed(
+        self, image: Float[Tensor, "3 H W"], view: View, learning: bool = False
+    ) -> Float[Tensor, "3 H W"]:
+        """A render as the photograph of a training view shows it: by a camera that moved, at its exposure. learning:
+        the view is one of the step under way."""
+        return self.exposures.applied(self.blur.applied(image, view), view.name, learning)
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

@@ -76,8 +76,9 @@ class TrainingOptions:
         steps = self.cooldown * iterations
         return min(1.0, max(0.0, (iterations - step + 1) / steps)) if steps >= 1 else 1.0
 
-    def resolution(self, scene: Scene, iterations: int) -> Resolution:
-        """Of the training views in a run of so many steps."""
+    def resolution(self, scene: Scene, iterations: int, device: torch.device) -> Resolution:
+        """Of the training views in a run of so many steps on a device."""
+        names = [view.name for view in scene.train]
         return Resolution(
             scene=scene,
             coarse=self.coarse,
@@ -86,6 +87,8 @@ class TrainingOptions:
             finer_after=round(self.supersample_from * iterations) if self.supersample > 1 else 0,
             poses=Poses(self.poses, [view.camera for view in scene.train], iterations),
             distractors=Distractors(self.distractors, iterations),
+            exposures=Exposures(self.exposure, names, iterations, device),
+            blur=Blur(self.blur, iterations),
         )
 
 
@@ -193,16 +196,11 @@ class Run:
     recorder: Recorder | None = None
     """Takes steps that can be recorded; None: all are launched one by one."""
     photographs: Photographs = field(init=False)
-    exposures: Exposures = field(init=False)
-    blur: Blur = field(init=False)
     plateau: Plateau = field(init=False)
 
     def __post_init__(self) -> None:
         self.photographs = Photographs(self.device, self.photograph_bytes)
-        names = [view.name for view in self.scene.train]
-        self.exposures = Exposures(self.training.exposure, names, self.iterations, self.device)
-        self.blur = Blur(self.training.blur, self.iterations)
-        passing = -(-len(names) // self.training.batch)
+        passing = -(-len(self.scene.train) // self.training.batch)
         self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 
     @property
@@ -216,6 +214,16 @@ class Run:
         return self.resolution.distractors
 
     @property
+    def exposures(self) -> Exposures:
+        """Of the training photographs."""
+        return self.resolution.exposures
+
+    @property
+    def blur(self) -> Blur:
+        """Of the training photographs."""
+        return self.resolution.blur
+
+    @property
     def photographed(self) -> Sequence[View]:
         """The training views at their own resolution, by the poses of the moment, without distractors."""
         return self.distractors.views(self.poses.views(self.scene.train))
@@ -226,8 +234,8 @@ class Run:
         return self.step >= self.iterations
 
     def as_photographed(self, image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
-        """A render as the photograph of a training view shows it: by a camera that moved, at its exposure."""
-        return self.exposures.applied(self.blur.applied(image, view), view.name)
+        """A render as the photograph of a training view shows it, to be looked at."""
+        return self.resolution.as_photographed(image, view)
 
     def refuse_if_stopping(self) -> None:
         """To be called within long parts of a step that change nothing yet.

@@ -160,7 +160,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    shown = saturated(run.as_photographed(rendering.image, view), target, run.exposures)
+    shown = saturated(run.resolution.as_photographed(rendering.image, view, learning=True), target, run.exposures)
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:

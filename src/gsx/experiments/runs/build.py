@@ -141,12 +141,12 @@ def build(
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
-    own = settings.training.resolution(scene, general.iterations)
+    own = settings.training.resolution(scene, general.iterations, device)
 
     def resolution(views: Scene, iterations: int) -> Resolution:
         """The run's own where it sees the same views for as long: reduced pictures are kept in it."""
         same = views.train is scene.train and iterations == general.iterations
-        return own if same else settings.training.resolution(views, iterations)
+        return own if same else settings.training.resolution(views, iterations, device)
 
     def anew(
         scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE, begins: bool = True

@@ -86,7 +86,7 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         backbone=backbone,
         raster=backbone.raster,
         training=unasked,
-        resolution=unasked.resolution(scene, steps),
+        resolution=unasked.resolution(scene, steps, run.device),
         iterations=steps,
         device=run.device,
         generator=generator,
