@@ -547,13 +547,12 @@ def test_runs_in_fewer_steps_are_compared_with_published_ones_in_all_of_theirs()
         return {"zoom": zooms, "gap": gap, "primitives": 100, "train_seconds": seconds}
 
     published, short = ("gs3d", 1.0), ("gs3d_zoom", 0.5)
-    found = [
-        {arm: run(30.0, 0.8, 20.0) for arm in sooner.ARMS} | {short: run(31.0 + seed, 0.2, 11.0)} for seed in (0, 1)
-    ]
-    rows = {(row["arm"], row["steps"]): row for row in sooner.rows_of("room", found)}
-    assert set(rows) == {("gs3d", 1500), ("gs3d_zoom", 1125), ("gs3d_zoom", 750)}
-    assert rows["gs3d_zoom", 750]["more4"] == "+1.50 ± 0.50"
-    assert (rows["gs3d_zoom", 750]["times"], rows["gs3d_zoom", 750]["gap"]) == ("0.55", "+0.20 ± 0.00")
+    arms = sooner.arms_of("demo")
+    found = [{arm: run(30.0, 0.8, 20.0) for arm in arms} | {short: run(31.0 + seed, 0.2, 11.0)} for seed in (0, 1)]
+    rows = {(row["arm"], row["steps"]): row for row in sooner.rows_of("demo", found)}
+    assert set(rows) == {("gs3d", 900), ("gs3d_zoom", 675), ("gs3d_zoom", 450)}
+    assert rows["gs3d_zoom", 450]["more4"] == "+1.50 ± 0.50"
+    assert (rows["gs3d_zoom", 450]["times"], rows["gs3d_zoom", 450]["gap"]) == ("0.55", "+0.20 ± 0.00")
     assert (sooner.steps_of("demo", published[1]), sooner.steps_of("fox_4", short[1])) == (900, 750)
 
 
