@@ -22,6 +22,7 @@ from gsx.core.data.images import read_image, write_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
+from gsx.scenes import splits
 from gsx.scenes.colmap import load
 from gsx.scenes.colmap_model import check_binary, count_images
 from gsx.scenes.posed import Shot
@@ -106,6 +107,23 @@ def test_images_of_a_text_model_are_counted_past_empty_keypoint_lines(tmp_path: 
     lines = ["# comment", "1 1 0 0 0 0 0 0 1 a.png", "", "2 1 0 0 0 0 0 0 1 b.png", "1.0 2.0 -1", "3 1 0 0 0 0 0 0 1 c"]
     (tmp_path / "images.txt").write_bytes("\n".join(lines).encode() + b"\xff\n\n")  # a name that is no UTF-8
     assert count_images(tmp_path) == 3
+
+
+def test_the_sharpest_photographs_may_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose files are asked, in the order of their names; how sharp they are is told by hand."""
+    write_scene(synthesize(frames=6), tmp_path)
+    names = sorted(view.name for view in load(colmap_options(tmp_path, split="none")).train)
+    ratios = dict(zip(names, (0.5, 1.0, 0.7, 0.9, 0.8, 0.2), strict=True))
+    asked = list[str]()
+
+    def sharpness(photographs: list[Path]) -> dict[Path, float]:
+        asked.extend(path.name for path in photographs)
+        return {path: ratios[path.name] for path in photographs}
+
+    monkeypatch.setattr(splits, "sharpness", sharpness)
+    scene = load(colmap_options(tmp_path, split="sharp:3"))
+    assert asked == names
+    assert [view.name for view in scene.test] == [names[1], names[3]]
 
 
 def test_names_with_folders_are_found_and_split_by_base_name(tmp_path: Path) -> None:

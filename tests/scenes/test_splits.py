@@ -3,7 +3,11 @@
 from pathlib import Path
 
 import pytest
+import torch
+from torch.nn import functional
 
+from gsx.core.data.images import write_image
+from gsx.core.data.movement import motion_blurred
 from gsx.core.errors import ConfigError, InputError
 from gsx.scenes.splits import check_rule, split_names
 
@@ -15,6 +19,31 @@ def test_every_eighth_of_the_sorted_names_is_test() -> None:
     train, test = split_names(shuffled, "every:8")
     assert [shuffled[i] for i in test] == ["00.jpg", "08.jpg", "16.jpg"]
     assert [shuffled[i] for i in train] == [n for n in NAMES if n not in ("00.jpg", "08.jpg", "16.jpg")]
+
+
+def test_of_every_four_the_sharpest_is_test(tmp_path: Path) -> None:
+    """Photographs of noise; 0, 5 and 9 are blurred along their rows, 2 and 7 have more fine contrast than others, and
+    nothing is known of 10 and 11, of 32 px."""
+    generator = torch.Generator().manual_seed(0)
+    smooth = functional.interpolate(torch.rand(1, 3, 24, 24, generator=generator), scale_factor=4, mode="bilinear")[0]
+    names, photographs = [f"{number:02d}.png" for number in range(12)], []
+    for number, name in enumerate(names):
+        fine = 0.3 * torch.rand(3, 96, 96, generator=generator) * (1.5 if number in (2, 7) else 1.0)
+        picture = 255 * (0.6 * smooth + fine).clamp(0, 1)
+        if number in (0, 5, 9):
+            picture = motion_blurred(picture, 4.0, 0.0)
+        photographs.append(tmp_path / name)
+        write_image(photographs[-1], (picture[:, :32, :32] if number > 9 else picture).round().byte())
+    train, test = split_names(names, "sharp:4", photographs=photographs)
+    assert test == [2, 7, 8]
+    assert sorted(train + test) == list(range(12))
+    mixed = [5, 11, 0, 3, 8, 1, 10, 2, 9, 4, 7, 6]
+    shuffled, theirs = [names[i] for i in mixed], [photographs[i] for i in mixed]
+    train, test = split_names(shuffled, "sharp:4", photographs=theirs)
+    assert [shuffled[i] for i in test] == ["02.png", "07.png", "08.png"]
+    assert [shuffled[i] for i in train] == [name for i, name in enumerate(names) if i not in (2, 7, 8)]
+    with pytest.raises(ConfigError, match=r"use every:4"):
+        split_names(names, "sharp:4")
 
 
 def test_sorting_is_by_base_name_without_suffix() -> None:

@@ -28,7 +28,7 @@ from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_model import model_folders
-from gsx.scenes.duplicates import refuse_shared
+from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.points import grey_points, read_points
 from gsx.scenes.posed import (
@@ -83,7 +83,7 @@ def load(options: BungeeOptions) -> Scene:
         centre = torch.zeros(3)
     groups, basis = _scales(scene.train, centre, folder, options.images)
     views = [replace(view, group=f"scale-{scale}") for view, scale in zip(scene.train, groups, strict=True)]
-    train, test = split_views([view.name for view in views], options.split, folder)
+    train, test = split_views([view.name for view in views], options.split, folder, photos_of(views))
     train_views, test_views = ([views[i] for i in side] for side in (train, test))
     refuse_too_few(train_views, folder)
     refuse_shared(train_views, test_views, folder)
@@ -97,7 +97,7 @@ def load(options: BungeeOptions) -> Scene:
     )
 
 
-def split_views(names: Sequence[str], rule: str, folder: Path) -> Split:
+def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequence[Path] = ()) -> Split:
     """Positions of training and test names; `lod:N`, or any rule of `gsx.scenes.splits`.
 
     Raises:
@@ -106,7 +106,7 @@ def split_views(names: Sequence[str], rule: str, folder: Path) -> Split:
     """
     kind, _, number = rule.partition(":")
     if kind != "lod":
-        return split_names(list(names), rule, folder)
+        return split_names(list(names), rule, folder, photographs)
     last = positive(number)
     if last is None:
         raise ConfigError(f"scene.split is '{short(rule)}', give a whole number above 0 after lod, as in lod:30.")

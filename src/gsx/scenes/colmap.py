@@ -17,7 +17,7 @@ from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
-from gsx.scenes.duplicates import refuse_file_twice, refuse_shared
+from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.posed import (
@@ -70,7 +70,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
     shots = [shot_of(model, image, photos) for image in present]
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
-    train, test = split_names([view.name for view in views], options.split, path)
+    train, test = split_names([view.name for view in views], options.split, path, photos_of(views))
     train_views, test_views = ([views[index] for index in side] for side in (train, test))
     refuse_too_few(train_views, path)
     refuse_shared(train_views, test_views, photos)

@@ -47,4 +47,4 @@ class SceneOptions:
     masks: str = "auto"
     """auto | alpha | none: which pixels of photographs count (gsx.scenes.masked)."""
     split: str = "every:8"
-    """every:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
+    """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""

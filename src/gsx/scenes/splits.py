@@ -1,26 +1,30 @@
 """Which images are held out for testing, decided by their sorted names (3D-GS, camera_utils.py)."""
 
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.quality.sharpness import sharpness
 
-RULES = ("every:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
+RULES = ("every:K", "sharp:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
 DIGITS = 9  # of numbers of images
 SHOWN = 200  # letters of a rule in an error
 Split = tuple[list[int], list[int]]
 """Positions of the training and of the test names in the list that was split, each in sorted order."""
 
 
-def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
-    """Splits `names` after sorting them.
+def split_names(names: list[str], rule: str, folder: Path = Path(), photographs: Sequence[Path] = ()) -> Split:
+    """Splits `names` after sorting them; photographs: their files, in the same order, for rules that look at them.
 
     `every:K`: of the sorted names, those at positions 0, K, 2K, ... are test, as published for K = 8.
+    `sharp:K`: of every K of them that one which is the sharpest beside its neighbours, so that no blurred photograph
+    judges a model.
     `none`: all are train.
     `counts:N,M`: M test names spread evenly over the sorted list, then N train names over the rest.
     `files:a,b`: train and test names one per line, with or without suffix; relative files lie in `folder`.
 
     Raises:
-        ConfigError: the rule cannot be read.
+        ConfigError: the rule cannot be read, or looks at photographs where there are none.
         InputError: a split file is unusable, or the rule leaves no image to train on or none to test on.
     """
     check_rule(rule)
@@ -30,6 +34,8 @@ def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
     if kind == "every":
         k = _count(argument, rule)
         train, test = [i for position, i in enumerate(order) if position % k], order[::k]
+    elif kind == "sharp":
+        train, test = _sharp(order, photographs, _count(argument, rule), rule)
     elif kind == "counts":
         train, test = _counts(order, *(_count(count, rule) for count in _pair(argument, rule)))
     elif kind == "files":
@@ -41,7 +47,7 @@ def split_names(names: list[str], rule: str, folder: Path = Path()) -> Split:
 def check_rule(rule: str) -> None:
     """Raise ConfigError for a rule that cannot be read, also where a scene has a split of its own."""
     kind, _, argument = rule.partition(":")
-    if kind == "every":
+    if kind in ("every", "sharp"):
         _count(argument, rule)
     elif kind == "counts":
         for count in _pair(argument, rule):
@@ -66,6 +72,16 @@ def short(text: str) -> str:
 def sort_key(name: str) -> tuple[str, str]:
     """Order of published splits: base name up to its first dot; the whole name decides between equal ones."""
     return PurePosixPath(name).name.split(".")[0], name
+
+
+def _sharp(order: list[int], photographs: Sequence[Path], k: int, rule: str) -> Split:
+    """The sharpest of every `k` is test, the first of equals; as sharp as its neighbours is one that tells nothing."""
+    if len(photographs) != len(order):
+        raise ConfigError(f"scene.split is '{rule}', and not each view here has a photograph: use every:{k}.")
+    ratios = sharpness([photographs[i] for i in order])
+    blocks = [order[first : first + k] for first in range(0, len(order), k)]
+    test = [max(block, key=lambda i: ratios.get(photographs[i], 1.0)) for block in blocks]
+    return [i for i in order if i not in set(test)], test
 
 
 def _counts(order: list[int], train_count: int, test_count: int) -> Split:

@@ -20,7 +20,7 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.core.ranges import Points, Seed
-from gsx.scenes.duplicates import refuse_shared
+from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
@@ -198,7 +198,7 @@ def _split(
     names = [view.name for view in views]
     notes = []
     if rule != "json":
-        train, test = split_names(names, rule, file.parent)
+        train, test = split_names(names, rule, file.parent, photos_of(views))
     elif "train_filenames" in content:
         train, test = _listed_split(content, names, file)
     else:
