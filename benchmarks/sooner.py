@@ -18,7 +18,7 @@ from capacity import PUBLISHED, SUBJECTS, ZOOMS, row_of, scenes_of, trained, wor
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 from starts import seen_in_training
-from zoom import over_seeds, shared_arguments, steps_among, told
+from zoom import over_seeds, refuse_unknown, shared_arguments, steps_among, told
 
 PUBLISHED_ARM = ("gs3d", 1.0)
 """Backbone, with its share of the steps, that all are compared with."""
@@ -74,6 +74,7 @@ def rows_of(scene: str, found: Sequence[dict[tuple[str, float], dict[str, Any]]]
 def main(words: Sequence[str]) -> None:
     """Train and write the table."""
     given = arguments(words)
+    refuse_unknown(given.only, SHARES)
     machine, load = describe_machine(torch.device("cpu")), told_load()
     machine |= {"threads": 1} if given.jobs > 1 else {}
     read_sections(given.to / "sooner_cpu.json")  # what cannot be added to is refused before training
@@ -85,8 +86,9 @@ def main(words: Sequence[str]) -> None:
     found = over_seeds(look, scenes, given)
     rows = [row for scene in scenes for row in rows_of(scene, found[scene])]
     title, command = "The default in fewer steps, beside published 3D-GS", shown_command(words, "benchmarks/sooner.py")
-    write_results(given.to, "sooner_cpu", machine, {"gs3d_zoom": stamped(title, COLUMNS, rows, [NOTE], load, command)})
-    print(text_table(stamped(title, COLUMNS, rows, [NOTE], load, command)))
+    section = stamped(title, COLUMNS, rows, [NOTE], load, command)
+    write_results(given.to, "sooner_cpu", machine, {"gs3d_zoom": section})
+    print(text_table(section))
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **mor
 
 
 def small_gs3d(
-    scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None, **more: int
+    scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None, **more: Any
 ) -> GS3D:
     """The backbone at step 0; `more`: of its resolution."""
     return gs3d(options or published_options(), small_context(scene, iterations=iterations, seed=seed, **more))

@@ -20,12 +20,13 @@ from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
+from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
+from gsx.core.training.blur import Blur
 from gsx.core.training.distributed import Ranks
-from gsx.core.training.evidence import drawn_errors, rounding_of
 from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 from gsx.core.training.photographs import Photographs
@@ -295,28 +296,59 @@ class Printed:
         return 1.0
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_photographs_are_compared_with_what_they_would_show_of_the_model(known: bool) -> None:
-    """They show the model itself at half its brightness: with their exposures known it has no error to speak of, others
-    draw none, and half of it does far worse."""
-    bare = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=0.5)
-    model = small_gs3d(bare, options=options_of("adaptive"))
-    drawn = [(view.camera, model.draw(view.camera, 700).splats) for view in bare.train]
-    whole = [rasterize(splats, camera, model.raster, background=bare.background).image for camera, splats in drawn]
-    shown = [(127.5 * image.detach()).round().byte() for image in whole]
+@pytest.mark.parametrize("how", ["dark", "bright", "moved"])
+def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: str) -> None:
+    """They show the model itself at half its brightness, at two and a half times that so that they saturate, or by
+    cameras that moved: where that is known it has no error to speak of, and half of it does far worse."""
+    bare = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=0.1)
+    model, gain = small_gs3d(bare, options=options_of("adaptive")), {"dark": 0.5, "bright": 2.5, "moved": 1.0}[how]
+    across, names, shown = 3.0 if how == "moved" else 0.0, [view.name for view in bare.train], []
+    for view in bare.train:
+        splats = model.draw(view.camera, 700).splats
+        image = rasterize(splats, view.camera, model.raster, background=bare.background).image.detach()
+        shown.append((255 * gain * motion_blurred(image, across, 0.0)).round().clamp(0, 255).byte())
     scene = replace(bare, train=[replace(v, source=Printed(p)) for v, p in zip(bare.train, shown, strict=True)])
-    exposures = Exposures(names=[view.name for view in scene.train])
-    if known:
-        exposures.begin(torch.cat([0.5 * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(scene.train), 1, 1))
-    context = small_context(scene, exposures=exposures)
-    half = with_rows(model.table, torch.arange(40) < 20)
-    gain = Adaptive(AdaptiveOptions(), context, PUBLISHED, 0).gain(model, model.table, half, 700)[0]
-    found = worth_in_training(model, context, 700)
-    form, background = context.resolution.forming(700), scene.background
-    errors = drawn_errors(model, scene.train, form, background, 700, context.resolution.as_photographed)
-    assert (gain > 10) is known
-    assert (found.error_share < 2 * found.rounding_share) is known
-    assert (float(errors.sum()) < 2 * sum(rounding_of(view) for view in scene.train)) is known
+    half, lost, found = with_rows(model.table, torch.arange(40) < 20), [], []
+    exposures, blur = Exposures(names=names), Blur()
+    for known in (False, True):
+        if known and how == "moved":
+            blur.movements = {view.name: (across / view.camera.width, 0.0) for view in scene.train}
+        elif known:
+            exposures.begin(torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(names), 1, 1))
+        context = small_context(scene, exposures=exposures, blur=blur)
+        judge = Adaptive(AdaptiveOptions(window=1.0), context, PUBLISHED, 0)
+        lost.append(judge.gain(model, model.table, half, 700)[0])
+        found.append(worth_in_training(model, context, 700))
+    assert lost[1] > lost[0] + 5
+    assert found[0].error_share > 4 * found[0].rounding_share
+    assert found[1].error_share < 2 * found[1].rounding_share
+
+
+def test_all_that_judges_by_photographs_takes_them_for_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene(spread(40), views=12)
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    for name in ("gradient", "count", "absolute"):
+        model.table.statistics[name] = torch.ones(40)
+    seen = list[object]()
+
+    def errors(model: GS3D, *more: object) -> Tensor:
+        seen.append(more[-1])
+        return torch.ones(len(model.table))
+
+    def fits(*more: object) -> None:
+        seen.append(more[-1])
+        raise Found
+
+    monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", errors)
+    monkeypatch.setattr("gsx.backbones.gs3d.colour_fits", fits)
+    model.densify_and_prune(3000)
+    with pytest.raises(Found):
+        model.judge_degrees(3000)
+    assert seen == [model.context.resolution.compared] * 2
+
+
+class Found(Exception):
+    """What was looked for."""
 
 
 def half_of_it_faint() -> tuple[Scene, GS3D]:

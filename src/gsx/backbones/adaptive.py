@@ -150,11 +150,11 @@ class Adaptive:
         """(dB by which validation windows are better drawn with one table than with another, its standard error)."""
         windows = self.windows(step)
         resolution, floor = self.context.resolution, rounding_in(windows)
-        form, exposed = resolution.forming(step), resolution.as_photographed
+        form, compared = resolution.forming(step), resolution.compared
 
         def look() -> tuple[float, float]:
             both = (
-                window_errors(model, rows, windows, form, self.background, step, exposed) for rows in (table, before)
+                window_errors(model, rows, windows, form, self.background, step, compared) for rows in (table, before)
             )
             return decibels(*(errors.cpu() + floor for errors in both))
 

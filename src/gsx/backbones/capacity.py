@@ -187,8 +187,8 @@ def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int)
     background, form = context.scene.background.to(context.device), context.resolution.forming(step)
 
     def look() -> Removal:
-        exposed = context.resolution.as_photographed
-        return worth_of_rows(model, views, form, background, step, context.generator, exposed).to("cpu")
+        compared = context.resolution.compared
+        return worth_of_rows(model, views, form, background, step, context.generator, compared).to("cpu")
 
     return context.found_by_first(look).to(context.device)
 

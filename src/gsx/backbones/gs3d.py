@@ -225,8 +225,8 @@ class GS3D:
 
         def look() -> Judged:
             form, background = context.resolution.forming(step), context.scene.background.to(context.device)
-            exposed = context.resolution.as_photographed
-            fits = colour_fits(self, views, form, background, step, context.generator, highest - 1, exposed)
+            compared = context.resolution.compared
+            fits = colour_fits(self, views, form, background, step, context.generator, highest - 1, compared)
             return judged(fits, price, numbers_of(highest, other)).to("cpu")
 
         return lower_degrees(self.table, context.found_by_first(look).to(context.device), step, price)

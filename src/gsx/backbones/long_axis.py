@@ -90,8 +90,8 @@ class LongAxis:
         views = some_of(context.resolution.views(step), self.views, control.generator)
 
         def look() -> Tensor:
-            form, exposed = context.resolution.forming(step), context.resolution.as_photographed
-            return drawn_errors(model, views, form, control.background, step, exposed).cpu()
+            form, compared = context.resolution.forming(step), context.resolution.compared
+            return drawn_errors(model, views, form, control.background, step, compared).cpu()
 
         score = context.found_by_first(look).to(context.device) * mean_absolute(table)
         wanted = (score > 0) & not_sky(table)

@@ -15,8 +15,8 @@ logger = logging.getLogger(__name__)
 SKY_OPACITY = 0.98
 """At first: nothing near has to be made up in its place."""
 WIDEST = 1.5
-"""Largest size of a Gaussian of the sky at first, in spacings of directions: where neighbours are far off, it would lie
-before others."""
+"""Largest size of a Gaussian of the sky at first, in spacings of directions: one whose neighbours are far off
+would cover what is beside it."""
 OPEN = 0.01
 """`sky=auto`: share of the pixels that look past the scene, from which on something stands behind it."""
 NOTHING = Sky(points=PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), spacing=1.0, share=0.0)

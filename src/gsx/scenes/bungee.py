@@ -98,10 +98,10 @@ def load(options: BungeeOptions) -> Scene:
 
 
 def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequence[Path] = ()) -> Split:
-    """Positions of training and test names; `lod:N`, or any rule of `gsx.scenes.splits`.
+    """Positions of training and test names; `lod:N`, or any rule of `gsx.scenes.splits`. photographs: their files.
 
     Raises:
-        ConfigError: the rule cannot be read.
+        ConfigError: the rule cannot be read, or looks at photographs where there are none.
         InputError: it leaves no image to train on or none to test on.
     """
     kind, _, number = rule.partition(":")

@@ -1,4 +1,4 @@
-"""Which images are held out for testing, decided by their sorted names (3D-GS, camera_utils.py)."""
+"""Which images are held out for testing, decided by their sorted names (3D-GS, camera_utils.py), or by sharpness."""
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -17,15 +17,14 @@ def split_names(names: list[str], rule: str, folder: Path = Path(), photographs:
     """Splits `names` after sorting them; photographs: their files, in the same order, for rules that look at them.
 
     `every:K`: of the sorted names, those at positions 0, K, 2K, ... are test, as published for K = 8.
-    `sharp:K`: of every K of them that one which is the sharpest beside its neighbours, so that no blurred photograph
-    judges a model.
+    `sharp:K`: of every K of them the one that is the sharpest beside its neighbours.
     `none`: all are train.
     `counts:N,M`: M test names spread evenly over the sorted list, then N train names over the rest.
     `files:a,b`: train and test names one per line, with or without suffix; relative files lie in `folder`.
 
     Raises:
         ConfigError: the rule cannot be read, or looks at photographs where there are none.
-        InputError: a split file is unusable, or the rule leaves no image to train on or none to test on.
+        InputError: a split file or a photograph is unusable, or the rule leaves none to train on or none to test on.
     """
     check_rule(rule)
     kind, _, argument = rule.partition(":")
@@ -75,13 +74,14 @@ def sort_key(name: str) -> tuple[str, str]:
 
 
 def _sharp(order: list[int], photographs: Sequence[Path], k: int, rule: str) -> Split:
-    """The sharpest of every `k` is test, the first of equals; as sharp as its neighbours is one that tells nothing."""
+    """The sharpest of every `k` is test, the first of equals; one that tells nothing only among its like."""
     if len(photographs) != len(order):
-        raise ConfigError(f"scene.split is '{rule}', and not each view here has a photograph: use every:{k}.")
+        raise ConfigError(f"scene.split is '{rule}', and not each view has a photograph of its own: use every:{k}.")
     ratios = sharpness([photographs[i] for i in order])
     blocks = [order[first : first + k] for first in range(0, len(order), k)]
-    test = [max(block, key=lambda i: ratios.get(photographs[i], 1.0)) for block in blocks]
-    return [i for i in order if i not in set(test)], test
+    test = [max(block, key=lambda i: ratios.get(photographs[i], 0.0)) for block in blocks]
+    held_out = set(test)
+    return [i for i in order if i not in held_out], test
 
 
 def _counts(order: list[int], train_count: int, test_count: int) -> Split:

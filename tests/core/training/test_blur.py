@@ -152,29 +152,26 @@ def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(
 
 def test_renders_are_blurred_before_they_are_compared(moved: tuple[Run, Path]) -> None:
     """A sharp model is nearer to blurred photographs so."""
-    run, _ = moved
+    run, _ = open_run(moved[1], plugins())
     found = dict(run.blur.movements)
     view = max(run.photographed, key=lambda view: math.hypot(*found.get(view.name, (0.0, 0.0))))
     losses = []
     for movements in (found, {}):
         run.blur.movements = movements
         losses.append(float(view_loss(run, run.step, view, [], run.scene.background).loss))
-    run.blur.movements = found
     assert losses[0] < 0.8 * losses[1]
 
 
 def test_halves_take_the_movements_that_were_found(moved: tuple[Run, Path]) -> None:
     """Models of half of the photographs learn from them as the run does, and their renders are blurred alike."""
-    run, _ = moved
-    moved_view = next(view for view in run.photographed if view.name in run.blur.movements)
-    found = dict(run.blur.movements)
-    shown, sharp = [], []
-    for pictures, movements in ((shown, found), (sharp, {})):
-        run.blur.movements = movements
-        pictures += made(run, lambda scene, steps, generator: run.backbone, 1, 0)
-    run.blur.movements = found
-    number = list(run.photographed).index(moved_view)
-    assert fineness(shown[number]).min() < 0.9 * fineness(sharp[number]).min()
+    pictures = []
+    for known in (True, False):
+        run, _ = open_run(moved[1], plugins())
+        name = next(iter(run.blur.movements))
+        run.blur.movements = run.blur.movements if known else {}
+        shown = made(run, lambda scene, steps, generator, resolution, own=run.backbone: own, 1, 0)
+        pictures.append(next(shown[n] for n, view in enumerate(run.photographed) if view.name == name))
+    assert fineness(pictures[0]).min() < 0.9 * fineness(pictures[1]).min()
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:

@@ -48,7 +48,8 @@ ONE_SIDE = [0.05 * i for i in range(12)]
 def fits_of(model: GS3D, degree: int = 2) -> ColourFits:
     context = model.context
     form, generator = context.resolution.forming(STEP), torch.Generator().manual_seed(0)
-    return colour_fits(model, context.scene.train, form, context.scene.background, STEP, generator, degree)
+    compared = context.resolution.compared
+    return colour_fits(model, context.scene.train, form, context.scene.background, STEP, generator, degree, compared)
 
 
 def pictures(model: GS3D) -> Tensor:

@@ -178,20 +178,24 @@ def test_several_processes_are_refused() -> None:
         refuse_shared(wrong, Ranks(size=2))
 
 
-DISTURBED = ("scene.disturb.exposure=0.3", "training.exposure.when=auto", "iterations=12")
+DISTURBED = (
+    *("scene.disturb.exposure=0.3", "training.exposure.when=auto", "iterations=30"),
+    *("backbone.capacity=adaptive", "backbone.sh_judged=0.8"),
+)
+"""Growth looks at photographs at steps 6 and 12, bands at step 24."""
 
 
 def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", DISTURBED)
     assert whole.exposures.matrices is not None
-    tiny_run(tmp_path / "stopped", DISTURBED, stop_after=7)
+    tiny_run(tmp_path / "stopped", DISTURBED, stop_after=13)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     execute(run, settings, plugins())
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "exposure.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
-    assert a["exposure.visits"].sum() == 10, "the steps after they were judged, and no look at a photograph beside"
+    assert a["exposure.visits"].sum() == 24, "the steps after they were judged, and no look at a photograph beside"
 
 
 def test_without_need_training_is_bit_for_bit_that_without_exposures(tmp_path: Path) -> None:

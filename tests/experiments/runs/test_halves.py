@@ -23,7 +23,7 @@ from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.halves import held_out_renders
+from gsx.experiments.runs.halves import held_out_renders, without
 from gsx.experiments.runs.open import open_run
 
 TRAINING = TrainingOptions(
@@ -51,7 +51,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     grey = small_scene(spread(60), extent=4.0, views=views)
     scene = replace(grey, train=[replace(view, source=Told(n, seen)) for n, view in enumerate(grey.train)])
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator) -> Backbone:
+    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: Resolution) -> Backbone:
         return gs3d(
             published_options(),
             BackboneContext(
@@ -60,22 +60,22 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
                 device=torch.device("cpu"),
                 raster=RasterSettings(),
                 generator=generator,
-                resolution=Resolution(scene=scene),
+                resolution=resolution,
             ),
         )
 
-    generator = torch.Generator().manual_seed(0)
+    generator, resolution = torch.Generator().manual_seed(0), Resolution(scene=scene)
     run = Run(
         config={},
         folder=folder,
         scene=scene,
-        backbone=anew(scene, 40, generator),
+        backbone=anew(scene, 40, generator, resolution),
         raster=RasterSettings(),
         training=TRAINING,
         iterations=40,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=Resolution(scene=scene),
+        resolution=resolution,
         sampler=Sampler(views, 0),
     )
     run.held_out = partial(held_out_renders, run, anew)
@@ -95,6 +95,21 @@ def test_views_are_rendered_by_a_model_that_never_saw_them(tmp_path: Path) -> No
     assert [tuple(render.shape) for render in renders] == [(3, 16, 24)] * 5
     bright = [float(render[:, 4:12, 6:18].mean()) for render in renders]
     assert min(bright[0::2]) > 1.5 * max(bright[1::2]), bright
+
+
+def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
+    """What its backbone judges by knows the movements that its loss does."""
+    run, _ = begun(tmp_path, steps=0)
+    run.blur.movements = {"view1": (0.1, 0.0)}
+    asked = list[Resolution]()
+
+    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: Resolution) -> Backbone:
+        asked.append(resolution)
+        return run.backbone
+
+    half = without(run, anew, 0, 10, 3)
+    assert asked == [half.resolution]
+    assert half.blur.movements == run.blur.movements
 
 
 def state_of(run: Run) -> list[Tensor]:

@@ -38,7 +38,7 @@ class BackboneContext:
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
     resolution: Resolution
-    """How finely training views are seen and rendered at each step."""
+    """How training views are seen and rendered at each step, and compared with renders."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     begins: bool = True

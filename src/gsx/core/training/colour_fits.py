@@ -21,10 +21,9 @@ from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Drawn
 from gsx.core.training.evidence import (
-    Exposed,
+    Compared,
     Forming,
     Look,
-    as_it_is,
     blending_squares,
     by_row,
     difference,
@@ -67,7 +66,7 @@ def colour_fits(
     step: int,
     generator: torch.Generator,
     degree: int,
-    exposed: Exposed = as_it_is,
+    compared: Compared,
 ) -> ColourFits:
     """What views say of the colours of a table with bands, for fits up to a degree."""
     own = own_coefficients(model.table, degree)
@@ -83,7 +82,7 @@ def colour_fits(
         products += by_row(drawn, weighted[:, None] * colours, count)
         norms += by_row(drawn, weights * colours.square().sum(0), count)
         shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view, exposed).double().square().sum()) + rounding_of(view)
+        error += float(difference(seen.image, view, compared).double().square().sum()) + rounding_of(view)
     return ColourFits(grams=grams, products=products, norms=norms, own=own, shown=shown, error=error)
 
 

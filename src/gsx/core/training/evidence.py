@@ -62,19 +62,15 @@ def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background:
     return Look(rendering=rendering, image=image, camera=raster.drawn_for, **leaves)
 
 
-Exposed = Callable[[Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
-"""A render as the photograph of that view shows it (`Resolution.as_photographed`)."""
+Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
+"""(render, photograph, view) -> the render as that photograph would show it (`Resolution.compared`). Errors are told of
+these; what a primitive does to a picture, of the render itself."""
 
 
-def as_it_is(image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
-    """For photographs of one exposure, by cameras that stood still."""
-    return image
-
-
-def difference(image: Float[Tensor, "3 H W"], view: View, exposed: Exposed = as_it_is) -> Float[Tensor, "3 H W"]:
-    """A render as the photograph of its view shows it, less that; 0 where that does not count."""
-    shown = exposed(image.detach(), view)
-    return blacked(shown - view.image().to(shown), view.counted())
+def difference(image: Float[Tensor, "3 H W"], view: View, compared: Compared) -> Float[Tensor, "3 H W"]:
+    """A render, as the photograph of its view would show it, less that photograph; 0 where that does not count."""
+    photograph = view.image().to(image)
+    return blacked(compared(image.detach(), photograph, view) - photograph, view.counted())
 
 
 def rounding_of(view: View, window: Window | None = None) -> float:
@@ -141,13 +137,13 @@ def drawn_errors(
     form: Forming,
     background: Float[Tensor, "3"],
     step: int,
-    exposed: Exposed = as_it_is,
+    compared: Compared,
 ) -> Float[Tensor, "N"]:
     """Of each row the squared error that it draws in the views, by blending weights."""
     sums = background.new_zeros(len(model.table))
     for view in views:
         drawn, seen = looked_at(model, view.camera, form, background, step)
-        sums += by_row(drawn, error_sums(seen, difference(seen.image, view, exposed)), len(sums))
+        sums += by_row(drawn, error_sums(seen, difference(seen.image, view, compared)), len(sums))
     return sums
 
 
@@ -185,7 +181,7 @@ def worth_of_rows(
     background: Float[Tensor, "3"],
     step: int,
     generator: torch.Generator,
-    exposed: Exposed = as_it_is,
+    compared: Compared,
 ) -> Removal:
     """What the pictures of the views lose without each row."""
     count, draws = len(model.table), draws_of_each(views)
@@ -194,7 +190,7 @@ def worth_of_rows(
         drawn, seen = looked_at(model, view.camera, form, background, step)
         squares += squared_changes(drawn, seen, view.counted(), count, draws, generator)
         shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view, exposed).double().square().sum())
+        error += float(difference(seen.image, view, compared).double().square().sum())
         rounding += rounding_of(view)
     all_shown = max(1.0, float(shown.sum()))
     shares = {"error_share": error / all_shown, "rounding_share": rounding / all_shown}
@@ -230,13 +226,13 @@ def window_errors(
     form: Forming,
     background: Float[Tensor, "3"],
     step: int,
-    exposed: Exposed = as_it_is,
+    compared: Compared,
 ) -> Float[Tensor, "W"]:
     """Squared error in windows of views, each summed over its values, of the model as it would be with that table."""
     own, model.table = model.table, table
     try:
         errors = [
-            window_error(model, view, window, form, background, step, exposed) for view, window in windows.items()
+            window_error(model, view, window, form, background, step, compared) for view, window in windows.items()
         ]
     finally:
         model.table = own
@@ -250,12 +246,13 @@ def window_error(
     form: Forming,
     background: Float[Tensor, "3"],
     step: int,
-    exposed: Exposed,
+    compared: Compared,
 ) -> Float[Tensor, ""]:
     """Squared error in a window of a view."""
     splats = model.draw(form(view.camera).drawn_for, step).splats
     raster, counted = form(window.of(view.camera)), view.counted()
     rendering = rasterize(splats, raster.camera, model.raster, background=background)
-    shown = exposed(raster.reduced(rendering.image), view)
-    off = shown - window.cut(view.image()).to(shown)
+    image = raster.reduced(rendering.image)
+    photograph = window.cut(view.image()).to(image)
+    off = compared(image, photograph, view) - photograph
     return blacked(off, None if counted is None else counted[window.pixels]).double().square().sum()

@@ -25,7 +25,6 @@ BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a photograph is seen a few dozen times in a short run."""
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
-CPU = torch.device("cpu")
 FEWEST_PIXELS, FEWEST_VIEWS = 64, 3
 """That tell a gain; that tell a spread."""
 
@@ -97,7 +96,7 @@ class Exposures:
     names: Sequence[str] = ()
     """Of the photographs."""
     iterations: int = 0
-    device: torch.device = CPU
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     matrices: Float[Tensor, "N 3 4"] | None = None
     moments: Float[Tensor, "2 N 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 3, 4))
     """Adam's means of gradients and of their squares."""

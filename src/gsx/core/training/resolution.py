@@ -1,4 +1,5 @@
-"""How finely training views are seen and rendered at each step: coarsely at first, then as they are, at last more so.
+"""How training views are seen and rendered at each step: coarsely at first, then as they are, at last more finely; by
+which poses, without which parts, and what their photographs would show of a render.
 
 What a view shows at a fraction of its size is learnt in a fraction of the time (DashGaussian, Chen et al. 2025).
 """
@@ -15,7 +16,7 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.shapes import Bool, Float, UInt8
 from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
-from gsx.core.training.exposure import Exposures
+from gsx.core.training.exposure import Exposures, saturated
 from gsx.core.training.poses import Poses
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
@@ -119,6 +120,16 @@ class Resolution:
         """A render as the photograph of a training view shows it: by a camera that moved, at its exposure. learning:
         the view is one of the step under way."""
         return self.exposures.applied(self.blur.applied(image, view), view.name, learning)
+
+    def compared(
+        self,
+        image: Float[Tensor, "3 H W"],
+        photograph: Float[Tensor, "3 H W"],
+        view: View,
+        learning: bool = False,
+    ) -> Float[Tensor, "3 H W"]:
+        """A render as its photograph would show it; where that is saturated, more is no error."""
+        return saturated(self.as_photographed(image, view, learning), photograph, self.exposures)
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

@@ -22,7 +22,6 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
 from gsx.core.training.captures import judge_photographs
 from gsx.core.training.evidence import window_errors
-from gsx.core.training.exposure import saturated
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.photographs import numbers_of
@@ -92,10 +91,10 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     """Squared error in each validation window by the rules of a step, the same on all ranks."""
     if not windows:
         return torch.zeros(0, dtype=torch.float64)
-    model, form, exposed = run.backbone, run.resolution.forming(step), run.as_photographed
+    model, form, compared = run.backbone, run.resolution.forming(step), run.resolution.compared
 
     def look() -> Tensor:
-        return window_errors(model, model.table, windows, form, run.background, run.model_step, exposed).cpu()
+        return window_errors(model, model.table, windows, form, run.background, run.model_step, compared).cpu()
 
     return run.ranks.broadcast(look)
 
@@ -160,7 +159,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    shown = saturated(run.resolution.as_photographed(rendering.image, view, learning=True), target, run.exposures)
+    shown = run.resolution.compared(rendering.image, target, view, learning=True)
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:

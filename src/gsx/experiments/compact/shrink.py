@@ -173,7 +173,8 @@ def colours_of_lower_degrees(
     highest, (model, step) = degree_of_run(run), (run.backbone, run.model_step)
     if highest < 1:
         return []
-    fits = colour_fits(model, views, forming(run), run.background, step, generator, highest - 1)
+    compared = run.resolution.compared
+    fits = colour_fits(model, views, forming(run), run.background, step, generator, highest - 1, compared)
     return [fitted(fits, degree) for degree in range(highest)]
 
 

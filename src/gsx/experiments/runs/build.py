@@ -143,13 +143,13 @@ def build(
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
     own = settings.training.resolution(scene, general.iterations, device)
 
-    def resolution(views: Scene, iterations: int) -> Resolution:
-        """The run's own where it sees the same views for as long: reduced pictures are kept in it."""
-        same = views.train is scene.train and iterations == general.iterations
-        return own if same else settings.training.resolution(views, iterations, device)
-
     def anew(
-        scene: Scene, iterations: int, generator: torch.Generator, together: Ranks = ALONE, begins: bool = True
+        scene: Scene,
+        iterations: int,
+        generator: torch.Generator,
+        resolution: Resolution,
+        together: Ranks = ALONE,
+        begins: bool = True,
     ) -> Backbone:
         context = BackboneContext(
             scene=scene,
@@ -157,7 +157,7 @@ def build(
             device=device,
             raster=raster,
             generator=generator,
-            resolution=resolution(scene, iterations),
+            resolution=resolution,
             ranks=together,
             begins=begins,
         )
@@ -165,10 +165,11 @@ def build(
 
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
-        backbone = anew(replace(scene, points=one_point(stand_in)), general.iterations, generator, ranks, begins=False)
+        one = replace(scene, points=one_point(stand_in))
+        backbone = anew(one, general.iterations, generator, own, ranks, begins=False)
         go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
-        backbone = anew(scene, general.iterations, generator, ranks, begins)
+        backbone = anew(scene, general.iterations, generator, own, ranks, begins)
     augmenters = build_augmenters(settings, scene) if training else []
     run = Run(
         config=settings.resolved,

@@ -27,14 +27,15 @@ from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.guard import Guard
 from gsx.core.training.poses import PoseOptions
 from gsx.core.training.render import render
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
 
 logger = logging.getLogger(__name__)
 
 HALVES = 2
-Anew: TypeAlias = Callable[[Scene, int, torch.Generator], Backbone[Any]]
-"""(scene, steps, generator) -> a backbone of the run's options at step 0."""
+Anew: TypeAlias = Callable[[Scene, int, torch.Generator, Resolution], Backbone[Any]]
+"""(scene, steps, generator, how its views are seen) -> a backbone of the run's options at step 0."""
 
 
 def held_out_renders(run: Run, anew: Anew, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
@@ -78,22 +79,22 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
-    backbone = anew(scene, steps, generator)
-    half_run = Run(
+    resolution = unasked.resolution(scene, steps, run.device)
+    resolution.blur.movements = dict(run.blur.movements)
+    backbone = anew(scene, steps, generator, resolution)
+    return Run(
         config=run.config,
         folder=run.folder,
         scene=scene,
         backbone=backbone,
         raster=backbone.raster,
         training=unasked,
-        resolution=unasked.resolution(scene, steps, run.device),
+        resolution=resolution,
         iterations=steps,
         device=run.device,
         generator=generator,
         sampler=Sampler(len(views), own, batch=run.training.batch),
     )
-    half_run.blur.movements = dict(run.blur.movements)
-    return half_run
 
 
 def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
