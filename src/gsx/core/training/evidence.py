@@ -30,6 +30,9 @@ ROUNDING = 1 / (12 * 255**2)
 """Squared error of a value that is rounded to 8 bits: what lies below it is no evidence."""
 Forming = Callable[[Camera], FinerRaster]
 """How a camera's picture comes about at a step (`training.supersample`)."""
+Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
+"""(render, photograph, view) -> the render as that photograph would show it (`Resolution.compared`). Errors are told of
+these; what a primitive does to a picture, of the render itself."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,15 +65,15 @@ def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background:
     return Look(rendering=rendering, image=image, camera=raster.drawn_for, **leaves)
 
 
-Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
-"""(render, photograph, view) -> the render as that photograph would show it (`Resolution.compared`). Errors are told of
-these; what a primitive does to a picture, of the render itself."""
-
-
-def difference(image: Float[Tensor, "3 H W"], view: View, compared: Compared) -> Float[Tensor, "3 H W"]:
-    """A render, as the photograph of its view would show it, less that photograph; 0 where that does not count."""
-    photograph = view.image().to(image)
-    return blacked(compared(image.detach(), photograph, view) - photograph, view.counted())
+def difference(
+    image: Float[Tensor, "3 H W"], view: View, compared: Compared, window: Window | None = None
+) -> Float[Tensor, "3 H W"]:
+    """A render of all of a view or of a window, as the photograph would show it, less that photograph; 0 where that
+    does not count."""
+    part, counted = window or Window(0, 0, *view.camera.size), view.counted()
+    photograph = part.cut(view.image()).to(image)
+    off = compared(image.detach(), photograph, view) - photograph
+    return blacked(off, None if counted is None else counted[part.pixels])
 
 
 def rounding_of(view: View, window: Window | None = None) -> float:
@@ -250,9 +253,6 @@ def window_error(
 ) -> Float[Tensor, ""]:
     """Squared error in a window of a view."""
     splats = model.draw(form(view.camera).drawn_for, step).splats
-    raster, counted = form(window.of(view.camera)), view.counted()
-    rendering = rasterize(splats, raster.camera, model.raster, background=background)
-    image = raster.reduced(rendering.image)
-    photograph = window.cut(view.image()).to(image)
-    off = compared(image, photograph, view) - photograph
-    return blacked(off, None if counted is None else counted[window.pixels]).double().square().sum()
+    raster = form(window.of(view.camera))
+    image = raster.reduced(rasterize(splats, raster.camera, model.raster, background=background).image)
+    return difference(image, view, compared, window).double().square().sum()

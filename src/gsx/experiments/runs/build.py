@@ -5,6 +5,7 @@ import os
 import platform
 import weakref
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
@@ -143,26 +145,7 @@ def build(
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
     own = settings.training.resolution(scene, general.iterations, device)
 
-    def anew(
-        scene: Scene,
-        iterations: int,
-        generator: torch.Generator,
-        resolution: Resolution,
-        together: Ranks = ALONE,
-        begins: bool = True,
-    ) -> Backbone:
-        context = BackboneContext(
-            scene=scene,
-            iterations=iterations,
-            device=device,
-            raster=raster,
-            generator=generator,
-            resolution=resolution,
-            ranks=together,
-            begins=begins,
-        )
-        return settings.backbone.component.factory(settings.backbone.options, context)
-
+    anew = partial(backbone_of, settings.backbone, device, raster)
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
         one = replace(scene, points=one_point(stand_in))
@@ -199,6 +182,31 @@ def build(
 
     run.held_out = held_out if training else None
     return run
+
+
+def backbone_of(
+    chosen: Chosen,
+    device: torch.device,
+    raster: RasterSettings,
+    scene: Scene,
+    iterations: int,
+    generator: torch.Generator,
+    resolution: Resolution,
+    ranks: Ranks = ALONE,
+    begins: bool = True,
+) -> Backbone:
+    """The backbone that was chosen, at step 0 of so many; see `BackboneContext`."""
+    context = BackboneContext(
+        scene=scene,
+        iterations=iterations,
+        device=device,
+        raster=raster,
+        generator=generator,
+        resolution=resolution,
+        ranks=ranks,
+        begins=begins,
+    )
+    return chosen.component.factory(chosen.options, context)
 
 
 def recorder_of(backbone: Backbone, training: TrainingOptions, device: torch.device) -> Recorder | None:
