@@ -32,6 +32,10 @@ class Frame:
     width: int
     height: int
 
+    def shares(self, across: float, down: float) -> tuple[float, float]:
+        """A movement in px, as shares of the sides."""
+        return across / self.width, down / self.height
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:

@@ -128,12 +128,6 @@ def movement_of(name: str, spread: float) -> tuple[float, float]:
     return across, down
 
 
-def movement_shares(view: View, spread: float) -> tuple[float, float]:
-    """The movement of a photograph (`movement_of`), as shares of the sides of its view's frame."""
-    (across, down), frame = movement_of(view.name, spread), view.camera.frame
-    return across / frame.width, down / frame.height
-
-
 def turned(camera: Camera, name: str, spread: float) -> Camera:
     """The camera turned about its centre, so that its picture moves so (`turn_of`)."""
     across, down = turn_of(name, spread)
@@ -168,7 +162,7 @@ def worse(view: View, by: Mapping[str, float]) -> View:
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
         patch=patch_of(view.name, covered) if covered else None,
-        movement=movement_shares(view, blur) if blur else None,
+        movement=view.camera.frame.shares(*movement_of(view.name, blur)) if blur else None,
     )
     return replace(view, source=source, camera=turned(view.camera, view.name, pose) if pose else view.camera)
 

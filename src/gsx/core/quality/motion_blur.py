@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gsx.core.data.camera import Frame
 from gsx.core.data.masks import blacked
 from gsx.core.data.movement import motion_blurred
 from gsx.core.shapes import Bool, Float
@@ -43,10 +42,6 @@ class Movement:
     def times(self, factor: float) -> "Movement":
         """In px so many times as small."""
         return Movement(self.across * factor, self.down * factor, self.explained)
-
-    def shares_of(self, frame: Frame) -> tuple[float, float]:
-        """Across and down, as shares of the sides of the frame that it is in px of."""
-        return self.across / frame.width, self.down / frame.height
 
 
 def movement_between(

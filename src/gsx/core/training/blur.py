@@ -81,7 +81,7 @@ class Blur:
     def move(self, found: Mapping[View, Movement], number: int) -> list[float]:
         """These movements, px of their views, from a step on, as far as they count; returns the lengths of those."""
         kept = {view: one for view, one in found.items() if self.counts(one)}
-        self.movements = {view.name: one.shares_of(view.camera.frame) for view, one in kept.items()}
+        self.movements = {view.name: view.camera.frame.shares(one.across, one.down) for view, one in kept.items()}
         self.asked = number
         return [one.length for one in kept.values()]
 
