@@ -9,11 +9,13 @@ runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussia
 numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
 published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`: longer runs that
 leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose coarsest cells
-are pixels, grown as published and adaptively, beside published ones. Finished runs below --runs are not trained again.
+are pixels, grown as published and adaptively, beside published ones. `flat`: adaptive runs of photographs of one
+colour alone, made here. Finished runs below --runs are not trained again.
 A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
 import argparse
+import math
 import shutil
 import statistics
 import sys
@@ -28,7 +30,9 @@ import torch
 from gsx.api import train as train_here
 from gsx.backbones import adaptive, capacity, long_axis
 from gsx.backbones.sh_degrees import numbers_of
-from gsx.core.files import read_json
+from gsx.core.data.camera import look_at
+from gsx.core.data.images import write_image
+from gsx.core.files import read_json, write_json
 from gsx.experiments.runs.progress import read_curves
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
@@ -56,7 +60,9 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = shared_arguments(__doc__, "fox,fox_4,lego,castle,demo", "outputs/capacity")
     parser.add_argument(
-        "--what", default="growth,compact", help="tables: growth, compact, bands, evidence, cooldown, plateau, cells"
+        "--what",
+        default="growth,compact",
+        help="tables: growth, compact, bands, evidence, cooldown, plateau, cells, flat",
     )
     parser.add_argument("--backbones", default="gs3d", help="free Gaussians, by commas")
     parser.add_argument("--arms", default=";".join(ARMS), help="rows beside the published one, by semicolons")
@@ -282,14 +288,18 @@ def spz_bytes(folder: Path) -> int:
     return path.stat().st_size
 
 
+def degrees_of(folder: Path) -> list[int]:
+    """How many Gaussians have each SH degree, from 0 to 3."""
+    line = next(line for line in read_curves(folder) if "degree_0" in line)
+    return [line[f"degree_{degree}"] for degree in range(4)]
+
+
 def judged_evaluation(scene: str, price: float, backbone: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Of a run at that price, with how many Gaussians have each degree."""
     folder = given.runs / f"{backbone}_{scene}_bands_{price}_{seed}"
     wish = [ADAPTIVE, f"backbone.sh_judged={BANDS_FROM}", f"backbone.sh_price={price}"]
     found = trained(folder, words_of(wish, scene, backbone, seed, given), given)
-    lines = read_curves(folder)
-    told_of = next(line for line in lines if "degree_0" in line)
-    return found | {"degrees": [told_of[f"degree_{degree}"] for degree in range(4)], "spz": spz_bytes(folder)}
+    return found | {"degrees": degrees_of(folder), "spz": spz_bytes(folder)}
 
 
 def bands_row(scene: str, price: float, own: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]]) -> dict:
@@ -319,6 +329,65 @@ def bands_judged(backbone: str, given: argparse.Namespace) -> list[dict[str, Any
         for scene in scenes
         for price in PRICES
     ]
+
+
+# -- a scene of one colour ---------------------------------------------------------------------------------------------
+
+FLAT = (
+    *("scene=blender", "scene.random_points=10000", "iterations=600", "eval.zoom=[1]", ADAPTIVE),
+    f"backbone.sh_judged={BANDS_FROM}",
+)
+SIDE, COLOUR = 96, (184, 122, 61)
+"""Of its photographs, px; 8 bits."""
+FLAT_COLUMNS = [
+    *(["seeds", "seeds"], ["points", "points"], ["primitives", "primitives"], ["least", "fewest"], ["most", "most"]),
+    *(["degrees", "of degree 0 / 1 / 2 / 3"], ["x1", "x1"]),
+]
+FLAT_NOTE = (
+    f"`backbone.capacity=adaptive backbone.sh_judged={BANDS_FROM}`: 24 photographs of {SIDE} px, all of one colour, "
+    "from all around; random points. PSNR on four held-out views, dB, mean over seeds ± half the range."
+)
+
+
+def frames_around(folder: Path, split: str, count: int) -> list[dict[str, Any]]:
+    """Photographs of one colour from all around the origin, as transforms_*.json lists them."""
+    frames, picture = [], torch.tensor(COLOUR, dtype=torch.uint8)[:, None, None].expand(3, SIDE, SIDE).contiguous()
+    to_opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    for index in range(count):
+        angle = 2 * math.pi * (index + 0.5 * (split == "test")) / count
+        eye = (4 * math.cos(angle), 4 * math.sin(angle), 1 + math.sin(3 * angle))
+        camera = look_at(eye, (0, 0, 0), fov_x=0.69, width=SIDE, height=SIDE)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = camera.rotation.T, torch.tensor(eye)
+        write_image(folder / split / f"r_{index}.png", picture)
+        frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": (pose @ to_opengl).tolist()})
+    return frames
+
+
+def flat_scene(folder: Path) -> Path:
+    """A NeRF-Synthetic folder of photographs of one colour."""
+    for split, count in (("train", 24), ("test", 4)):
+        (folder / split).mkdir(parents=True, exist_ok=True)
+        frames = frames_around(folder, split, count)
+        write_json(folder / f"transforms_{split}.json", {"camera_angle_x": 0.69, "frames": frames})
+    return folder
+
+
+def flat_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
+    """One row."""
+    scene = flat_scene(given.runs / "scene_of_one_colour")
+
+    def look(_: str, seed: int) -> dict[str, Any]:
+        folder = given.runs / f"{backbone}_flat_{seed}"
+        found = trained(folder, [f"backbone={backbone}", *FLAT, f"scene.path={scene}", f"seed={seed}"], given)
+        return found | {"degrees": degrees_of(folder)}
+
+    found = over_seeds(look, ["flat"], given)["flat"]
+    counts = [run["primitives"] for run in found]
+    degrees = [statistics.mean(column) for column in zip(*(run["degrees"] for run in found), strict=True)]
+    row = {"seeds": len(found), "points": 10000, "primitives": round(statistics.mean(counts))}
+    row |= {"least": min(counts), "most": max(counts), "degrees": " / ".join(f"{count:.1f}" for count in degrees)}
+    return [row | {"x1": told([run["psnr"] for run in found], ".2f")}]
 
 
 # -- what the evidence costs -------------------------------------------------------------------------------------------
@@ -477,6 +546,9 @@ def main(words: Sequence[str]) -> None:
         if "cells" in given.what:
             title, rows = f"Cells of {backbone}", cells_rows(backbone, given)
             tables[f"{backbone}_cells"] = stamped(title, CELLS_COLUMNS, rows, [CELLS_NOTE], load, command)
+        if "flat" in given.what:
+            title, rows = f"{backbone} of a scene of one colour", flat_rows(backbone, given)
+            tables[f"{backbone}_flat"] = stamped(title, FLAT_COLUMNS, rows, [FLAT_NOTE], load, command)
         if "compact" in given.what:
             title, rows = f"Published {backbone} made smaller", made_smaller(backbone, given)
             tables[f"{backbone}_compact"] = stamped(title, COMPACT_COLUMNS, rows, [COMPACT_NOTE], load, command)

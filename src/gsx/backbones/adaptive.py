@@ -35,6 +35,11 @@ SLOWER, FASTER = 0.5, 2.0
 """By how much the rate of growth changes from one event to the next, at most."""
 STEPS = 100
 """Rates of growth are told for so many: the more training views there are, the farther apart events are."""
+AT_ONCE = 0.5
+"""Share of the rows that is removed at once, at most: they are judged one by one, though none may be worth anything
+beside the others and all of them together much. What is left learns before it is asked."""
+AGAIN = 0.1
+"""Once growth has ended, events go on asking while the last answer removed such a share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +92,7 @@ class Adaptive:
         """Nothing has been added or found yet."""
         table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
         table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
+        table.record["removed_share"] = torch.zeros((), dtype=torch.float64)
 
     def clear(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
         """Remove what lies where photographs show that nothing is: most of random points."""
@@ -116,14 +122,15 @@ class Adaptive:
     # -- what is found -------------------------------------------------------------------------------------------
 
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
-        """Find what the primitives added by the event before this one have gained; when growth ends, and at the last
-        event, remove what is not worth the price."""
+        """Find what the primitives added by the event before this one have gained; when growth ends, while that makes
+        the model much smaller, and at the last event, remove what is not worth the price."""
         grew = not self.ended(model.table)
         found = self.tried(model, undone, step)
         last = self.growing.passed(step) == 1
         ends = grew and (last or self.ended(model.table))
         found |= self.without_idle_levels(model, step) if ends else {}
-        found |= self.removed(model, step) if last or ends else {}
+        goes_on = not grew and float(model.table.record["removed_share"]) >= AGAIN
+        found |= self.removed(model, step) if last or ends or goes_on else {}
         held = self.asked(model.table, step) - room_under(self.most, len(model.table))
         return found | ({"withheld": held} if held > 0 else {})
 
@@ -200,20 +207,22 @@ class Adaptive:
 
         A view that shows N rows may lose lambda / (N ln 2) dB with one of them, lambda being the price: lambda ln 10 /
         (10 N ln 2) of its squared error, as that will be in the end, with that of the photograph's rounding. Rows
-        are judged in the mean over the views that show them.
+        are judged in the mean over the views that show them; those worth least go first, at most half of all at once.
         """
         found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share + found.rounding_share
         least = error_exponent(self.options.price) * lasting
-        doomed = (found.shown > 0) & (found.squares < least)
-        if bool(doomed.all()):
-            return {}
+        idle = (found.shown > 0) & (found.squares < least)
+        count = min(int(idle.sum()), math.floor(AT_ONCE * len(idle)))
+        doomed = torch.zeros_like(idle)
+        doomed[torch.where(idle, found.squares, torch.inf).argsort(stable=True)[:count]] = True
         logger.info(
-            "step %d: %d of %d primitives are removed: each adds less than %.3g to the squared error",
-            *(step, int(doomed.sum()), len(doomed), least),
+            "step %d: %d of %d primitives are removed, of %d that each add less than %.3g to the squared error",
+            *(step, count, len(idle), int(idle.sum()), least),
         )
+        model.table.record["removed_share"] = torch.tensor(count / len(idle), dtype=torch.float64)
         keep_rows(model.table, ~doomed)
-        return {"removed": int(doomed.sum())}
+        return {"removed": count}
 
     def tell(self, trial: Trial, table: ParameterTable) -> None:
         """Log what was decided, because of which number and threshold."""
