@@ -35,7 +35,7 @@ SLOWER, FASTER = 0.5, 2.0
 """By how much the rate of growth changes from one event to the next, at most."""
 STEPS = 100
 """Rates of growth are told for so many: the more training views there are, the farther apart events are."""
-AT_ONCE = 0.5
+AT_ONCE = 0.75
 """Share of the rows that is removed at once, at most: they are judged one by one, though none may be worth anything
 beside the others and all of them together much. What is left learns before it is asked."""
 AGAIN = 0.1
@@ -207,7 +207,8 @@ class Adaptive:
 
         A view that shows N rows may lose lambda / (N ln 2) dB with one of them, lambda being the price: lambda ln 10 /
         (10 N ln 2) of its squared error, as that will be in the end, with that of the photograph's rounding. Rows
-        are judged in the mean over the views that show them; those worth least go first, at most half of all at once.
+        are judged in the mean over the views that show them; those worth least go first, at most three quarters of all
+        at once.
         """
         found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share + found.rounding_share
