@@ -1,17 +1,18 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--what exposure,poses,covered,passed,blur,sky] [--only demo,fox]
-                                  [--seeds 0,1] [--share 0.4]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,covered,passed,blur,sky]
+                                  [--only demo,fox] [--seeds 0,1] [--share 0.4]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
-`training.exposure.when=auto`, beside the scene as it is, with it. `poses`: training cameras turned by half a pixel and
-by two, with and without `training.poses.when=auto`, likewise. `covered`: something plain stands before a part of each
-training photograph, with and without `training.distractors.when=auto`, likewise; `passed`: somebody does in the
-built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx photographs` names is counted.
-`blur`: cameras move while they take photographs, with and without `training.blur.when=auto`, beside the scene as it
-is. `sky`: what plain `gsx` trains, with and without `backbone.sky=auto`.
-Finished runs below --runs are not trained again.
+`training.exposure.when=auto`, beside the scene as it is, with it. `light`: training photographs that are brighter
+towards a side, each towards another, with and without `training.exposure.grid=auto`, likewise. `poses`: training
+cameras turned by half a pixel and by two, with and without `training.poses.when=auto`, likewise. `covered`: something
+plain stands before a part of each training photograph, with and without `training.distractors.when=auto`, likewise;
+`passed`: somebody does in the built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx
+photographs` names is counted. `blur`: cameras move while they take photographs, with and without
+`training.blur.when=auto`, beside the scene as it is. `sky`: what plain `gsx` trains, with and without
+`backbone.sky=auto`. Finished runs below --runs are not trained again.
 """
 
 import argparse
@@ -46,6 +47,9 @@ FITTED = ("eval.colours=fitted",)
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
+SHADED, EVENED = ("scene.disturb.shade=0.2",), (*JUDGED, "training.exposure.grid=auto")
+LIGHT_ARMS = {"as it is, auto": EVENED, "shaded": SHADED, "shaded, auto": (*SHADED, *EVENED)}
+"""The same of light within photographs."""
 CORRECTED = ("training.poses.when=auto",)
 HALF, TWO = ("scene.disturb.pose=0.5",), ("scene.disturb.pose=2",)
 POSE_ARMS = {
@@ -109,12 +113,6 @@ def figures(
     return found | {asked: evaluation.get(asked, {})}
 
 
-def measured(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
-    """Figures of a run by both protocols of colours, and what it found of exposures."""
-    found = figures(scene, seed, arm, ARMS[arm], "exposures", given)
-    return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
-
-
 Found = Sequence[Mapping[str, Any]]
 """What was measured with each seed."""
 Arms = Mapping[str, Sequence[str]]
@@ -134,19 +132,22 @@ def rows_by_arm(
     return [row(scene, arm, by_scene[scene]) for scene in scenes for arm in arms]
 
 
-def row_of(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
-    """Figures of one arm over seeds."""
-    found = by_arm[arm]
+def row_of(
+    scene: str, arm: str, by_arm: Mapping[str, Found], spread: str = "spread", learnt: str = "learnt"
+) -> dict[str, Any]:
+    """Figures of one arm over seeds; what was found, and learnt, of all that is known of exposures."""
+    found, (best, worst, mended) = by_arm[arm], by_arm
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
-    spreads = [100 * one["exposures"]["spread"] for one in found if one["exposures"]]
+    spreads = [100 * one["exposures"][spread] for one in found if one["exposures"]]
     row["spread"] = told(spreads, ".1f") if spreads else ""
-    row["learnt"] = f"{sum(one['exposures'].get('learnt', 0) > 0 for one in found)} of {len(found)}"
+    row["learnt"] = f"{sum(one['exposures'].get(learnt, 0) > 0 for one in found)} of {len(found)}"
     asking = [100 * one["exposures"].get("seconds", 0.0) / one["seconds"] for one in found]
     row["asking"] = f"{statistics.mean(asking):.1f}" if spreads else ""
     for zoom in ZOOMS:
         row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
-        if arm == "disturbed, auto":
-            row[f"back{zoom}"] = told(shares_won([by_arm[name] for name in ARMS], "fitted", zoom), ".2f")
+        if arm == mended:
+            arms = [by_arm[name] for name in (best, worst, mended)]
+            row[f"back{zoom}"] = told(shares_won(arms, "fitted", zoom), ".2f")
     return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
 
 
@@ -223,17 +224,46 @@ def faults(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 # -- exposure ----------------------------------------------------------------------------------------------------------
 
 
+EXPOSURE_COLUMNS = [
+    *(["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["spread", "spread found, %"]),
+    *(["learnt", "learnt"], ["asking", "asking, % of training"], ["fitted1", "x1"], ["fitted4", "x4"]),
+    *(["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as rendered"], ["x4", "x4 as rendered"]),
+]
+EXPOSURE_NOTE = (
+    "PSNR on held-out views that are not disturbed, of right halves in colours fitted on the left (as rendered: of "
+    "whole views as the model shows them); means over seeds ± half their range."
+)
+
+
+def in_colours(arms: Arms, kind: str) -> Callable[..., dict[str, Any]]:
+    """Figures of a run of an arm by both protocols of colours, and what it found of exposures."""
+
+    def look(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+        found = figures(scene, seed, f"{kind}{arm}", arms[arm], "exposures", given)
+        return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
+
+    return look
+
+
 def exposure(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     """Exposures of their own, and what mends them."""
-    rows = rows_by_arm(ARMS, measured, row_of, scenes, given)
-    columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["spread", "spread found, %"]]
-    columns += [["learnt", "learnt"], ["asking", "asking, % of training"], ["fitted1", "x1"], ["fitted4", "x4"]]
-    columns += [["back1", "won back at x1"], ["back4", "at x4"], ["x1", "x1 as rendered"], ["x4", "x4 as rendered"]]
+    rows = rows_by_arm(ARMS, in_colours(ARMS, ""), row_of, scenes, given)
+    note = f"{given.share:g} of the steps; {EXPOSURE_NOTE}"
+    return "Photographs at exposures of their own", EXPOSURE_COLUMNS, rows, note
+
+
+def light(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Light that differs within photographs, and what mends it."""
+
+    def row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+        return row_of(scene, arm, by_arm, "within", "grids")
+
+    rows = rows_by_arm(LIGHT_ARMS, in_colours(LIGHT_ARMS, "light "), row, scenes, given)
     note = (
-        f"{given.share:g} of the steps; PSNR on held-out views that are not disturbed, of right halves in colours "
-        "fitted on the left (as rendered: of whole views as the model shows them); means over seeds ± half their range."
+        f"{given.share:g} of the steps; log gains grow by 0.2 (standard deviation) from the middle of each training "
+        f"photograph to a side, across and down. {EXPOSURE_NOTE}"
     )
-    return "Photographs at exposures of their own", columns, rows, note
+    return "Photographs that are brighter towards a side", EXPOSURE_COLUMNS, rows, note
 
 
 # -- poses -------------------------------------------------------------------------------------------------------------
@@ -386,6 +416,7 @@ def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
 WHAT: dict[str, Measure] = {
     "exposure": exposure,
+    "light": light,
     "poses": poses,
     "covered": covered,
     "passed": passed,

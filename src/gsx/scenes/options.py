@@ -36,7 +36,7 @@ class SceneOptions:
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
-        default_factory=lambda: {"exposure": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
+        default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )
     """What training photographs are made to suffer, for research (gsx.core.data.disturbed); 0: nothing."""
     cache_gb: Gigabytes = without_effect(default=2.0)

@@ -8,7 +8,7 @@ import torch
 from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.disturbed import disturbed, gains_of, movement_of, turn_of
+from gsx.core.data.disturbed import disturbed, gains_of, movement_of, slopes_of, turn_of
 from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import FromFile, Masked, View
 from gsx.core.errors import ConfigError
@@ -40,6 +40,21 @@ def test_gains_are_spread_as_asked() -> None:
     logs = torch.stack([gains_of(str(number), 0.2) for number in range(2000)]).log()
     assert abs(float(logs.mean(1).std()) - 0.2) < 0.01
     assert abs(float((logs - logs.mean(1, keepdim=True)).std()) - 0.25 * 0.2 * (2 / 3) ** 0.5) < 0.005
+
+
+def test_a_shaded_photograph_gets_brighter_towards_a_side_at_every_size_and_in_crops() -> None:
+    scene = small_scene(spread(5))
+    [worse] = disturbed(replace(scene, train=scene.train[:1]), {"shade": 0.2}).train
+    right, down = slopes_of(worse.name, 0.2)
+    for camera in (worse.camera, worse.camera.zoom(4)):
+        x, y = (2 * torch.arange(camera.width) + 1) / camera.width - 1, (2 * torch.arange(camera.height) + 1)
+        light = (right * x + down * (y / camera.height - 1)[:, None]).exp()
+        expected = (128 * light).round().clamp(0, 255).to(torch.uint8)
+        assert torch.equal(worse.source.image(camera)[1], expected)
+    part = worse.camera.zoom(4).crop(50, 30, 20, 10)
+    assert torch.equal(worse.source.image(part)[1], expected[30:40, 50:70])
+    drawn = torch.tensor([slopes_of(str(number), 0.2) for number in range(2000)])
+    assert (drawn.std(0) - 0.2).abs().max() < 0.01
 
 
 def test_values_saturate_and_files_and_masks_stay_those_of_the_source() -> None:

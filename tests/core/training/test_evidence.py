@@ -73,7 +73,7 @@ def test_errors_are_shared_by_blending_weights() -> None:
     """Against renders in which one splat is white and all else black: these are its weights."""
     splats, view = cloud(5), view_of(12, 9)
     seen = look(splats, plain(view.camera), RULES, BACKGROUND)
-    off = difference(seen.rendering.image, view, lambda image, photograph, view: image)
+    off = difference(seen.rendering.image, view, lambda image, photograph, view, window: image)
     error = (rasterize(splats, view.camera, RULES, background=BACKGROUND).image - view.image()).square().sum(0)
     for row, found in enumerate(error_sums(seen, off)):
         white = torch.zeros(5, 3, dtype=torch.float64)

@@ -75,7 +75,10 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
     found = Exposures(options(), names, 1000, CPU)
     assert found.due(201)
     assert not found.due(200)
-    assert found.judge(pairs) == pytest.approx(float(gains.log().std()), rel=1e-4)
+    spread, inside = found.judge(pairs)
+    assert spread == pytest.approx(float(gains.log().std()), rel=1e-4)
+    assert math.isnan(inside)
+    assert found.grids is None
     assert not found.due(201)
     for name, gain in zip(names, gains - gains.mean() + 1, strict=True):
         torch.testing.assert_close(found.applied(image, name).detach(), image * gain)
@@ -84,7 +87,7 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
 def test_equal_photographs_have_none_unless_asked_for() -> None:
     image, pairs = photographs_at(torch.tensor([1.01, 1.0, 0.99, 1.0]))
     found = Exposures(options(), list("abcd"), 1000, CPU)
-    assert found.judge(pairs) < found.options.spread
+    assert found.judge(pairs)[0] < found.options.spread
     assert found.matrices is None
     assert found.tensors() == {}
     assert found.applied(image, "a") is image

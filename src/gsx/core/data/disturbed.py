@@ -19,7 +19,7 @@ from gsx.core.shapes import Bool, Float, UInt8
 
 BALANCE = 0.25
 """Spread of a channel's own gain, of that of the exposure."""
-MOST = {"exposure": 2.0, "pose": 64.0, "blur": 16.0, "covered": 0.9, "some": 1.0}
+MOST = {"exposure": 2.0, "shade": 2.0, "pose": 64.0, "blur": 16.0, "covered": 0.9, "some": 1.0}
 """What photographs may suffer, and the largest value of each."""
 
 
@@ -57,6 +57,8 @@ class Worse:
     source: ImageSource
     gains: Float[Tensor, "3"] | None = None
     """Display values are multiplied by them, and saturate."""
+    slopes: tuple[float, float] | None = None
+    """Of log gains of display values, to the right and down, from the middle of the frame to its sides."""
     patch: Patch | None = None
     movement: tuple[float, float] | None = None
     """Across and down, as shares of the frame's sides, while it was exposed."""
@@ -68,9 +70,20 @@ class Worse:
             if self.movement is None
             else with_motion_blur(self.source, camera, *self.movement)
         )
-        if self.gains is not None:
-            image = (image * self.gains[:, None, None]).round().clamp(0, 255).to(torch.uint8)
+        if self.gains is not None or self.slopes is not None:
+            light = self.light(camera).to(image.device)
+            image = (image * light).round().clamp(0, 255).to(torch.uint8)
         return image if self.patch is None else self.patch.over(image, camera)
+
+    def light(self, camera: Camera) -> Float[Tensor, "3 h w"]:
+        """Gains of display values: of all pixels alike, h and w are 1 then, or of each."""
+        gains = (torch.ones(3) if self.gains is None else self.gains)[:, None, None]
+        if self.slopes is None:
+            return gains
+        frame, (right, down) = camera.frame, self.slopes
+        x = 2 * (torch.arange(camera.width) + 0.5 + frame.left) / frame.width - 1
+        y = 2 * (torch.arange(camera.height) + 0.5 + frame.top) / frame.height - 1
+        return gains * (right * x + down * y[:, None]).exp()
 
     def max_zoom(self, camera: Camera) -> float:
         """That of the source."""
@@ -112,6 +125,13 @@ def gains_of(name: str, spread: float) -> Float[Tensor, "3"]:
     """Gains of the photograph of that name."""
     drawn = torch.randn(4, generator=generator_of("exposure", name))
     return (spread * (drawn[0] + BALANCE * drawn[1:])).exp()
+
+
+def slopes_of(name: str, spread: float) -> tuple[float, float]:
+    """By how much the log gain of that photograph grows to the right and down, from its middle to its sides, of that
+    standard deviation."""
+    right, down = (spread * torch.randn(2, generator=generator_of("shade", name)).double()).tolist()
+    return right, down
 
 
 def turn_of(name: str, spread: float) -> tuple[float, float]:
@@ -156,11 +176,13 @@ def patch_of(name: str, share: float) -> Patch:
 
 def worse(view: View, by: Mapping[str, float]) -> View:
     """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken."""
-    exposure, pose, covered, blur = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
+    kinds = ("exposure", "shade", "pose", "covered", "blur")
+    exposure, shade, pose, covered, blur = (by.get(kind, 0.0) for kind in kinds)
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
+        slopes=slopes_of(view.name, shade) if shade else None,
         patch=patch_of(view.name, covered) if covered else None,
         movement=view.camera.frame.shares(*movement_of(view.name, blur)) if blur else None,
     )
@@ -180,6 +202,7 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     """The scene with training photographs made worse, and a note that says so; test photographs stay as they are.
 
     by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
+    `shade`: of how much log gains grow from the middle of a photograph to its sides, to the right and down.
     `pose`: of how far pictures move along each axis when cameras are turned, px. `blur`: of how far they move while
     they are exposed, px. `covered`: share of each photograph that something plain stands before. `some`: the share of
     photographs that suffer; 1 where it is not said.

@@ -30,6 +30,11 @@ class Window:
         """The camera through this window."""
         return camera.crop(self.left, self.top, self.width, self.height)
 
+    def shares(self, width: int, height: int) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom edge, as shares of a raster of that size."""
+        right, bottom = self.left + self.width, self.top + self.height
+        return self.left / width, self.top / height, right / width, bottom / height
+
     def grown(self, margin: int, width: int, height: int) -> "Window":
         """With up to `margin` more on each side, as far as a raster of that size reaches."""
         left, top = max(0, self.left - margin), max(0, self.top - margin)

@@ -44,12 +44,21 @@ def judge_exposures(run: Run) -> dict[str, float]:
     line of the step."""
     pairs = ((render(run, view.camera).image, view.image(), view.counted()) for view in run.photographed)
     begun = time.perf_counter()
-    spread = run.exposures.judge(pairs)
+    spread, inside = run.exposures.judge(pairs)
     learnt = run.exposures.matrices is not None
     verdict = "each has its own from here on" if learnt else "they are taken for equal"
     logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
-    seconds = round(time.perf_counter() - begun, 3)
-    return {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0, "exposure_seconds": seconds}
+    seconds, count = round(time.perf_counter() - begun, 3), len(run.scene.train) if learnt else 0
+    found = {"exposure_spread": spread, "exposures": count, "exposure_seconds": seconds}
+    return found | ({} if math.isnan(inside) else told_within(run, inside))
+
+
+def told_within(run: Run, spread: float) -> dict[str, float]:
+    """Log by how much light differs within photographs, and what follows; for the line of the step."""
+    learnt = run.exposures.grids is not None
+    verdict = "each has a bilateral grid from here on" if learnt else "it is taken for even"
+    logger.info("step %d: light within photographs is spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
+    return {"light_spread": spread, "grids": len(run.scene.train) if learnt else 0}
 
 
 def judge_poses(run: Run) -> dict[str, float]:

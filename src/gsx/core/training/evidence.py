@@ -30,9 +30,9 @@ ROUNDING = 1 / (12 * 255**2)
 """Squared error of a value that is rounded to 8 bits: what lies below it is no evidence."""
 Forming = Callable[[Camera], FinerRaster]
 """How a camera's picture comes about at a step (`training.supersample`)."""
-Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View], Float[Tensor, "3 H W"]]
-"""(render, photograph, view) -> the render as that photograph would show it (`Resolution.compared`). Errors are told of
-these; what a primitive does to a picture, of the render itself."""
+Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View, Window | None], Float[Tensor, "3 H W"]]
+"""(render, photograph, view, window that both are of, None: all of it) -> the render as that photograph would show it
+(`Resolution.compared`). Errors are told of these; what a primitive does to a picture, of the render itself."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +72,7 @@ def difference(
     does not count."""
     part, counted = window or Window(0, 0, *view.camera.size), view.counted()
     photograph = part.cut(view.image()).to(image)
-    off = compared(image.detach(), photograph, view) - photograph
+    off = compared(image.detach(), photograph, view, window) - photograph
     return blacked(off, None if counted is None else counted[part.pixels])
 
 

@@ -4,7 +4,8 @@ A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers
 (3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
 photographs and renders say instead of at the identity; their mean stays the identity, so that the model has the
 exposure of the mean photograph; and Adam keeps the steps of each photograph apart. One Adam over all of them, as
-published, goes on moving a photograph while others are shown: by several rates a visit, where one is meant.
+published, goes on moving a photograph while others are shown: by several rates a visit, where one is meant. Behind A
+comes a bilateral grid, where light is found to differ within photographs (`core.training.bilateral_grid`).
 """
 
 import math
@@ -17,16 +18,20 @@ from torch import Tensor
 
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.bilateral_grid import WHOLE, beginning, changed, slopes_of_light, without_common
 from gsx.core.training.occasions import WHEN
 from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a photograph is seen a few dozen times in a short run."""
+GRID_DECAY = 0.03
+"""Share of its grid that a photograph loses whenever it is shown: light that gets brighter along the scene looks like
+photographs that get darker, and the least that explains them is meant."""
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
-FEWEST_PIXELS, FEWEST_VIEWS = 64, 3
-"""That tell a gain; that tell a spread."""
+FEWEST_PIXELS, FEWEST_OF_BLOCK, FEWEST_VIEWS = 64, 16, 3
+"""That tell a gain; that of a part of a picture; that tell a spread."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +44,24 @@ class ExposureOptions:
     """Share of the steps after which it is judged, and the first guess made."""
     spread: Annotated[float, Range(0, 1)] = 0.06
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
+    grid: str = "never"
+    """auto: a bilateral grid of each photograph, where light differs within photographs."""
+    grid_spread: Annotated[float, Range(0, 1)] = 0.08
+    """`auto`: of slopes of log gains, from the middle of a photograph to its sides (standard deviation), from which on
+    there are grids."""
     rate: PositiveRate = 0.01
     rate_final: PositiveRate = 0.001
     """Of Adam at the first and at the last step; their logarithm is interpolated."""
 
     def __post_init__(self) -> None:
-        if self.when not in WHEN:
-            raise ValueError(f"training.exposure.when is '{self.when}'; choose from {', '.join(WHEN)}")
+        for name, value in (("when", self.when), ("grid", self.grid)):
+            if value not in WHEN:
+                raise ValueError(f"training.exposure.{name} is '{value}'; choose from {', '.join(WHEN)}")
+        if self.when == "never" != self.grid:
+            raise ValueError(
+                f"training.exposure.grid is '{self.grid}', but training.exposure.when is 'never': a grid comes behind "
+                "an exposure; set training.exposure.when=auto"
+            )
         if not 0 < self.start < 1:
             raise ValueError(f"training.exposure.start is {self.start}; give a share of the steps between 0 and 1")
 
@@ -53,13 +69,20 @@ class ExposureOptions:
 # -- what photographs and renders say ----------------------------------------------------------------------------------
 
 
+def telling(
+    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+) -> Bool[Tensor, "H W"]:
+    """Pixels that count and are neither dark nor light in either."""
+    told = ((image > DARK) & (image < LIGHT) & (photograph > DARK) & (photograph < LIGHT)).all(0)
+    return told if counted is None else told & counted.to(told.device)
+
+
 def log_gains(
     image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "3"]:
     """Median of log(photograph / image) of each channel, over pixels that count and are neither dark nor light in
     either; nan where they are too few."""
-    told = ((image > DARK) & (image < LIGHT) & (photograph > DARK) & (photograph < LIGHT)).all(0)
-    told = told if counted is None else told & counted.to(told.device)
+    told = telling(image, photograph, counted)
     if int(told.sum()) < FEWEST_PIXELS:
         return torch.full((3,), math.nan)
     return (photograph[:, told] / image[:, told]).log().double().median(dim=1).values.float().cpu()
@@ -100,6 +123,9 @@ class Exposures:
     matrices: Float[Tensor, "N 3 4"] | None = None
     moments: Float[Tensor, "2 N 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 3, 4))
     """Adam's means of gradients and of their squares."""
+    grids: Float[Tensor, "N rank 3 4"] | None = None
+    """Matrices of bilateral grids; None: light does not differ within photographs."""
+    grid_moments: Float[Tensor, "2 N rank 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 0, 3, 4))
     visits: Float[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0))
     """Steps of each photograph."""
     shown: set[int] = field(default_factory=set)
@@ -114,32 +140,51 @@ class Exposures:
         """Whether they are judged before this step."""
         return self.options.when != "never" and self.matrices is None and number == self.first
 
-    def judge(self, pairs: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> float:
+    def judge(self, pairs: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> tuple[float, float]:
         """Begin with the gains of (render, photograph, which pixels count) of each photograph in order, if they are
-        spread enough, or have to be; returns their spread."""
-        found = torch.stack([of_halves(*pair) for pair in pairs])
-        spread = shared_spread(found[:, 1], found[:, 2])
-        if self.options.when == "always" or spread > self.options.spread:
-            gains = found[:, 0].nan_to_num(0.0).exp()
-            matrices = torch.cat([torch.diag_embed(gains), torch.zeros(len(gains), 3, 1)], dim=2)
-            self.begin(centred_on_identity(matrices))
-        return spread
+        spread enough, or have to be, and with grids likewise; returns both spreads, nan for what was not asked."""
+        found, within, own = list[Tensor](), list[Tensor](), self.options
+        for image, photograph, counted in pairs:
+            found.append(of_halves(image, photograph, counted))
+            if own.grid != "never":
+                told = telling(image, photograph, counted)
+                within.append(slopes_of_light(image, photograph, told, FEWEST_OF_BLOCK))
+        gains = torch.stack(found)
+        spread = shared_spread(gains[:, 1], gains[:, 2])
+        slopes = torch.stack(within) if within else torch.zeros(0, 3, 2, 3)
+        inside = shared_spread(*slopes[:, 1:].flatten(2).unbind(1)) if within else math.nan
+        local = own.grid == "always" or inside > own.grid_spread
+        if own.when == "always" or spread > own.spread or local:
+            first = gains[:, 0].nan_to_num(0.0).exp()
+            matrices = torch.cat([torch.diag_embed(first), torch.zeros(len(first), 3, 1)], dim=2)
+            self.begin(centred_on_identity(matrices), beginning(slopes[:, 0].nan_to_num(0.0)) if local else None)
+        return spread, inside
 
-    def begin(self, matrices: Float[Tensor, "N 3 4"]) -> None:
+    def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
         """Learn from these on."""
         self.matrices = matrices.to(self.device).requires_grad_()
         self.moments, self.visits = torch.zeros(2, *matrices.shape, device=self.device), torch.zeros(len(matrices))
+        self.grids = None if grids is None else grids.to(self.device).requires_grad_()
+        self.grid_moments = torch.zeros(2, *(() if grids is None else grids.shape), device=self.device)
 
-    def applied(self, image: Float[Tensor, "3 H W"], name: str, learning: bool = False) -> Float[Tensor, "3 H W"]:
+    def applied(
+        self,
+        image: Float[Tensor, "3 H W"],
+        name: str,
+        learning: bool = False,
+        edges: tuple[float, float, float, float] = WHOLE,
+    ) -> Float[Tensor, "3 H W"]:
         """The render as the photograph of that name would have it, on the device that learns; as it is where there are
-        no exposures. learning: the photograph is one of the step under way."""
+        no exposures. learning: the photograph is one of the step under way. edges: of what is rendered, as shares of
+        the photograph's sides."""
         if self.matrices is None:
             return image
         index = self.names.index(name)
         if learning:
             self.shown.add(index)
-        matrix = self.matrices[index] if learning else self.matrices[index].detach()
-        return transformed(image.to(self.device), matrix)
+        matrix, grid = self.matrices[index], None if self.grids is None else self.grids[index]
+        out = transformed(image.to(self.device), matrix if learning else matrix.detach())
+        return out if grid is None else changed(out, grid if learning else grid.detach(), edges)
 
     def rate(self, number: int) -> float:
         """Of step `number`."""
@@ -148,41 +193,54 @@ class Exposures:
 
     @torch.no_grad()
     def update(self, number: int) -> None:
-        """One step of Adam for each photograph that was shown; the mean stays the identity."""
+        """One step of Adam for each photograph that was shown; the mean of the matrices stays the identity."""
         if self.matrices is None or self.matrices.grad is None:
             return
+        learnt = [(self.matrices, self.moments), (self.grids, self.grid_moments)]
         for index in sorted(self.shown):
-            self.matrices[index] -= self.rate(number) * self.direction(index, self.matrices.grad[index])
+            self.visits[index] += 1
+            for values, moments in learnt:
+                if values is not None and values.grad is not None:
+                    direction = adam_direction(moments[:, index], values.grad[index], float(self.visits[index]))
+                    values[index] -= self.rate(number) * direction
         self.matrices.copy_(centred_on_identity(self.matrices))
+        if self.grids is not None:
+            self.grids[sorted(self.shown)] *= 1 - GRID_DECAY
+            self.grids.copy_(without_common(self.grids))
         self.forget()
-
-    def direction(self, index: int, gradient: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
-        """Adam's, of one photograph."""
-        self.visits[index] += 1
-        for moment, beta, value in zip(self.moments, BETAS, (gradient, gradient.square()), strict=True):
-            moment[index] = beta * moment[index] + (1 - beta) * value
-        seen = float(self.visits[index])
-        mean, square = (m[index] / (1 - beta**seen) for m, beta in zip(self.moments, BETAS, strict=True))
-        return mean / (square.sqrt() + EPS)
 
     def forget(self) -> None:
         """Drop the gradients of a step."""
         self.shown.clear()
-        if self.matrices is not None:
-            self.matrices.grad = None
+        for values in (self.matrices, self.grids):
+            if values is not None:
+                values.grad = None
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where there are none."""
         if self.matrices is None:
             return {}
-        return {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
+        own = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
+        return own if self.grids is None else own | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: there are no exposures."""
-        self.matrices = None
+        self.matrices = self.grids = None
         if tensors:
-            self.begin(tensors["matrices"].clone())
+            grids = tensors.get("grids")
+            self.begin(tensors["matrices"].clone(), None if grids is None else grids.clone())
             self.moments, self.visits = tensors["moments"].to(self.device).clone(), tensors["visits"].clone()
+            if grids is not None:
+                self.grid_moments = tensors["grid_moments"].to(self.device).clone()
+
+
+def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:
+    """Adam's, of one photograph's numbers at its step of that number; its moments are changed in place."""
+    means = []
+    for moment, beta, value in zip(moments, BETAS, (gradient, gradient.square()), strict=True):
+        moment.mul_(beta).add_((1 - beta) * value)
+        means.append(moment / (1 - beta**steps))
+    return means[0] / (means[1].sqrt() + EPS)
 
 
 def transformed(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 H W"]:

@@ -13,7 +13,9 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
+from gsx.core.data.window import Window
 from gsx.core.shapes import Bool, Float, UInt8
+from gsx.core.training.bilateral_grid import WHOLE
 from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
 from gsx.core.training.exposure import Exposures, saturated
@@ -115,21 +117,23 @@ class Resolution:
         return self.distractors.views(self.poses.views(self.coarse_views[times]))
 
     def as_photographed(
-        self, image: Float[Tensor, "3 H W"], view: View, learning: bool = False
+        self, image: Float[Tensor, "3 H W"], view: View, window: Window | None = None, learning: bool = False
     ) -> Float[Tensor, "3 H W"]:
-        """A render as the photograph of a training view shows it: by a camera that moved, at its exposure. learning:
-        the view is one of the step under way."""
-        return self.exposures.applied(self.blur.applied(image, view), view.name, learning)
+        """A render of a training view, or of a window of it, as its photograph shows it: by a camera that moved, at its
+        exposure. learning: the view is one of the step under way."""
+        edges = WHOLE if window is None else window.shares(*view.camera.size)
+        return self.exposures.applied(self.blur.applied(image, view), view.name, learning, edges)
 
     def compared(
         self,
         image: Float[Tensor, "3 H W"],
         photograph: Float[Tensor, "3 H W"],
         view: View,
+        window: Window | None = None,
         learning: bool = False,
     ) -> Float[Tensor, "3 H W"]:
         """A render as its photograph would show it; where that is saturated, more is no error."""
-        return saturated(self.as_photographed(image, view, learning), photograph, self.exposures)
+        return saturated(self.as_photographed(image, view, window, learning), photograph, self.exposures)
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""

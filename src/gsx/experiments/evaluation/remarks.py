@@ -63,11 +63,13 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def judged_exposures(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """At which step exposures were judged, their spread, of how many photographs they were learnt, and seconds."""
+    """At which step exposures were judged, their spread, of how many photographs they were learnt, and seconds; where
+    light within photographs was asked for, the spread of that, and of how many grids were."""
     for line in lines:
         if "exposure_spread" in line:
             told = {"spread": "exposure_spread", "learnt": "exposures", "seconds": "exposure_seconds"}
-            return {"step": line["step"]} | {name: line[key] for name, key in told.items()}
+            within = {"within": "light_spread", "grids": "grids"} if "light_spread" in line else {}
+            return {"step": line["step"]} | {name: line[key] for name, key in (told | within).items()}
     return {}
 
 
@@ -157,6 +159,11 @@ def exposure_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"exposures of photographs are spread by {found['spread']:.1%}, each has its own from step "
             f"{found['step']:,} on: the model has that of the mean photograph; eval.colours=fitted looks past that"
+        )
+    if found.get("grids"):
+        yield (
+            f"light within photographs is spread by {found['within']:.1%}, each has a bilateral grid from step "
+            f"{found['step']:,} on"
         )
 
 
