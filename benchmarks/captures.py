@@ -135,7 +135,7 @@ def rows_by_arm(
 def row_of(
     scene: str, arm: str, by_arm: Mapping[str, Found], spread: str = "spread", learnt: str = "learnt"
 ) -> dict[str, Any]:
-    """Figures of one arm over seeds; what was found, and learnt, of all that is known of exposures."""
+    """Figures of one arm over seeds; spread, learnt: keys of what was found, and of how many photographs learn it."""
     found, (best, worst, mended) = by_arm[arm], by_arm
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     spreads = [100 * one["exposures"][spread] for one in found if one["exposures"]]

@@ -25,6 +25,7 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
+from gsx.core.training.bilateral_grid import RANK, through_grid
 from gsx.core.training.blur import Blur
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.evidence import Removal
@@ -297,17 +298,21 @@ class Printed:
         return 1.0
 
 
-@pytest.mark.parametrize("how", ["dark", "bright", "moved"])
+@pytest.mark.parametrize("how", ["dark", "bright", "moved", "shaded"])
 def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: str) -> None:
-    """They show the model itself at half its brightness, at two and a half times that so that they saturate, or by
-    cameras that moved: where that is known it has no error to speak of, and half of it does far worse."""
+    """They show the model itself at half its brightness, at two and a half times that so that they saturate, by
+    cameras that moved, or brighter to the right: where that is known it has no error to speak of, and half
+    of it does far worse."""
     bare = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=0.1)
-    model, gain = small_gs3d(bare, options=options_of("adaptive")), {"dark": 0.5, "bright": 2.5, "moved": 1.0}[how]
+    model, gain = small_gs3d(bare, options=options_of("adaptive")), {"dark": 0.5, "bright": 2.5}.get(how, 1.0)
     across, names, shown = 3.0 if how == "moved" else 0.0, [view.name for view in bare.train], []
+    light = torch.zeros(RANK, 3, 4)
+    light[1, :, :3] = 0.5 * torch.eye(3) if how == "shaded" else 0.0
     for view in bare.train:
         splats = model.draw(view.camera, 700).splats
         image = rasterize(splats, view.camera, model.raster, background=bare.background).image.detach()
-        shown.append((255 * gain * motion_blurred(image, across, 0.0)).round().clamp(0, 255).byte())
+        photographed = gain * through_grid(motion_blurred(image, across, 0.0), light)
+        shown.append((255 * photographed).round().clamp(0, 255).byte())
     scene = replace(bare, train=[replace(v, source=Printed(p)) for v, p in zip(bare.train, shown, strict=True)])
     half, lost, found = with_rows(model.table, torch.arange(40) < 20), [], []
     exposures, blur = Exposures(names=names), Blur()
@@ -315,9 +320,10 @@ def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: st
         if known and how == "moved":
             blur.movements = {view.name: (across / view.camera.width, 0.0) for view in scene.train}
         elif known:
-            exposures.begin(torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(names), 1, 1))
+            matrices = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(names), 1, 1)
+            exposures.begin(matrices, light.repeat(len(names), 1, 1, 1) if how == "shaded" else None)
         context = small_context(scene, exposures=exposures, blur=blur)
-        judge = Adaptive(AdaptiveOptions(window=1.0), context, PUBLISHED, 0)
+        judge = Adaptive(AdaptiveOptions(window=0.5 if how == "shaded" else 1.0), context, PUBLISHED, 0)
         lost.append(judge.gain(model, model.table, half, 700)[0])
         found.append(worth_in_training(model, context, 700))
     assert lost[1] > lost[0] + 5

@@ -3,7 +3,8 @@
 Between two events of density control a window of some training views counts in no loss. At the next event they are
 drawn twice: by the model as it is, and as it would be had the last event added nothing. What the error differs by
 is the gain of what was added, told in dB per doubling of the primitives, the unit of the price. Growth is the faster
-the more it gains, and ends where that stays below the price; then, and at the last event, goes what is not worth it.
+the more it gains, and ends where that stays below the price; then, at the events after as long as much goes, and at the
+last one, goes what is not worth it.
 No step has seen the windows since what is judged was added; they move to other views and places with every event, so
 that all pixels are learnt from in the end. Test views play no part.
 """

@@ -52,7 +52,7 @@ class Patch:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Worse:
-    """A source of a photograph that was taken at another exposure, by a moving camera, with something in the way."""
+    """A source of a photograph that was taken in other light, by a moving camera, with something in the way."""
 
     source: ImageSource
     gains: Float[Tensor, "3"] | None = None

@@ -47,6 +47,7 @@ def judge_exposures(run: Run) -> dict[str, float]:
     spread, inside = run.exposures.judge(pairs)
     learnt = run.exposures.matrices is not None
     verdict = "each has its own from here on" if learnt else "they are taken for equal"
+    verdict += ", since light differs within them" if run.exposures.grids is not None else ""
     logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
     seconds, count = round(time.perf_counter() - begun, 3), len(run.scene.train) if learnt else 0
     found = {"exposure_spread": spread, "exposures": count, "exposure_seconds": seconds}
@@ -164,7 +165,7 @@ def differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         photograph, counted = small.image(), small.counted()
-        image = at_exposure(run.as_photographed(shown.image, view).detach().cpu(), photograph, counted)
+        image = at_exposure(run.as_photographed(shown.image, small).detach().cpu(), photograph, counted)
         found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
     return found
 

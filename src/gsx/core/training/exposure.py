@@ -18,16 +18,13 @@ from torch import Tensor
 
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.bilateral_grid import WHOLE, beginning, changed, slopes_of_light, without_common
+from gsx.core.training.bilateral_grid import WHOLE, first_matrices, slopes_of_light, through_grid, without_common
 from gsx.core.training.occasions import WHEN
 from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a photograph is seen a few dozen times in a short run."""
-GRID_DECAY = 0.03
-"""Share of its grid that a photograph loses whenever it is shown: light that gets brighter along the scene looks like
-photographs that get darker, and the least that explains them is meant."""
 DARK, LIGHT = 0.05, 0.95
 """Display values that tell a gain: below them noise does, above them they may be saturated."""
 FEWEST_PIXELS, FEWEST_OF_BLOCK, FEWEST_VIEWS = 64, 16, 3
@@ -43,7 +40,8 @@ class ExposureOptions:
     start: Share = 0.2
     """Share of the steps after which it is judged, and the first guess made."""
     spread: Annotated[float, Range(0, 1)] = 0.06
-    """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own."""
+    """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own; as they have
+    where they have grids."""
     grid: str = "never"
     """auto: a bilateral grid of each photograph, where light differs within photographs."""
     grid_spread: Annotated[float, Range(0, 1)] = 0.08
@@ -152,13 +150,13 @@ class Exposures:
         gains = torch.stack(found)
         spread = shared_spread(gains[:, 1], gains[:, 2])
         slopes = torch.stack(within) if within else torch.zeros(0, 3, 2, 3)
-        inside = shared_spread(*slopes[:, 1:].flatten(2).unbind(1)) if within else math.nan
-        local = own.grid == "always" or inside > own.grid_spread
-        if own.when == "always" or spread > own.spread or local:
+        light_spread = shared_spread(*slopes[:, 1:].flatten(2).unbind(1)) if within else math.nan
+        with_grids = own.grid == "always" or light_spread > own.grid_spread
+        if own.when == "always" or spread > own.spread or with_grids:
             first = gains[:, 0].nan_to_num(0.0).exp()
             matrices = torch.cat([torch.diag_embed(first), torch.zeros(len(first), 3, 1)], dim=2)
-            self.begin(centred_on_identity(matrices), beginning(slopes[:, 0].nan_to_num(0.0)) if local else None)
-        return spread, inside
+            self.begin(centred_on_identity(matrices), first_matrices(slopes[:, 0]) if with_grids else None)
+        return spread, light_spread
 
     def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
         """Learn from these on."""
@@ -184,7 +182,7 @@ class Exposures:
             self.shown.add(index)
         matrix, grid = self.matrices[index], None if self.grids is None else self.grids[index]
         out = transformed(image.to(self.device), matrix if learning else matrix.detach())
-        return out if grid is None else changed(out, grid if learning else grid.detach(), edges)
+        return out if grid is None else through_grid(out, grid if learning else grid.detach(), edges)
 
     def rate(self, number: int) -> float:
         """Of step `number`."""
@@ -193,7 +191,8 @@ class Exposures:
 
     @torch.no_grad()
     def update(self, number: int) -> None:
-        """One step of Adam for each photograph that was shown; the mean of the matrices stays the identity."""
+        """One step of Adam for each photograph that was shown; the mean of the matrices stays the identity, that of
+        grids zero."""
         if self.matrices is None or self.matrices.grad is None:
             return
         learnt = [(self.matrices, self.moments), (self.grids, self.grid_moments)]
@@ -205,7 +204,6 @@ class Exposures:
                     values[index] -= self.rate(number) * direction
         self.matrices.copy_(centred_on_identity(self.matrices))
         if self.grids is not None:
-            self.grids[sorted(self.shown)] *= 1 - GRID_DECAY
             self.grids.copy_(without_common(self.grids))
         self.forget()
 

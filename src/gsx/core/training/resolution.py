@@ -117,7 +117,7 @@ class Resolution:
         return self.distractors.views(self.poses.views(self.coarse_views[times]))
 
     def as_photographed(
-        self, image: Float[Tensor, "3 H W"], view: View, window: Window | None = None, learning: bool = False
+        self, image: Float[Tensor, "3 H W"], view: View, window: Window | None = None, *, learning: bool = False
     ) -> Float[Tensor, "3 H W"]:
         """A render of a training view, or of a window of it, as its photograph shows it: by a camera that moved, at its
         exposure. learning: the view is one of the step under way."""
@@ -130,10 +130,11 @@ class Resolution:
         photograph: Float[Tensor, "3 H W"],
         view: View,
         window: Window | None = None,
+        *,
         learning: bool = False,
     ) -> Float[Tensor, "3 H W"]:
         """A render as its photograph would show it; where that is saturated, more is no error."""
-        return saturated(self.as_photographed(image, view, window, learning), photograph, self.exposures)
+        return saturated(self.as_photographed(image, view, window, learning=learning), photograph, self.exposures)
 
     def rendered_cameras(self, step: int) -> list[Camera]:
         """Those that a step renders training views by."""
