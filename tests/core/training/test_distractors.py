@@ -13,6 +13,7 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import patch_of
 from gsx.core.data.scene import View
+from gsx.core.training.captures import differences
 from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.execute import execute
@@ -161,6 +162,22 @@ def test_a_stop_between_finding_and_the_step_is_told_as_far_as_it_is_known() -> 
     assert "5.0% of the pixels" in " ".join(remarks_of(gathered(lines)))
     poses = gathered([{"step": 7, "poses": 6, "pose_motion": 0.2, "pose_seconds": 1.0}])
     assert "corrected" in " ".join(remarks_of(poses))
+
+
+def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Movements are shares of a view's sides: those of the smaller view that was rendered."""
+    run, seen = tiny_run(tmp_path, ["iterations=1"]), list[tuple[object, ...]]()
+
+    def applied(image: Tensor, view: View) -> Tensor:
+        seen.append(((image.shape[2], image.shape[1]), view.camera.size))
+        return image
+
+    monkeypatch.setattr(run.blur, "applied", applied)
+    differences(run, run.scene.train[:2])
+    assert len(seen) == 2
+    assert all(rendered == size for rendered, size in seen)
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
