@@ -168,7 +168,7 @@ def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Movements are shares of a view's sides: those of the smaller view that was rendered."""
-    run, seen = tiny_run(tmp_path, ["iterations=1"]), list[tuple[object, ...]]()
+    run, seen = tiny_run(tmp_path, ["iterations=1", "scene.width=80", "scene.height=64"]), list[tuple[object, ...]]()
 
     def applied(image: Tensor, view: View) -> Tensor:
         seen.append(((image.shape[2], image.shape[1]), view.camera.size))
