@@ -350,13 +350,15 @@ FLAT_NOTE = (
 
 
 def frames_around(folder: Path, split: str, count: int) -> list[dict[str, Any]]:
-    """Photographs of one colour from all around the origin, as transforms_*.json lists them."""
-    frames, picture = [], torch.tensor(COLOUR, dtype=torch.uint8)[:, None, None].expand(3, SIDE, SIDE).contiguous()
+    """Photographs of one colour from all around the origin, as transforms_*.json lists them. Those that judge are
+    larger: gsx refuses photographs that are trained on, byte for byte."""
+    side = SIDE + (8 if split == "test" else 0)
+    frames, picture = [], torch.tensor(COLOUR, dtype=torch.uint8)[:, None, None].expand(3, side, side).contiguous()
     to_opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
     for index in range(count):
         angle = 2 * math.pi * (index + 0.5 * (split == "test")) / count
         eye = (4 * math.cos(angle), 4 * math.sin(angle), 1 + math.sin(3 * angle))
-        camera = look_at(eye, (0, 0, 0), fov_x=0.69, width=SIDE, height=SIDE)
+        camera = look_at(eye, (0, 0, 0), fov_x=0.69, width=side, height=side)
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3], pose[:3, 3] = camera.rotation.T, torch.tensor(eye)
         write_image(folder / split / f"r_{index}.png", picture)
