@@ -16,7 +16,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import LOG, REPORT, RESULTS, SPLATS
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import start
+from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.settings import Settings
 
 OVERRIDES = (
@@ -63,6 +63,14 @@ def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = No
     run = start(settings, loaded)
     with loaded.listening([StopAfter(stop_after)] if stop_after is not None else []):
         execute(run, settings, loaded)
+    return run
+
+
+def stopped_and_resumed(folder: Path, more: Sequence[str], stop_after: int) -> Run:
+    """The same run, stopped after a step, opened from its folder again and run to its end."""
+    tiny_run(folder, more, stop_after)
+    run, settings = open_run(folder, plugins(), training=True)
+    execute(run, settings, plugins())
     return run
 
 

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import final_tensors, tiny_run
+from tiny import final_tensors, stopped_and_resumed, tiny_run
 from torch import Tensor
 
-from gsx.builtin import plugins
 from gsx.core.data.window import Window
 from gsx.core.training.bilateral_grid import RANK, first_matrices, slopes_of_light, through_grid, without_common
 from gsx.core.training.exposure import ExposureOptions, Exposures
-from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import open_run
 
 CPU = torch.device("cpu")
 ALL = torch.ones(36, 48, dtype=torch.bool)
@@ -167,9 +164,7 @@ SHADED = (
 def test_a_run_with_grids_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", SHADED)
     assert whole.exposures.grids is not None
-    tiny_run(tmp_path / "stopped", SHADED, stop_after=9)
-    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    execute(run, settings, plugins())
+    stopped_and_resumed(tmp_path / "stopped", SHADED, stop_after=9)
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "exposure.grids" in a

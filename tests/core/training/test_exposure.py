@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import final_tensors, tiny_run
+from tiny import final_tensors, stopped_and_resumed, tiny_run
 from torch import Tensor
 
-from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.exposure import (
@@ -25,8 +24,6 @@ from gsx.core.training.exposure import (
 from gsx.core.training.poses import PoseOptions
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.runs.build import refuse_shared
-from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import open_run
 
 CPU = torch.device("cpu")
 
@@ -191,9 +188,7 @@ DISTURBED = (
 def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", DISTURBED)
     assert whole.exposures.matrices is not None
-    tiny_run(tmp_path / "stopped", DISTURBED, stop_after=13)
-    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    execute(run, settings, plugins())
+    stopped_and_resumed(tmp_path / "stopped", DISTURBED, stop_after=13)
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "exposure.matrices" in a

@@ -33,6 +33,13 @@ class Disturbable(Protocol):
         ...
 
 
+def places_in_frame(camera: Camera) -> tuple[Float[Tensor, "W"], Float[Tensor, "H"]]:
+    """Centres of columns and of rows of pixels, as shares of the frame's sides."""
+    frame = camera.frame
+    columns = (torch.arange(camera.width) + 0.5 + frame.left) / frame.width
+    return columns, (torch.arange(camera.height) + 0.5 + frame.top) / frame.height
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Patch:
     """Something plain in front of a camera."""
@@ -43,9 +50,7 @@ class Patch:
 
     def over(self, image: UInt8[Tensor, "3 H W"], camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """The image with it: pixels whose centres it covers."""
-        frame, (left, top, right, bottom) = camera.frame, self.edges
-        x = (torch.arange(camera.width) + 0.5 + frame.left) / frame.width
-        y = (torch.arange(camera.height) + 0.5 + frame.top) / frame.height
+        (left, top, right, bottom), (x, y) = self.edges, places_in_frame(camera)
         covered = ((y >= top) & (y < bottom))[:, None] & ((x >= left) & (x < right))
         return torch.where(covered.to(image.device), self.colour.to(image.device)[:, None, None], image)
 
@@ -80,9 +85,7 @@ class Worse:
         gains = (torch.ones(3) if self.gains is None else self.gains)[:, None, None]
         if self.slopes is None:
             return gains
-        frame, (right, down) = camera.frame, self.slopes
-        x = 2 * (torch.arange(camera.width) + 0.5 + frame.left) / frame.width - 1
-        y = 2 * (torch.arange(camera.height) + 0.5 + frame.top) / frame.height - 1
+        (right, down), (x, y) = self.slopes, (2 * places - 1 for places in places_in_frame(camera))
         return gains * (right * x + down * y[:, None]).exp()
 
     def max_zoom(self, camera: Camera) -> float:
