@@ -16,6 +16,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
+from gsx.scenes.adjust import adjusted, fit_line, refuse_unknown
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
@@ -44,6 +45,9 @@ class ColmapOptions(SceneOptions):
 
     images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
+    adjust: str = "never"
+    """never | auto | always: whether poses and intrinsics are found anew from the model's observations
+    (gsx.scenes.adjust)."""
     max_reprojection_px: Annotated[float, Range(0, 1e6)]
     """The scene is refused when the median reprojection error exceeds this, in pixels of the model's cameras."""
 
@@ -52,11 +56,14 @@ def load(options: ColmapOptions) -> Scene:
     """Load a COLMAP scene.
 
     Raises:
+        ConfigError: an option has no such value.
         InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
     """
+    refuse_unknown(options.adjust)
     path = Path(options.path).expanduser()
     folder, notes = find_model(path)
-    return build(read_model(folder), path / options.images, options, notes)
+    model, adjustment = adjusted(read_model(folder), options.adjust)
+    return build(model, path / options.images, options, [*notes, *adjustment])
 
 
 def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str]) -> Scene:
@@ -144,7 +151,8 @@ def check_cameras(
     if not median <= limit:
         raise InputError(
             f"The cameras of {model.folder} miss the observed keypoints by {median:.3g} px (median; the limit is "
-            f"scene.max_reprojection_px={limit:g}): poses, intrinsics or files of different reconstructions are mixed."
+            f"scene.max_reprojection_px={limit:g}): poses, intrinsics or files of different reconstructions are mixed. "
+            "Where they are only inexact, scene.adjust=auto finds them anew from these observations."
         )
     return f"Reprojection error {median:.2f} px (median of {len(errors)} observations, at the model's resolution)."
 
@@ -191,6 +199,7 @@ def _provenance(model: Model, shots: Sequence[Shot], views: Sequence[View], opti
         image_folder=Path(options.images).name,
         camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
         undistortion=METHOD if bent else None,
+        **({} if options.adjust == "never" else {"adjust": options.adjust}),
     )
 
 
@@ -199,6 +208,7 @@ def facts(path: Path) -> Iterator[str]:
     folder = find_model(path)[0]
     model = read_model(folder)
     yield f"model     {folder}: {len(model.images)} images, mean reprojection error {model.mean_error:.2f} px"
+    yield f"fit       {fit_line(model)}"
     cameras = [model.cameras[image.camera_id] for image in model.images]
     kinds = Counter((camera.model_name, camera.width, camera.height) for camera in cameras)
     for (name, width, height), count in sorted(kinds.items()):

@@ -93,7 +93,7 @@ def model_folders(path: Path) -> list[Path]:
 
 def count_images(folder: Path) -> int:
     """The number of images of a model, from the head of images.bin or the lines of images.txt."""
-    file = _files(folder)["images"]
+    file = model_files(folder)["images"]
     if file.suffix == ".txt":
         return _count_text(file)
     with file.open("rb") as stream:
@@ -117,7 +117,7 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: a file is missing, truncated or corrupt, a camera model is unknown, or there are no points.
     """
-    files = _files(folder)
+    files = model_files(folder)
     if _suffix(folder) == ".bin":
         check_binary(folder)
     reconstruction = _reconstruction(folder)
@@ -163,7 +163,12 @@ def _suffix(folder: Path) -> str:
     return next((suffix for suffix in (".bin", ".txt") if (folder / f"cameras{suffix}").is_file()), "")
 
 
-def _files(folder: Path) -> dict[str, Path]:
+def model_files(folder: Path) -> dict[str, Path]:
+    """Files that every model has, by what they hold.
+
+    Raises:
+        InputError: one is missing.
+    """
     files = {name: folder / f"{name}{_suffix(folder)}" for name in REQUIRED}
     for file in files.values():
         if not file.is_file():

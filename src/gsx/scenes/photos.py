@@ -1,9 +1,6 @@
 """Scenes from a folder with nothing but photos: reconstructed once, kept in the cache, then a COLMAP scene."""
 
 import logging
-import os
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -11,16 +8,16 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from gsx.core.cache import cache_folder, content_key, enlist, file_stamp, listed, make_folder, whole
+from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.data.images import image_size
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError, nearest
-from gsx.core.files import own_mark
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
+from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.posed import named, refuse_partial
@@ -142,33 +139,13 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path
     final = cache_folder("sfm", _key(folder, sizes, options))
     if intact(final):
         logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
-        return final
-    make_folder(final.parent)
-    with tempfile.TemporaryDirectory(".partial", f".{final.name}.{own_mark()}-", final.parent) as work:
-        best = sfm.reconstruct(folder, sizes, options, Path(work))
+
+    def make(work: Path) -> Any:
+        best = sfm.reconstruct(folder, sizes, options, work)
         _refuse_nothing(best, folder, sizes)
-        model = make_folder(Path(work) / "model")
-        best.write_binary(model)
-        enlist(*model.iterdir())
-        _publish(model, final)
-    return final
+        return best
 
-
-def intact(final: Path) -> bool:
-    """Whether there is a model in the cache, and all its files are as they were written."""
-    names = listed(final)
-    return bool(names) and all(whole(final / name) for name in names)
-
-
-def _publish(model: Path, final: Path) -> None:
-    """Move the finished model to its place, unless another process has finished the same in the meantime."""
-    if final.is_dir() and not intact(final):
-        shutil.rmtree(final, ignore_errors=True)
-    try:
-        os.rename(model, final)
-    except OSError:
-        if not intact(final):
-            raise
+    return kept_model(final, make)
 
 
 def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> str:

@@ -64,7 +64,7 @@ def reconstruct(folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> 
     """
     database, sparse = work / "database.db", work / "sparse"
     sparse.mkdir()
-    with _quiet():
+    with quiet():
         import_photos(database, folder, sizes, options)
         _extract(database, folder, sizes, options)
         _match(database, len(sizes), options)
@@ -211,7 +211,7 @@ def watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep COLMAP's own log off the terminal: progress is told here, errors are raised, lost photos are named."""
     import pycolmap
 

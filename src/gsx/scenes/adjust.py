@@ -1,0 +1,217 @@
+"""Poses, intrinsics and points of a COLMAP model anew from its own observations, where these contradict it.
+
+The cameras of a model that another program wrote, or that was put together by hand, may miss what they observed by the
+same movement everywhere in a picture: a wrong pose, focal length or lens. That is told apart from what each keypoint is
+off by on its own: a movement fitted to every other keypoint of an image has to explain those in between. COLMAP's
+bundle adjustment then moves cameras and points to where they explain the observations best.
+
+A model that learns from the photographs cannot do this: it takes a wrong lens in, by points at wrong depths, and no
+photograph contradicts it.
+"""
+
+import copy
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.cache import cache_folder, content_key, file_stamp
+from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.shapes import Float
+from gsx.scenes.colmap_model import Model, ModelImage, model_files, read_model
+from gsx.scenes.kept_models import kept_model
+from gsx.scenes.sfm import quiet
+from gsx.scenes.undistort import pinhole_of, undistort_points
+
+logger = logging.getLogger(__name__)
+
+WHEN = ("never", "auto", "always")
+METHOD = "adjusted/1"
+"""Part of the cache key: raise the number when the adjustment changes."""
+LEAST = 32
+"""Observations of an image that tell its movement."""
+SHIFT = 0.25
+"""Px of the model's cameras, root of the mean square, from which on movements of whole pictures are wrong cameras."""
+BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}
+"""Cameras with distortion, by the same ones without."""
+
+
+def refuse_unknown(when: str) -> None:
+    """Raise ConfigError for a word that `scene.adjust` does not know."""
+    if when not in WHEN:
+        raise ConfigError(f"scene.adjust is '{when}', use one of {', '.join(WHEN)}.{nearest(when, WHEN)}")
+
+
+def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
+    """(the model, adjusted where that is wanted, a note that says so).
+
+    Raises:
+        InputError: a file of it is missing, or nothing could be solved.
+    """
+    if when == "never":
+        return model, []
+    before = shift_of(model)
+    if when == "auto" and not (before is not None and before > SHIFT):
+        return model, [f"Nothing is adjusted: {fit_told(before)} (scene.adjust=auto)."]
+    stamps = [file_stamp(file) for file in model_files(model.folder).values()]
+    key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
+    after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
+    return after, [
+        f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_told(before)}, then "
+        f"{fit_told(shift_of(after))}{lenses_told(model, after)}."
+    ]
+
+
+def fit_told(shift: float | None) -> str:
+    """How cameras fit what they observed, in words."""
+    return "too few observations tell" if shift is None else f"pictures lie {shift:.2f} px beside what cameras observed"
+
+
+def fit_line(model: Model) -> str:
+    """The same of a model, with what to do about it."""
+    shift = shift_of(model)
+    wrong = shift is not None and shift > SHIFT
+    return fit_told(shift) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
+
+
+def installed() -> str:
+    """The version of COLMAP."""
+    import pycolmap
+
+    return str(pycolmap.__version__)
+
+
+def lenses_told(before: Model, after: Model) -> str:
+    """By how much focal lengths have changed, and which distortion was found, in words."""
+    ratios = [
+        after.cameras[number].mean_focal_length() / camera.mean_focal_length()
+        for number, camera in before.cameras.items()
+    ]
+    low, high = min(ratios), max(ratios)
+    bent = sum(after.cameras[number].model_name != camera.model_name for number, camera in before.cameras.items())
+    told = f"; focal lengths times {low:.4f}" + (f" to {high:.4f}" if high - low > 1e-4 else "")
+    return told + (f", lenses of {bent} cameras were bent" if bent else "")
+
+
+# -- do cameras fit what they observed? --------------------------------------------------------------------------------
+
+
+def shift_of(model: Model) -> float | None:
+    """Px of the model's cameras by which movements of whole pictures put points beside where they were observed: root
+    of the mean square over images; None where none tells."""
+    told = [found for image in model.images if (found := explained(image, model.cameras[image.camera_id])) is not None]
+    return math.sqrt(max(0.0, sum(told) / len(told))) if told else None
+
+
+def explained(image: ModelImage, intrinsics: Any) -> float | None:
+    """Mean square of the movement that half the keypoints of an image tell of the other half, px; may be negative where
+    they contradict each other. None: too few."""
+    pinhole = pinhole_of(intrinsics)
+    points = image.observed @ image.rotation.T + image.translation
+    seen = points[:, 2] > 0
+    x, y, z = points[seen].T
+    if len(z) < LEAST:
+        return None
+    observed = undistort_points(intrinsics, pinhole, image.keypoints)[seen]
+    focal = observed.new_tensor([pinhole.focal_length_x, pinhole.focal_length_y])
+    centre = observed.new_tensor([pinhole.principal_point_x, pinhole.principal_point_y])
+    off = (observed - centre) / focal - torch.stack([x / z, y / z], 1)
+    columns = movements(x / z, y / z, z)
+    told = [told_of(columns, off, slice(start, None, 2), slice(1 - start, None, 2)) for start in range(2)]
+    return float(focal.square().mean()) * sum(told) / len(told)
+
+
+def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"]) -> Float[Tensor, "K 2 8"]:
+    """How directions move with a turn about each axis, a step along each, the focal length, and radial distortion."""
+    none, one, squared = torch.zeros_like(x), torch.ones_like(x), x * x + y * y
+    across = [-x * y, 1 + x * x, -y, one / z, none, -x / z, x, x * squared]
+    down = [-1 - y * y, x * y, x, none, one / z, -y / z, y, y * squared]
+    return torch.stack([torch.stack(across, -1), torch.stack(down, -1)], 1)
+
+
+def told_of(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], own: slice, other: slice) -> float:
+    """Mean product of what other observations are off by and what the movement of some says that they are."""
+    weights = 1 / (1 + off.square().sum(1) / off.square().sum(1).median().clamp_min(1e-18))
+    system = (columns[own] * weights[own, None, None]).flatten(0, 1).T @ columns[own].flatten(0, 1)
+    right = (columns[own] * weights[own, None, None]).flatten(0, 1).T @ off[own].flatten()
+    scale = system.diagonal().sqrt().clamp_min(1e-12)
+    held = system / scale / scale[:, None] + 1e-6 * torch.eye(len(scale), dtype=scale.dtype)
+    movement = torch.linalg.solve(held, right / scale) / scale
+    products = ((columns[other] @ movement) * off[other]).sum(1)
+    return float((weights[other] * products).sum() / weights[other].sum())
+
+
+# -- bundle adjustment -------------------------------------------------------------------------------------------------
+
+
+def bundle_adjusted(folder: Path) -> Any:
+    """The pycolmap.Reconstruction of a folder with cameras and points moved; cameras without distortion get some where
+    that moves what they observed.
+
+    Raises:
+        InputError: nothing could be solved.
+    """
+    import pycolmap
+
+    found = pycolmap.Reconstruction(folder)
+    logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
+    adjust(found, folder)
+    bent = with_distortion(found)
+    if bent is not None:
+        adjust(bent, folder)
+    return found if bent is None or bend_of(bent) <= SHIFT else bent
+
+
+def adjust(reconstruction: Any, folder: Path) -> None:
+    """Move cameras, focal lengths, distortion and points; on one thread, so that the bits are the same each time.
+
+    Raises:
+        InputError: nothing could be solved.
+    """
+    import pycolmap
+
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # some observations are of something else
+    options.ceres.solver_options.num_threads = 1
+    for number in reconstruction.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    with quiet():
+        summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    if not summary.is_solution_usable():
+        raise InputError(
+            f"The bundle adjustment of {folder} came to nothing ({summary.brief_report()}): set scene.adjust=never, or "
+            "reconstruct the photos with scene=photos."
+        )
+
+
+def with_distortion(reconstruction: Any) -> Any | None:
+    """A copy whose cameras without distortion could have some; None where there are none such."""
+    import pycolmap
+
+    out = copy.deepcopy(reconstruction)
+    straight = [camera for camera in out.cameras.values() if camera.model_name in BENT]
+    for camera in straight:
+        wider = pycolmap.Camera.create_from_model_name(
+            camera.camera_id, BENT[camera.model_name], 1.0, camera.width, camera.height
+        )
+        params = [*camera.params, *[0.0] * (len(wider.params) - len(camera.params))]
+        camera.model, camera.params = wider.model, params
+    return out if straight else None
+
+
+def bend_of(reconstruction: Any) -> float:
+    """Px by which distortion moves what was observed, root of the mean square."""
+    squares = []
+    for image in (reconstruction.image(number) for number in reconstruction.reg_image_ids()):
+        camera = reconstruction.cameras[image.camera_id]
+        seen = np.array([image.point2D(index).xy for index in image.get_observation_point2D_idxs()]).reshape(-1, 2)
+        focal = np.array([camera.focal_length_x, camera.focal_length_y])
+        straight = camera.cam_from_img(seen) * focal + [camera.principal_point_x, camera.principal_point_y]
+        squares.append(np.square(straight - seen).sum(1))
+    return float(np.sqrt(np.concatenate(squares).mean()))

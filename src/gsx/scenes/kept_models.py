@@ -1,0 +1,45 @@
+"""COLMAP models that take minutes to make, kept in the cache."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gsx.core.cache import enlist, listed, make_folder, whole
+from gsx.core.files import own_mark
+
+
+def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:
+    """The folder of a model in the cache; where it is not there whole, it is made.
+
+    make: what gives the pycolmap.Reconstruction, in an empty folder for its files. Raises what that raises.
+    """
+    if intact(final):
+        return final
+    make_folder(final.parent)
+    with tempfile.TemporaryDirectory(".partial", f".{final.name}.{own_mark()}-", final.parent) as work:
+        found = make(Path(work))
+        model = make_folder(Path(work) / "model")
+        found.write_binary(model)
+        enlist(*model.iterdir())
+        _publish(model, final)
+    return final
+
+
+def intact(final: Path) -> bool:
+    """Whether there is a model in the cache, and all its files are as they were written."""
+    names = listed(final)
+    return bool(names) and all(whole(final / name) for name in names)
+
+
+def _publish(model: Path, final: Path) -> None:
+    """Move the finished model to its place, unless another process has finished the same in the meantime."""
+    if final.is_dir() and not intact(final):
+        shutil.rmtree(final, ignore_errors=True)
+    try:
+        os.rename(model, final)
+    except OSError:
+        if not intact(final):
+            raise
