@@ -1,24 +1,27 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,covered,passed,blur,sky]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,adjust,covered,passed,blur,sky]
                                   [--only demo,fox] [--seeds 0,1] [--share 0.4]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
 `training.exposure.when=auto`, beside the scene as it is, with it. `light`: training photographs that are brighter
 towards a side, each towards another, with and without `training.exposure.grid=auto`, likewise. `poses`: training
-cameras turned by half a pixel and by two, with and without `training.poses.when=auto`, likewise. `covered`: something
-plain stands before a part of each training photograph, with and without `training.distractors.when=auto`, likewise;
-`passed`: somebody does in the built-in scene. `faults`: a tenth of the photographs are made worse, and what `gsx
-photographs` names is counted. `blur`: cameras move while they take photographs, with and without
+cameras turned by half a pixel and by two, with and without `training.poses.when=auto`, likewise. `adjust`: models of
+structure from motion whose cameras say something wrong, with and without `scene.adjust=auto`, likewise. `covered`:
+something plain stands before a part of each training photograph, with and without `training.distractors.when=auto`,
+likewise; `passed`: somebody does in the built-in scene. `faults`: a tenth of the photographs are made worse, and what
+`gsx photographs` names is counted. `blur`: cameras move while they take photographs, with and without
 `training.blur.when=auto`, beside the scene as it is. `sky`: what plain `gsx` trains, with and without
 `backbone.sky=auto`. Finished runs below --runs are not trained again.
 """
 
 import argparse
 import math
+import re
 import statistics
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -26,6 +29,7 @@ from gsx.builtin import plugins
 from gsx.core.data.disturbed import chosen, turn_of
 from gsx.core.files import read_json
 from gsx.experiments.runs.photographs import judge_photographs
+from measuring.wrong_models import wrong_model
 from zoom import (
     SUBJECTS,
     USUAL,
@@ -42,6 +46,8 @@ from zoom import (
 )
 
 ZOOMS = ("1", "4")
+MAKING = threading.Lock()
+"""Held while a model is made wrong, which is done once."""
 OWN = ("backbone=mip_splatting", "backbone.rates.shortened=0.4")
 FITTED = ("eval.colours=fitted",)
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
@@ -60,6 +66,14 @@ POSE_ARMS = {
     "2 px, auto": (*TWO, *CORRECTED),
 }
 """The same of poses."""
+ADJUSTED = ("scene.adjust=auto",)
+WRONG: dict[str, dict[str, float]] = {
+    "focal lengths 3 % too long": {"focal": 0.03},
+    "corners 3 % too far out": {"bend": 0.03},
+    "poses 0.5 px off": {"turn": 0.5},
+    "poses 2 px off": {"turn": 2.0},
+}
+"""What cameras of a model say wrongly (`measuring.wrong_models`); turns are px of a training picture."""
 COVERED = ("scene.disturb.covered=0.15",)
 UNCOVERED = ("training.distractors.when=auto",)
 COVERED_ARMS = {"as it is, auto": UNCOVERED, "covered": COVERED, "covered, auto": (*COVERED, *UNCOVERED)}
@@ -305,6 +319,61 @@ def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Poses that are wrong", columns, rows, note
 
 
+# -- models of structure from motion -----------------------------------------------------------------------------------
+
+
+def adjust_arms() -> list[str]:
+    """Names of the rows: as it is, and what is wrong, without and with adjustment."""
+    return ["as it is, auto", *(arm for wrong in WRONG for arm in (wrong, f"{wrong}, auto"))]
+
+
+def of_model(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Figures of a run from a model as it is or made wrong, by both protocols of poses, and what was done about it."""
+    auto, wish = arm.endswith("auto"), ["scene.max_reprojection_px=1000"]
+    wrong = dict(WRONG.get(arm.removesuffix(", auto"), {}))
+    if wrong:
+        downscale = next(int(word.partition("=")[2]) for word in SUBJECTS[scene] if "downscale" in word)
+        wrong |= {"turn": downscale * wrong["turn"]} if "turn" in wrong else {}
+        target = given.runs / "_".join(["wrong", scene, *(f"{key}_{value:g}" for key, value in wrong.items())])
+        with MAKING:
+            wish.append(f"scene.path={wrong_model(given.scenes / scene, target, **wrong)}")
+    found = figures(scene, seed, f"adjust {arm}", [*wish, *(ADJUSTED if auto else ())], "adjust", given)
+    notes = read_json(found["folder"] / "environment.json")["scene"]["notes"]
+    aligned = looked_at(found["folder"], "aligned", ["eval.poses=aligned"])
+    return found | {"note": next((note for note in notes if "adjust" in note), ""), "aligned": aligned}
+
+
+def adjust_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+    """Figures of one arm over seeds."""
+    found, wrong = by_arm[arm], arm.removesuffix(", auto")
+    row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
+    shifts = re.findall(r"([0-9.]+) px beside", found[0]["note"])
+    row["before"], row["after"] = [*shifts, "", ""][:2]
+    row["focal"] = "".join(re.findall(r"focal lengths times ([0-9.]+[0-9])", found[0]["note"]))
+    for zoom in ZOOMS:
+        row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
+        if arm.endswith("auto") and wrong in WRONG:
+            arms = [by_arm[name] for name in ("as it is, auto", wrong, arm)]
+            row[f"back{zoom}"] = told(shares_won(arms, "aligned", zoom), ".2f")
+    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+
+
+def adjust(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Models whose cameras say something wrong, and their adjustment."""
+    rows = rows_by_arm(dict.fromkeys(adjust_arms(), ()), of_model, adjust_row, scenes, given)
+    columns = [["scene", "scene"], ["name", "cameras of the model"], ["seeds", "seeds"]]
+    columns += [["before", "pictures lie beside, px"], ["after", "adjusted, px"], ["focal", "focal lengths times"]]
+    columns += [["aligned1", "x1"], ["aligned4", "x4"], ["back1", "won back at x1"], ["back4", "at x4"]]
+    columns += [["x1", "x1 as given"], ["x4", "x4 as given"]]
+    note = (
+        f"{given.share:g} of the steps; cameras of training and test views say something wrong, what they observed is "
+        "as it was; beside: px of the model's cameras; poses: px of training pictures (standard deviation along each "
+        "axis). PSNR on held-out views, of right halves from poses aligned by the left (as given: of whole views from "
+        "the poses of the model); means over seeds ± half their range."
+    )
+    return "Models whose cameras are wrong", columns, rows, note
+
+
 # -- distractors -------------------------------------------------------------------------------------------------------
 
 
@@ -418,6 +487,7 @@ WHAT: dict[str, Measure] = {
     "exposure": exposure,
     "light": light,
     "poses": poses,
+    "adjust": adjust,
     "covered": covered,
     "passed": passed,
     "faults": faults,
