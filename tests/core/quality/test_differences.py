@@ -5,7 +5,18 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.quality.distractors import BLOCK, LEAST, TIMES, Difference, difference_of, distractors_in, whole_of
+from gsx.core.quality.distractors import (
+    BLOCK,
+    LEAST,
+    PLAIN,
+    TIMES,
+    Difference,
+    difference_of,
+    distractors_in,
+    plain_parts,
+    whole_of,
+    with_plain_parts,
+)
 from gsx.core.training.captures import at_exposure
 
 SIZE = 64, 48
@@ -153,3 +164,59 @@ def test_single_blocks_go_and_weak_neighbours_come() -> None:
     expected = torch.zeros(8, 12, dtype=torch.bool)
     expected[4, 4:8] = expected[4, 3] = True
     assert torch.equal(whole_of(marked, weak), expected)
+
+
+def flooded(colours: Tensor, start: tuple[int, int]) -> set[tuple[int, int]]:
+    """Blocks that are reached from one over steps between colours that differ little."""
+    reached, edge = {start}, [start]
+    while edge:
+        y, x = edge.pop()
+        for other in ((y + 1, x), (y - 1, x), (y, x + 1), (y, x - 1)):
+            inside = 0 <= other[0] < colours.shape[1] and 0 <= other[1] < colours.shape[2]
+            if inside and other not in reached and (colours[:, *other] - colours[:, y, x]).abs().max() < PLAIN:
+                reached.add(other)
+                edge.append(other)
+    return reached
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plain_parts_are_those_that_a_flood_fills(seed: int) -> None:
+    """Of pictures of few colours, whose parts wind."""
+    generator = torch.Generator().manual_seed(seed)
+    colours = torch.randint(0, 2, (1, 14, 19), generator=generator).float().expand(3, -1, -1) * 0.5
+    colours = colours + 0.1 * PLAIN * torch.rand(3, 14, 19, generator=generator)
+    parts = plain_parts(colours)
+    for y in range(14):
+        for x in range(19):
+            alike = {tuple(place) for place in (parts == parts[y, x]).nonzero().tolist()}
+            assert alike == flooded(colours, (y, x))
+
+
+def test_a_thing_goes_as_a_whole_where_enough_of_it_is_marked() -> None:
+    """A plain coat of 40 blocks before a patterned wall; blocks of the wall are parts of their own."""
+    colours = torch.rand(3, 12, 10, generator=torch.Generator().manual_seed(0))
+    colours[:, 2:10, 3:8] = torch.tensor([0.8, 0.1, 0.1])[:, None, None]
+    parts, few, enough = plain_parts(colours), torch.zeros(12, 10, dtype=torch.bool), torch.zeros(12, 10).bool()
+    few[2:4, 3:8] = True
+    enough[2:5, 3:8] = True
+    enough[0, 0] = True
+    assert torch.equal(with_plain_parts(few, parts), few)
+    expected = enough.clone()
+    expected[2:10, 3:8] = True
+    assert torch.equal(with_plain_parts(enough, parts), expected)
+
+
+def test_what_the_model_has_learnt_of_a_plain_thing_is_found_with_the_rest() -> None:
+    """Half of it is in the render already, and differs nowhere."""
+    photographs = [shown(camera)[0] for camera in cameras()]
+    photographs[2] = photographs[2].clone()
+    photographs[2][:, 10:30, 20:40] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    pictures = [shown(camera) for camera in cameras()]
+    learnt = pictures[2][0].clone()
+    learnt[:, 10:20, 20:40] = photographs[2][:, 10:20, 20:40]
+    found = distractors_in([
+        difference_of(camera, learnt if n == 2 else image, depth, torch.ones(48, 64), photograph)
+        for n, (camera, (image, depth), photograph) in enumerate(zip(cameras(), pictures, photographs, strict=True))
+    ])  # fmt: skip
+    assert bool(found[2][5:15, 10:20].all())
+    assert not any(bool(marked.any()) for n, marked in enumerate(found) if n != 2)

@@ -13,7 +13,7 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import patch_of
 from gsx.core.data.scene import View
-from gsx.core.training.captures import differences
+from gsx.core.training.captures import differences, forget_distractors
 from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.execute import execute
@@ -144,6 +144,7 @@ def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photog
     assert all(torch.equal(a[name], b[name]) for name in a)
     told = [line for line in whole.curves if "distractor_seconds" in line]
     assert [line["step"] for line in told] == run.distractors.steps()
+    assert sum(line["forgotten"] for line in told) > 0
     found, covered, others = 0, 0, 0
     for view, own in zip(whole.photographed, whole.scene.train, strict=True):
         patch, counted = patch_of(view.name, 0.1), view.counted()
@@ -190,3 +191,22 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_path: Path) -> None:
+    """All but the first photograph count whole, and of that the left half does not."""
+    run = tiny_run(tmp_path, ["iterations=4"])
+    blocks = [torch.zeros(9, 12, dtype=torch.bool) for _ in run.scene.train]
+    blocks[0][:, :6] = True
+    before = run.backbone.table["means"].clone()
+    run.distractors.mark(blocks, run.step)
+    gone = forget_distractors(run)
+    left = {tuple(mean) for mean in run.backbone.table["means"].tolist()}
+    removed = torch.tensor([mean for mean in before.tolist() if tuple(mean) not in left])
+    assert 0 < gone == len(removed) < len(before) / 4
+    sees = torch.stack([view.camera.sees(removed) for view in run.scene.train]).sum(0)
+    assert float(sees.float().mean()) < 3  # of six: others would show them where they count
+    pixels, _ = run.scene.train[0].camera.project(removed)
+    assert float((pixels[:, 0] < 24).float().mean()) > 0.9
+    run.distractors.mark([torch.ones_like(one) for one in blocks], run.step)
+    assert forget_distractors(run) == 0  # a model of nothing is none

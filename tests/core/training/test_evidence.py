@@ -20,6 +20,7 @@ from gsx.core.training.evidence import (
     look,
     random_signs,
     removal_changes,
+    shown_weights,
     squared_changes,
 )
 from gsx.core.training.supersampling import FinerRaster, finer_raster
@@ -81,6 +82,28 @@ def test_errors_are_shared_by_blending_weights() -> None:
         weights = rasterize(replace(splats, colours=white), view.camera, RULES).image[0]
         assert float(found) == pytest.approx(float((weights * error).sum()), rel=1e-9)
     assert float(off.square().sum()) == pytest.approx(float(error.sum()), rel=1e-12)
+
+
+def test_weights_are_summed_where_pixels_do_not_count_and_everywhere() -> None:
+    """A splat's blending weights are what it alone adds, painted white before black; two splats make the second row."""
+    splats, camera = cloud(3), view_of(24, 16).camera
+    counted = torch.ones(16, 24, dtype=torch.bool)
+    counted[3:9, 5:14] = False
+    seen, drawn = (
+        look(splats, plain(camera), RULES, BACKGROUND),
+        DrawnSplats(splats=splats, rows=torch.tensor([0, 1, 1])),
+    )
+    hidden, shown = shown_weights(drawn, seen, counted, 2)
+    weights = []
+    for number in range(3):
+        painted = replace(splats, colours=torch.zeros_like(splats.colours).index_fill(0, torch.tensor([number]), 1.0))
+        weights.append(rasterize(painted, camera, RULES, background=0 * BACKGROUND).image[0])
+    by_row = torch.stack([weights[0], weights[1] + weights[2]])
+    torch.testing.assert_close(shown, by_row.sum((1, 2)))
+    torch.testing.assert_close(hidden, by_row[:, 3:9, 5:14].sum((1, 2)))
+    none, all_over = shown_weights(drawn, seen, None, 2)
+    assert not none.any()
+    torch.testing.assert_close(all_over, shown)
 
 
 def test_what_the_picture_loses_without_a_splat() -> None:

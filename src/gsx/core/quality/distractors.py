@@ -3,7 +3,8 @@
 A model of a static scene shows what photographs agree on. Where one of them differs from it by more than fine detail,
 and the photographs that see the same place do not, something was in the way (distractors: RobustNeRF, Sabour et al.
 2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here by the places that depth
-tells). Where others differ there as well it is the model that is wrong.
+tells). Where others differ there as well it is the model that is wrong. What is plain, a coat for example, goes as a
+whole (as clusters of features do there): a model that has learnt a piece of it differs little there.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
 from gsx.core.data.camera import Camera
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Bool, Float, Int
 
 BLOCK = 2
 """Px of a picture that are looked at as one: finer differences are detail that the model has yet to learn."""
@@ -35,6 +36,10 @@ FEWEST = 3
 """Blocks of a distractor, of the nine around each of its own."""
 GROWTH = 3
 """Rounds in which neighbours join that differ by half as much."""
+PLAIN = 0.02
+"""Blocks side by side whose colours differ by less, display values, are of one thing."""
+SHARE = 0.3
+"""Of a thing that is marked, from which on all of it is."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,6 +54,8 @@ class Difference:
     """Camera z, scene units; inf where nothing is."""
     counted: Bool[Tensor, "h w"]
     """Blocks of which all pixels count."""
+    colours: Float[Tensor, "3 h w"]
+    """Means of the photograph."""
 
     @cached_property
     def size_around(self) -> Float[Tensor, "h w"]:
@@ -79,6 +86,7 @@ def difference_of(
         size=off.abs().amax(0) * whole,
         depth=torch.where(weight > COVERED, z / weight.clamp_min(COVERED), torch.inf),
         counted=whole,
+        colours=by_block(photograph),
     )
 
 
@@ -91,7 +99,8 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
     for number, own in enumerate(differences):
         order = (centres - centres[number]).norm(dim=1).argsort(stable=True)
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
-        found.append(whole_of(alone(own, others, least), own.size > least / 2))
+        marked = whole_of(alone(own, others, least), own.size > least / 2)
+        found.append(with_plain_parts(marked, plain_parts(own.colours)))
     return found
 
 
@@ -142,3 +151,31 @@ def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Ten
 def spread(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """The largest of each block and those around it."""
     return max_pool2d(values[None], 3, 1, 1)[0]
+
+
+# -- plain things ------------------------------------------------------------------------------------------------------
+
+
+def plain_parts(colours: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
+    """A number for each part of a picture in which colours change little from block to block: that of its first."""
+    height, width = colours.shape[1:]
+    labels = torch.arange(height * width).reshape(height, width)
+    every, first, rest = slice(None), slice(None, -1), slice(1, None)
+    pairs = [((first, every), (rest, every)), ((every, first), (every, rest))]
+    alike = [(colours[:, *one] - colours[:, *other]).abs().amax(0) < PLAIN for one, other in pairs]
+    while True:
+        before = labels.clone()
+        for same, (one, other) in zip(alike, pairs, strict=True):
+            for here, there in ((one, other), (other, one)):
+                labels[here] = torch.where(same, torch.minimum(labels[here], labels[there]), labels[here])
+        labels = labels.flatten()[labels]
+        if torch.equal(labels, before):
+            return labels
+
+
+def with_plain_parts(marked: Bool[Tensor, "h w"], parts: Int[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Marked blocks, and parts of the picture of which so many are marked that all of them are meant."""
+    numbers = parts.flatten()
+    count = numbers.bincount(minlength=len(numbers))
+    hits = numbers.bincount(marked.flatten().double(), minlength=len(numbers))
+    return marked | (hits > SHARE * count)[parts]

@@ -16,7 +16,9 @@ from gsx.core.quality.motion_blur import Movement, movement_between
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.distractors import share_of
+from gsx.core.training.evidence import looked_at, shown_weights
 from gsx.core.training.exposure import log_gains
+from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.poses import spread_of_shifts
 from gsx.core.training.render import render
 from gsx.core.training.resolution import coarser
@@ -147,8 +149,30 @@ def judge_distractors(run: Run) -> dict[str, float]:
     marked = distractors_in([seen[view] for view in views]) if wanted else None
     told["distractors"] = distractors.mark(marked, run.step + 1)
     if wanted:
-        logger.info("step %d: %.1f %% of photographs do not count", run.step + 1, 100 * told["distractors"])
+        told["forgotten"] = forget_distractors(run)
+        logger.info(
+            "step %d: %.1f %% of photographs do not count; %d primitives that show these are removed",
+            *(run.step + 1, 100 * told["distractors"], told["forgotten"]),
+        )
     return told | {"distractor_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def forget_distractors(run: Run) -> int:
+    """Remove the primitives that are mostly shown where pixels of training photographs do not count; returns how many.
+    What they show was learnt before these were found."""
+    model, form, step = run.backbone, run.resolution.forming(run.model_step), run.model_step
+    hidden, shown = run.background.new_zeros(2, len(model.table))
+    for view in run.photographed:
+        run.refuse_if_stopping()
+        small = coarser(view, run.scene.reduction, SMALLER)
+        drawn, seen = looked_at(model, small.camera, form, run.background, step)
+        own, all_over = shown_weights(drawn, seen, small.counted(), len(model.table))
+        hidden, shown = hidden + own, shown + all_over
+    doomed = hidden > shown / 2
+    if bool(doomed.all()):
+        return 0
+    keep_rows(model.table, ~doomed)
+    return int(doomed.sum())
 
 
 def tell_share(share: float, needed: bool, step: int) -> None:

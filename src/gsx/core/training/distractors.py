@@ -27,11 +27,10 @@ class DistractorOptions:
     when: str = "never"
     """auto: where photographs show what others do not."""
     start: Share = 0.1
-    """Share of the steps after which that is judged, and distractors are found first: what was learnt of them until
-    then is not unlearnt soon."""
-    until: Share = 0.6
+    """Share of the steps after which that is judged, and distractors are found first."""
+    until: Share = 0.8
     """Share of the steps after which they are found last."""
-    times: Annotated[int, Range(1, 1000)] = 4
+    times: Annotated[int, Range(1, 1000)] = 6
     """How often they are, at shares that grow by the same factor."""
     share: Annotated[float, Range(0, 1)] = 0.02
     """`auto`: of the pictures that are judged by, from which on what shows a distractor does not count."""

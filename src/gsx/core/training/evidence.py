@@ -150,6 +150,16 @@ def drawn_errors(
     return sums
 
 
+def shown_weights(
+    drawn: Drawn, seen: Look, counted: Bool[Tensor, "H W"] | None, count: int
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """Blending weights of each row summed over pixels of a picture: (those that do not count, all)."""
+    everywhere = torch.ones_like(seen.image).detach()
+    hidden = torch.zeros_like(everywhere) if counted is None else blacked(everywhere, ~counted)
+    own, all_over = (by_row(drawn, error_sums(seen, part), count) for part in (hidden, everywhere))
+    return own / 3, all_over / 3
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Removal:
     """What N rows are worth to the pictures of some views."""
