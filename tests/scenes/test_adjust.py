@@ -1,6 +1,7 @@
 """Bundle adjustment of what a COLMAP model says: against the poses and lenses that its observations were made with."""
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +154,20 @@ def test_no_distortion_is_made_up(tmp_path: Path) -> None:
     assert scene.provenance["camera_models"] == ["PINHOLE"]
 
 
-def test_it_is_done_once_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lenses_that_are_no_lenses_are_told(tmp_path: Path) -> None:
+    found = synthesize()
+    for camera in found.cameras.values():
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [80.0, 32.0, 24.0, 1e9]
+    write_scene(found, tmp_path)
+    assert any(line.startswith("fit       The SIMPLE_RADIAL camera") for line in FORMAT.facts(tmp_path))
+
+
+def test_it_is_done_once_and_found_again(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scene(turned(synthesize(), 2.0), tmp_path)
     first = load(colmap_options(tmp_path, adjust="always"))
+    shutil.rmtree(cache / "adjusted")
+    anew = load(colmap_options(tmp_path, adjust="always"))
+    assert all(one.camera.draws_as(other.camera) for one, other in zip(first.train, anew.train, strict=True))
     monkeypatch.setattr(adjust, "bundle_adjusted", None)
     again = load(colmap_options(tmp_path, adjust="always"))
     assert all(one.camera.draws_as(other.camera) for one, other in zip(first.train, again.train, strict=True))

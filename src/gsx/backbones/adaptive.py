@@ -11,6 +11,7 @@ that all pixels are learnt from in the end. Test views play no part.
 
 import logging
 import math
+import sys
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -52,6 +53,9 @@ class AdaptiveOptions:
     discount: Annotated[float, Range(1e-6, 1)] = 0.2
     """So much of what is found during growth is left in the end: of gains, since other primitives count on the new
     ones and nothing has learnt without them; of errors, since learning goes on."""
+    judged: bool = True
+    """Whether what each event gains decides how fast growth goes on. Otherwise it is published growth, of which goes
+    what is not worth the price: where what is new comes to be worth something only later (anchors)."""
     rate: Annotated[float, Range(1e-6, 10)] = 0.15
     """Growth over a hundred steps, at first."""
     fastest: Annotated[float, Range(1e-6, 10)] = 0.4
@@ -116,7 +120,8 @@ class Adaptive:
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """That of the interval which the step belongs to, while there is something to judge."""
-        if not self.growing.start < step < self.growing.stop or self.ended(table):
+        over = self.ended(table) or not self.options.judged
+        if over or not self.growing.start < step < self.growing.stop:
             return None
         return self.windows(step).get(view)
 
@@ -133,12 +138,12 @@ class Adaptive:
         goes_on = not grew and float(model.table.record["removed_share"]) >= AGAIN
         found |= self.removed(model, step) if last or ends or goes_on else {}
         held = self.asked(model.table, step) - room_under(self.most, len(model.table))
-        return found | ({"withheld": held} if held > 0 else {})
+        return found | ({"withheld": held} if held > 0 and self.options.judged else {})
 
     def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Draw the validation windows with and without what the last event added."""
         table = model.table
-        before = None if self.ended(table) else undone(table)
+        before = None if self.ended(table) or not self.options.judged else undone(table)
         if before is None:
             return {}
         gain, error = self.gain(model, table, before, step)
@@ -252,8 +257,9 @@ class Adaptive:
 
     def asked(self, table: ParameterTable, step: int) -> int:
         """How many an event may add if no cap holds it; none at the last one, which nothing would judge."""
-        over = self.ended(table) or self.growing.passed(step) == 1
-        return 0 if over else max(1, round(self.share(table) * len(table)))
+        if self.ended(table) or self.growing.passed(step) == 1:
+            return 0
+        return max(1, round(self.share(table) * len(table))) if self.options.judged else sys.maxsize
 
     def plan(self) -> dict[str, Any]:
         """The price."""

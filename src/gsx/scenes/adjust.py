@@ -73,7 +73,10 @@ def fit_told(shift: float | None) -> str:
 
 def fit_line(model: Model) -> str:
     """The same of a model, with what to do about it."""
-    shift = shift_of(model)
+    try:
+        shift = shift_of(model)
+    except InputError as problem:  # of a lens
+        return str(problem)
     wrong = shift is not None and shift > SHIFT
     return fit_told(shift) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
 
