@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -394,6 +395,18 @@ def worth(*squares: float) -> Removal:
     return Removal(squares=worths, shown=torch.ones_like(worths), error_share=1e9, rounding_share=0.0)
 
 
+def test_unjudged_growth_is_published_growth_of_which_goes_what_no_picture_needs() -> None:
+    scene, model = half_of_it_faint()
+    own = Adaptive(AdaptiveOptions(judged=False), small_context(scene), PUBLISHED, 1000)
+    assert own.room(model.table, sys.maxsize, 700) == 1000 - len(model.table)
+    assert own.judge(model, lambda table: pytest.fail("nothing is tried"), 700) == {}
+    assert all(own.validation_window(model.table, view, 650) is None for view in scene.train)
+    assert own.room(model.table, sys.maxsize, 14900) == 0
+    before = len(model.table)
+    assert own.judge(model, lambda table: None, 14900) == {"removed": before - len(model.table)}
+    assert len(model.table) < before
+
+
 def test_at_most_three_quarters_of_the_rows_go_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """None of five is worth the price beside the others: the three go that are worth least."""
     monkeypatch.setattr("gsx.backbones.adaptive.worth_in_training", lambda *_: worth(3.0, 1.0, 4.0, 0.5, 9.0))
@@ -530,7 +543,13 @@ DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
     [
         (("backbone=gs3d", "backbone.sh_judged=0.5"), "density"),
         (("backbone=octree_gs3d", "backbone.densification=clone_split"), "clone_split.density"),
-        (("backbone=scaffold", "backbone.growth.observe_from=0", "backbone.growth.success=0.1"), "growth"),
+        (
+            (
+                *("backbone=scaffold", "backbone.adaptive.judged=true"),
+                *("backbone.growth.observe_from=0", "backbone.growth.success=0.1"),
+            ),
+            "growth",
+        ),
     ],
     ids=["free", "levels", "anchors"],
 )

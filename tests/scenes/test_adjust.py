@@ -147,6 +147,16 @@ def test_distortion_is_found_where_cameras_do_not_fit_without(tmp_path: Path) ->
     assert any("OPENCV cameras of 640x480 are undistorted" in note for note in scene.notes)
 
 
+def test_the_distortion_of_other_cameras_is_none_of_these(tmp_path: Path) -> None:
+    """One lens is bent and known to be, another is straight and stays so."""
+    bent = synthesize("OPENCV", (*(10 * x for x in PINHOLE), 0.2, 0.0, 0.0, 0.0), frames=8, size=(640, 480))
+    write_scene(straightened(bent), tmp_path / "bent")
+    found = adjust.bundle_adjusted(tmp_path / "bent" / "sparse" / "0")
+    [number] = found.cameras
+    assert adjust.bend_of(found, [number]) > 0.25
+    assert adjust.bend_of(found, [number + 1]) == 0
+
+
 def test_no_distortion_is_made_up(tmp_path: Path) -> None:
     write_scene(noisy(turned(synthesize(frames=8), 2.0), 0.3), tmp_path)
     scene = load(colmap_options(tmp_path, adjust="auto"))

@@ -12,6 +12,7 @@ photograph contradicts it.
 import copy
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,10 +164,12 @@ def bundle_adjusted(folder: Path) -> Any:
     found = pycolmap.Reconstruction(folder)
     logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
     adjust(found, folder)
-    bent = with_distortion(found)
-    if bent is not None:
-        adjust(bent, folder)
-    return found if bent is None or bend_of(bent) <= SHIFT else bent
+    straight = [number for number, camera in found.cameras.items() if camera.model_name in BENT]
+    if not straight:
+        return found
+    bent = with_distortion(found, straight)
+    adjust(bent, folder)
+    return bent if bend_of(bent, straight) > SHIFT else found
 
 
 def adjust(reconstruction: Any, folder: Path) -> None:
@@ -193,28 +196,30 @@ def adjust(reconstruction: Any, folder: Path) -> None:
         )
 
 
-def with_distortion(reconstruction: Any) -> Any | None:
-    """A copy whose cameras without distortion could have some; None where there are none such."""
+def with_distortion(reconstruction: Any, straight: Sequence[int]) -> Any:
+    """A copy in which cameras of these numbers, which have no distortion, could have some."""
     import pycolmap
 
     out = copy.deepcopy(reconstruction)
-    straight = [camera for camera in out.cameras.values() if camera.model_name in BENT]
-    for camera in straight:
+    for camera in (out.cameras[number] for number in straight):
         wider = pycolmap.Camera.create_from_model_name(
             camera.camera_id, BENT[camera.model_name], 1.0, camera.width, camera.height
         )
         params = [*camera.params, *[0.0] * (len(wider.params) - len(camera.params))]
         camera.model, camera.params = wider.model, params
-    return out if straight else None
+    return out
 
 
-def bend_of(reconstruction: Any) -> float:
-    """Px by which distortion moves what was observed, root of the mean square."""
-    squares = []
+def bend_of(reconstruction: Any, cameras: Sequence[int]) -> float:
+    """Px by which distortion moves what cameras of these numbers observed, root of the mean square."""
+    squares = [np.zeros(0)]
     for image in (reconstruction.image(number) for number in reconstruction.reg_image_ids()):
+        if image.camera_id not in cameras:
+            continue
         camera = reconstruction.cameras[image.camera_id]
         seen = np.array([image.point2D(index).xy for index in image.get_observation_point2D_idxs()]).reshape(-1, 2)
         focal = np.array([camera.focal_length_x, camera.focal_length_y])
         straight = camera.cam_from_img(seen) * focal + [camera.principal_point_x, camera.principal_point_y]
         squares.append(np.square(straight - seen).sum(1))
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    moved = np.concatenate(squares)
+    return float(np.sqrt(moved.mean())) if len(moved) else 0.0
