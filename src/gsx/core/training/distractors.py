@@ -32,7 +32,7 @@ class DistractorOptions:
     """Share of the steps after which they are found last."""
     times: Annotated[int, Range(1, 1000)] = 6
     """How often they are, at shares that grow by the same factor."""
-    share: Annotated[float, Range(0, 1)] = 0.02
+    share: Annotated[float, Range(0, 1)] = 0.03
     """`auto`: of the pictures that are judged by, from which on what shows a distractor does not count."""
     views: Annotated[int, Range(3, 10**6)] = 24
     """Photographs that are judged by, at most."""
