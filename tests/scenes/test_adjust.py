@@ -148,7 +148,7 @@ def test_distortion_is_found_where_cameras_do_not_fit_without(tmp_path: Path) ->
 
 
 def test_the_distortion_of_other_cameras_is_none_of_these(tmp_path: Path) -> None:
-    """One lens is bent and known to be, another is straight and stays so."""
+    """A lens that is found to be bent; of a camera that has no photographs nothing is told."""
     bent = synthesize("OPENCV", (*(10 * x for x in PINHOLE), 0.2, 0.0, 0.0, 0.0), frames=8, size=(640, 480))
     write_scene(straightened(bent), tmp_path / "bent")
     found = adjust.bundle_adjusted(tmp_path / "bent" / "sparse" / "0")

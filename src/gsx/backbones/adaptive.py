@@ -120,8 +120,7 @@ class Adaptive:
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
         """That of the interval which the step belongs to, while there is something to judge."""
-        over = self.ended(table) or not self.options.judged
-        if over or not self.growing.start < step < self.growing.stop:
+        if not self.growing.start < step < self.growing.stop or not self.tries(table):
             return None
         return self.windows(step).get(view)
 
@@ -143,7 +142,7 @@ class Adaptive:
     def tried(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Draw the validation windows with and without what the last event added."""
         table = model.table
-        before = None if self.ended(table) or not self.options.judged else undone(table)
+        before = undone(table) if self.tries(table) else None
         if before is None:
             return {}
         gain, error = self.gain(model, table, before, step)
@@ -250,6 +249,10 @@ class Adaptive:
     def ended(self, table: ParameterTable) -> bool:
         """Whether growth has become too slow to go on."""
         return self.rate(table) < self.options.slowest
+
+    def tries(self, table: ParameterTable) -> bool:
+        """Whether events are tried by what they gain."""
+        return self.options.judged and not self.ended(table)
 
     def room(self, table: ParameterTable, wanted: int, step: int) -> int:
         """A share of the primitives while growth pays, up to the cap."""

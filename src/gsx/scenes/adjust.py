@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import cache_folder, content_key, file_stamp
-from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 from gsx.scenes.colmap_model import Model, ModelImage, model_files, read_model
 from gsx.scenes.kept_models import kept_model
@@ -39,12 +39,6 @@ SHIFT = 0.25
 """Px of the model's cameras, root of the mean square, from which on movements of whole pictures are wrong cameras."""
 BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}
 """Cameras with distortion, by the same ones without."""
-
-
-def refuse_unknown(when: str) -> None:
-    """Raise ConfigError for a word that `scene.adjust` does not know."""
-    if when not in WHEN:
-        raise ConfigError(f"scene.adjust is '{when}', use one of {', '.join(WHEN)}.{nearest(when, WHEN)}")
 
 
 def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
@@ -139,9 +133,10 @@ def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"
 
 def told_of(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], own: slice, other: slice) -> float:
     """Mean product of what other observations are off by and what the movement of some says that they are."""
-    weights = 1 / (1 + off.square().sum(1) / off.square().sum(1).median().clamp_min(1e-18))
-    system = (columns[own] * weights[own, None, None]).flatten(0, 1).T @ columns[own].flatten(0, 1)
-    right = (columns[own] * weights[own, None, None]).flatten(0, 1).T @ off[own].flatten()
+    squares = off.square().sum(1)
+    weights = 1 / (1 + squares / squares.median().clamp_min(1e-18))
+    weighted = (columns[own] * weights[own, None, None]).flatten(0, 1).T
+    system, right = weighted @ columns[own].flatten(0, 1), weighted @ off[own].flatten()
     scale = system.diagonal().sqrt().clamp_min(1e-12)
     held = system / scale / scale[:, None] + 1e-6 * torch.eye(len(scale), dtype=scale.dtype)
     movement = torch.linalg.solve(held, right / scale) / scale

@@ -16,11 +16,11 @@ from gsx.core.errors import InputError
 from gsx.core.files import is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
-from gsx.scenes.adjust import adjusted, fit_line, refuse_unknown
+from gsx.scenes.adjust import WHEN, adjusted, fit_line
 from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.posed import (
     MIN_IMAGES,
     Shot,
@@ -59,7 +59,7 @@ def load(options: ColmapOptions) -> Scene:
         ConfigError: an option has no such value.
         InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
     """
-    refuse_unknown(options.adjust)
+    refuse_other("adjust", options.adjust, WHEN)
     path = Path(options.path).expanduser()
     folder, notes = find_model(path)
     model, adjustment = adjusted(read_model(folder), options.adjust)

@@ -1,8 +1,10 @@
 """What every loader of photographs can be told; the values and their sources are in conf/scene/*.yaml."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from gsx.core.errors import ConfigError, nearest
 from gsx.core.options import without_effect
 from gsx.core.ranges import Gigabytes, Range, Share, Steps
 
@@ -48,3 +50,9 @@ class SceneOptions:
     """auto | alpha | none: which pixels of photographs count (gsx.scenes.masked)."""
     split: str = "every:8"
     """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
+
+
+def refuse_other(key: str, word: str, known: Sequence[str]) -> None:
+    """Raise ConfigError for a word that is none of those that an option of scenes knows."""
+    if word not in known:
+        raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(known)}.{nearest(word, known)}")

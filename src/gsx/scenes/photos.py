@@ -12,14 +12,14 @@ from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.data.images import image_size
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
-from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.errors import InputError
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
 from gsx.scenes.colmap_model import Model, read_model
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.posed import named, refuse_partial
 
 logger = logging.getLogger(__name__)
@@ -68,9 +68,7 @@ def refuse_unknown(options: sfm.SfmOptions) -> None:
     models = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
     choices = {"matcher": MATCHERS, "camera_mode": CAMERA_MODES, "camera_model": models}
     for key, known in choices.items():
-        word = getattr(options, key)
-        if word not in known:
-            raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(known)}.{nearest(word, known)}")
+        refuse_other(key, getattr(options, key), known)
 
 
 def find_photos(path: Path) -> tuple[Path, list[str]]:
@@ -139,6 +137,7 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path
     final = cache_folder("sfm", _key(folder, sizes, options))
     if intact(final):
         logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
+        return final
 
     def make(work: Path) -> Any:
         best = sfm.reconstruct(folder, sizes, options, work)

@@ -155,9 +155,10 @@ def shown_weights(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """Blending weights of each row summed over pixels of a picture: (those that do not count, all)."""
     everywhere = torch.ones_like(seen.image).detach()
-    hidden = torch.zeros_like(everywhere) if counted is None else blacked(everywhere, ~counted)
-    own, all_over = (by_row(drawn, error_sums(seen, part), count) for part in (hidden, everywhere))
-    return own / 3, all_over / 3
+    all_over = by_row(drawn, error_sums(seen, everywhere), count) / 3
+    if counted is None:
+        return torch.zeros_like(all_over), all_over
+    return by_row(drawn, error_sums(seen, blacked(everywhere, ~counted)), count) / 3, all_over
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
