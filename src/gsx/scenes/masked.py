@@ -10,9 +10,9 @@ from gsx.core.data.masks import Mask
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
-from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.errors import InputError
 from gsx.core.files import is_file
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
@@ -33,10 +33,7 @@ def mask_of(
         ConfigError: scene.masks has no such value.
         InputError: a mask that the scene names is not there, or has another shape than its photograph.
     """
-    if options.masks not in MASKS:
-        raise ConfigError(
-            f"scene.masks is '{options.masks}', use one of {', '.join(MASKS)}.{nearest(options.masks, MASKS)}"
-        )
+    refuse_other("masks", options.masks, MASKS)
     if options.masks == "none":
         return None
     if options.masks == "alpha":
