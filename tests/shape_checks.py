@@ -14,7 +14,7 @@ from typing import Any
 import jaxtyping
 from beartype import BeartypeConf, beartype
 
-FIRST, EVERY = 4, 64
+FIRST, EVERY = 2, 64
 """Calls in a test that are checked, and every EVERY-th of the others."""
 
 check = beartype(conf=BeartypeConf(is_pep484_tower=True))

@@ -28,6 +28,7 @@ OVERRIDES = (
     "scene.points=300",
     "scene.samples=1",
     "training.test_points=2",
+    "eval.flight=false",
     "device=cpu",
 )
 

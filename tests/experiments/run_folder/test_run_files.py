@@ -27,7 +27,7 @@ Change = Callable[[Path], object]
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of two steps, as the command line leaves it."""
     folder = tmp_path_factory.mktemp("files") / "run"
-    assert main(words(folder, *QUICK)) == 0
+    assert main(words(folder, *QUICK, "eval.flight=true")) == 0
     return folder
 
 

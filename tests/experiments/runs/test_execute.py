@@ -39,7 +39,7 @@ def resume(folder: Path, *overrides: str) -> None:
 def finished(tmp_path_factory) -> Path:
     """A finished tiny run of 24 steps, with density events and an opacity reset on the way."""
     folder = tmp_path_factory.mktemp("runs") / "whole"
-    tiny_run(folder, DENSE)
+    tiny_run(folder, [*DENSE, "eval.flight=true"])
     return folder
 
 
@@ -61,6 +61,14 @@ def test_a_run_leaves_everything_documented(finished: Path) -> None:
     assert sum(line.get("cloned", 0) + line.get("split", 0) for line in lines) > 0, "the test needs density events"
     assert any("opacity_resets" in line for line in lines), "the test needs an opacity reset"
     assert sum("test_psnr" in line for line in lines) == 2
+    flight = json.loads((finished / "renders" / "index.json").read_text())["flight"]
+    assert (finished / "renders" / flight["file"]).is_file()
+
+
+def test_the_flight_can_be_left_out(tmp_path: Path) -> None:
+    tiny_run(tmp_path / "run", ["iterations=1", "eval.flight=false"])
+    assert "flight" not in json.loads((tmp_path / "run" / "renders" / "index.json").read_text())
+    assert not list((tmp_path / "run" / "renders").glob("*flight*"))
 
 
 def test_evaluation_has_the_published_layout(finished: Path) -> None:

@@ -60,6 +60,8 @@ class EvalOptions:
     poses: str = "given"
     """given: views are drawn where the scene says; aligned: where the model says that they were taken, told from their
     left halves, and their right halves are judged."""
+    flight: bool = True
+    """Draw a flight into the finest detail, for the report."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 

@@ -17,7 +17,7 @@ NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 """Keys that name what other keys hold."""
 EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
-NEWER = {"supersample": 0, "colours": "rendered", "poses": "given"}
+NEWER = {"supersample": 0, "colours": "rendered", "poses": "given", "flight": True}
 """Keys of `eval` that older gsx did not have, as it looked at models."""
 
 

@@ -1,4 +1,4 @@
-"""From overrides to a composition: the only module that speaks to Hydra."""
+"""From overrides to a composition: the only module that speaks to Hydra, but for the files that Hydra reads."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -35,27 +35,12 @@ def hydra_session(plugins: Plugins) -> Iterator[None]:
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
 
-    register_search_paths(plugins)
+    from gsx.experiments.runs.config_files import register
+
+    register(plugins.config_paths)
     GlobalHydra.instance().clear()
     with initialize_config_module(MODULE, version_base="1.3"):
         yield
-
-
-def register_search_paths(plugins: Plugins) -> None:
-    """Let Hydra search the configuration packages of plugins."""
-    from hydra.core.config_search_path import ConfigSearchPath
-    from hydra.core.plugins import Plugins as HydraPlugins
-    from hydra.plugins.search_path_plugin import SearchPathPlugin
-
-    paths = plugins.config_paths
-
-    class PluginPaths(SearchPathPlugin):
-        def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-            for path in paths:
-                search_path.append(provider="gsx", path=path)
-
-    if paths:
-        HydraPlugins.instance().register(PluginPaths)
 
 
 @dataclass(frozen=True)
@@ -301,7 +286,9 @@ def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictCo
 
     import hydra
 
-    register_search_paths(plugins)
+    from gsx.experiments.runs.config_files import register
+
+    register(plugins.config_paths)
     sys.argv = ["gsx", *arguments]
     hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")(job)()
 

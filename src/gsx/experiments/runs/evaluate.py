@@ -7,7 +7,7 @@ from typing import Any
 from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run
@@ -26,7 +26,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
-    embellish(run, pictures, options.tile_pixels)
+    embellish(run, pictures, options)
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
@@ -37,15 +37,16 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     return evaluation
 
 
-def embellish(run: Run, pictures: Pictures, pixels: int) -> None:
+def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
     """Depth and a flight for the report; if they cannot be drawn, what was measured is kept all the same.
 
     Raises:
         InputError: they cannot be written, which is so of all that a run has to leave.
     """
     try:
-        add_depth(run, pictures, pixels)
-        add_flight(run, pictures, pixels)
+        add_depth(run, pictures, options.tile_pixels)
+        if options.flight:
+            add_flight(run, pictures, options.tile_pixels)
     except (RuntimeError, TooManyPairs, MemoryError) as error:
         logger.warning("the report has no depth or flight (%s)", first_line(error))
 

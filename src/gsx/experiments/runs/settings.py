@@ -1,9 +1,11 @@
 """A composed configuration, checked against typed schemas: mistakes get the nearest match. No Hydra here."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any
@@ -212,12 +214,32 @@ def chosen(kind: str, node: Any, plugins: Plugins, inner: str = "") -> Chosen:
     return Chosen(component=component, options=typed(component.options, node, f"{kind}.{inner}" if inner else kind))
 
 
+@dataclass(frozen=True)
+class Values:
+    """Plain values; equal where they are written alike, so that 1 is neither 1.0 nor true."""
+
+    plain: Any = field(compare=False)
+    text: str
+
+    @classmethod
+    def of(cls, plain: Any) -> "Values":
+        """Some values."""
+        return cls(plain, repr(plain))
+
+
 def typed(schema: type, values: Any, path: str) -> Any:
     """An instance of a dataclass from plain values; see `settings_from` for errors."""
+    return copy.deepcopy(checked(schema, Values.of(values), path))
+
+
+@lru_cache(maxsize=512)
+def checked(schema: type, given: Values, path: str) -> Any:
+    """As `typed`; kept, since most nodes of many compositions are the same."""
+    values = given.plain
     refuse_not_finite(values, path)
     try:
-        given = values if isinstance(values, dict) else {}
-        merged = OmegaConf.merge(writable(OmegaConf.structured(schema), given), OmegaConf.create(values or {}))
+        named = values if isinstance(values, dict) else {}
+        merged = OmegaConf.merge(writable(OmegaConf.structured(schema), named), OmegaConf.create(values or {}))
         plain: Any = OmegaConf.to_container(merged)
         for key, value, bounds in beyond_range(schema, plain):
             raise ConfigError(f"{f'{path}.{key}'.lstrip('.')} is {value}; give a number {bounds}")
