@@ -4,13 +4,15 @@ Where the host would have to wait for a GPU is counted, as are the kernels that 
 devices in one operation are refused as CUDA refuses them. What would be compiled runs as it stands and counts as one
 launch, though it may be several.
 
-    python tests/stand_in_gpu.py [--recorded|--broken] OVERRIDES   # steps on the CPU, then there: losses and counts
+    python tests/stand_in_gpu.py CASE [/ CASE]...   # steps on the CPU, then there: losses and counts of each case
+
+A CASE is [--recorded|--broken] OVERRIDES.
 """
 
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +24,6 @@ import torch
 from tiny import tiny_settings
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 from gsx.builtin import plugins
 from gsx.core.training.guard import Guard
@@ -43,8 +44,9 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
         "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "narrow", "diagonal",
         "_local_scalar_dense"}  # fmt: skip
 """Operations that launch nothing."""
-STEPS, RECORDED = 3, 15
-"""Steps taken, and steps where some are recorded: density control changes the model at the 12th of them."""
+STEPS, RECORDED, BROKEN = 3, 15, 5
+"""Steps taken; steps where some are recorded: density control changes the model at the 12th of them; and where none
+can be."""
 
 
 @dataclass
@@ -55,8 +57,15 @@ class Tally:
     launches: Counter[str] = field(default_factory=Counter)
     inside: str = ""
     """Compiled function under way."""
+    failed: int = 0
+    """Recordings."""
     recording: bool = False
     """A graph is recorded or replayed: the host has no part in it."""
+
+    def note(self, counts: Counter[str], name: str, so: bool) -> None:
+        """Count an operation, if it is so."""
+        if so:
+            counts[f"{name} {asked_by()}"] += 1
 
     def begin(self) -> None:
         """Count from here on."""
@@ -88,6 +97,20 @@ class OnDevice(Tensor):
         return torch.tensor(values, dtype=self.dtype).to(self.device)
 
 
+def mapped(change: Callable[[Any], Any], value: Any) -> Any:
+    """What operations take and give, changed: tensors and what else there is, and lists of these."""
+    return type(value)([mapped(change, one) for one in value]) if isinstance(value, list | tuple) else change(value)
+
+
+def tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
+    """All tensors of what an operation takes."""
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from tensors_in(value)
+
+
 def there(value: Any) -> Any:
     """The tensor, said to be on the device."""
     return OnDevice(value) if isinstance(value, Tensor) and not isinstance(value, OnDevice) else value
@@ -115,7 +138,7 @@ class Watched(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs, name = dict(kwargs or {}), func.overloadpacket.__name__
-        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+        tensors = list(tensors_in((*args, *kwargs.values())))
         ours = [value for value in tensors if isinstance(value, OnDevice)]
         asked = kwargs.get("device")
         onto = torch.device(asked).type == DEVICE.type if asked is not None else bool(ours)
@@ -127,22 +150,22 @@ class Watched(TorchDispatchMode):
         if moved:
             assert not self.tally.recording, f"{name} {asked_by()}: a copy between devices within a graph"
             waiting = not (kwargs.get("non_blocking") or (name == "copy_" and len(args) > 2 and args[2]))
-            self.tally.waits[f"{name} {asked_by()}"] += waiting
+            self.tally.note(self.tally.waits, name, waiting)
         else:
             refuse_two_devices(name, tensors)
             self.count(name, args, kwargs)
-        result = func(*tree_map(here, args), **tree_map(here, kwargs))
+        result = func(*mapped(here, args), **{key: mapped(here, value) for key, value in kwargs.items()})
         if func._schema.name.endswith("_") and args and isinstance(args[0], OnDevice):
             return args[0]
-        return tree_map(there, result) if onto else result
+        return mapped(there, result) if onto else result
 
     def count(self, name: str, args: Any, kwargs: dict[str, Any]) -> None:
         """One operation of tensors that lie there."""
-        indices = [value for value in tree_leaves(args[1:2]) if isinstance(value, Tensor)] if "index" in name else []
+        indices = list(tensors_in(args[1:2])) if "index" in name else []
         masked = any(value.dtype == torch.bool for value in indices)  # torch looks for the places that are marked
         sized = name == "repeat_interleave" and kwargs.get("output_size") is None
-        self.tally.waits[f"{name} {asked_by()}"] += name in READS or masked or sized
-        self.tally.launches[f"{name} {asked_by()}"] += name not in FREE and not self.tally.inside
+        self.tally.note(self.tally.waits, name, name in READS or masked or sized)
+        self.tally.note(self.tally.launches, name, name not in FREE and not self.tally.inside)
 
 
 def refuse_two_devices(name: str, tensors: list[Tensor]) -> None:
@@ -175,7 +198,7 @@ class Compiled(torch.autograd.Function):
         ]
         with one_launch(tally, ctx.name), torch.enable_grad():
             ctx.made = function(*ctx.given)
-        return tree_map(lambda value: value.detach() if isinstance(value, Tensor) else value, ctx.made)
+        return mapped(lambda value: value.detach() if isinstance(value, Tensor) else value, ctx.made)
 
     @staticmethod
     def backward(ctx, *by_made):
@@ -275,6 +298,7 @@ def recording(run: Run, tally: Tally, broken: bool) -> Recorder:
     def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
         if broken:
             work()
+            tally.failed += 1
             raise RuntimeError("operation not permitted when stream is capturing")
         again = Again(work, run.backbone.table, tally)
         return again.made, again
@@ -304,18 +328,46 @@ def steps(
     return losses
 
 
+@dataclass(frozen=True)
+class Case:
+    """What is asked of the device."""
+
+    words: list[str]
+    recorded: bool
+    broken: bool
+
+    @classmethod
+    def of(cls, words: list[str]) -> "Case":
+        """From words of the command line."""
+        flags = {word for word in words if word.startswith("--")}
+        return cls([w for w in words if w not in flags], recorded=bool(flags), broken="--broken" in flags)
+
+    @property
+    def count(self) -> int:
+        """Steps."""
+        return BROKEN if self.broken else RECORDED if self.recorded else STEPS
+
+    def on_cpu(self) -> list[Tensor]:
+        """Losses there."""
+        return steps([*self.words, "rasterizer=eager"], torch.device("cpu"))
+
+    def on_device(self, tally: Tally, own: list[Tensor]) -> dict[str, Any]:
+        """Losses of all kinds, and counts of the last step."""
+        words = [*self.words, "rasterizer=compiled"]
+        recorded, tally.failed = tally if self.recorded else None, 0
+        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.broken)}
+        counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy(), "failed": tally.failed}
+        found |= {"unrecorded": steps(words, DEVICE, self.count)} if recorded else {}
+        return {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()} | counts
+
+
 def main(words: list[str]) -> None:
-    """Losses on the CPU and there, and counts of the last step."""
-    flags, words = {word for word in words if word.startswith("--")}, [w for w in words if not w.startswith("--")]
-    broken, count = "--broken" in flags, RECORDED if flags else STEPS
-    own = steps([*words, "rasterizer=eager"], torch.device("cpu"))
-    words = [*words, "rasterizer=compiled"]
+    """What is told of each case, as JSON."""
+    cases = [Case.of(part.split("\n")) for part in "\n".join(words).split("\n/\n")]
+    own = [case.on_cpu() for case in cases]
     with stand_in() as tally, patch.object(build, "decide", lambda raster, *_: raster):
-        found = {"device": steps(words, DEVICE, count, tally.begin, tally if flags else None, broken)}
-        waits, launches = (dict((+of).most_common()) for of in (tally.waits, tally.launches))
-        found |= {"unrecorded": steps(words, DEVICE, count)} if flags else {}
-        losses = {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()}
-    print(json.dumps(losses | {"waits": waits, "launches": launches}, indent=1))
+        told = [case.on_device(tally, losses) for case, losses in zip(cases, own, strict=True)]
+    print(json.dumps(told, indent=1))
 
 
 if __name__ == "__main__":
