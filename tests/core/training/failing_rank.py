@@ -1,4 +1,4 @@
-"""`gsx` whose process $WHO goes wrong at step 5 in the way of $KIND; for torchrun."""
+"""`gsx` whose process $WHO goes wrong at step 5 in the way of $KIND."""
 
 import os
 import signal
@@ -28,5 +28,11 @@ def broken(run, number, *rest):
     return whole(run, number, *rest)
 
 
-trainer.view_loss = broken
-sys.exit(main())
+def fail() -> None:
+    """From now on."""
+    trainer.view_loss = broken
+
+
+if __name__ == "__main__":
+    fail()
+    sys.exit(main())

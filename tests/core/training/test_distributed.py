@@ -1,13 +1,16 @@
 """Two processes train one scene: the same bits as one process with the same batch, one voice, one set of files."""
 
 import json
+import multiprocessing
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,11 +30,11 @@ from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.build import placed, refuse_uneven
 
-COMMON = ("rasterizer=eager", "iterations=30", "training.batch=2", "training.checkpoint_every=12")
+COMMON = ("rasterizer=eager", "iterations=20", "training.batch=2", "training.checkpoint_every=8")
 GS3D = (*COMMON, "backbone.density.every=400", "backbone.density.reset_passes=1", "backbone.density.gradient=1e-6",
         "training.random_background=true")  # fmt: skip
 FEW = [f"augmenter.{name}.timing.{key}" for name in ("upscale", "bootstrap") for key in ("every=8000", "span=2500")]
-OCTREE = (*COMMON, "iterations=24", "backbone=octree_scaffold", "backbone.offsets=4", "scene.points=60",
+OCTREE = (*COMMON, "iterations=16", "backbone=octree_scaffold", "backbone.offsets=4", "scene.points=60",
           "backbone.growth.every=400", "backbone.growth.gradient=1e-5", "training.log_every=1",
           "augmenter=[upscale_paper,bootstrap]", "augmenter.upscale.scales=[2]", *FEW,
           "augmenter.bootstrap.freeze_shared=active",
@@ -65,6 +68,45 @@ def together(*words: str, program: tuple[str, ...] = ("-m", "gsx"), **environmen
     return called((*launcher, *program, *words), **environment)
 
 
+def as_rank(rank: int, words: Sequence[str], port: int, folder: Path, failing: dict[str, str]) -> None:
+    """One of two processes as torchrun starts them, in a process that has all imported."""
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"} | failing
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder / f"{name}{rank}", os.O_CREAT | os.O_WRONLY), number)
+    if failing:
+        import failing_rank
+
+        failing_rank.fail()
+    torch.set_num_threads(1)
+    sys.exit(main(list(words)))
+
+
+@pytest.fixture(scope="module")
+def forking() -> Any:
+    """Starts processes that have gsx and all it needs imported."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        ["torch._dynamo", "hydra.compose", "gsx.experiments.runs.job", "tiny", "small_scene"]
+    )
+    return context
+
+
+def both(context: Any, folder: Path, *words: str, **failing: str) -> subprocess.CompletedProcess:
+    """Two processes by themselves; what the first says, and what both complain of."""
+    folder.mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    ranks = [context.Process(target=as_rank, args=(rank, words, port, folder, failing)) for rank in (0, 1)]
+    for rank in ranks:
+        rank.start()
+    for rank in ranks:
+        rank.join(300)
+    said = ["".join((folder / f"{name}{rank}").read_text() for rank in (0, 1)) for name in ("out", "err")]
+    return subprocess.CompletedProcess(words, max(abs(rank.exitcode or 0) for rank in ranks), *said)
+
+
 def sentences(finished: subprocess.CompletedProcess) -> list[str]:
     """What gsx itself had to complain of; torchrun has more to say."""
     lines = finished.stderr.splitlines()
@@ -93,8 +135,8 @@ def files(folder: Path) -> set[str]:
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
 
-def test_two_processes_equal_one_and_resume_as_one(tmp_path: Path) -> None:
-    """gs3d with clones, splits, opacity resets and random backgrounds."""
+def test_two_processes_equal_one_and_resume_as_one(forking: Any, tmp_path: Path) -> None:
+    """gs3d with clones, splits, opacity resets and random backgrounds; the first two are torchrun's."""
     two = together(*OVERRIDES, *GS3D, f"output={tmp_path / 'two'}")
     assert two.returncode == 0, two.stderr
     (folder,) = (tmp_path / "two" / "demo" / "gs3d").iterdir()
@@ -110,22 +152,22 @@ def test_two_processes_equal_one_and_resume_as_one(tmp_path: Path) -> None:
     assert (folder / "log.txt").read_text().count("evaluating 2 test views") == 1
 
     shutil.copytree(folder, tmp_path / "killed")
-    for path in (tmp_path / "killed" / "checkpoints").glob("step_0000030.*"):
+    for path in (tmp_path / "killed" / "checkpoints").glob("step_0000020.*"):
         path.unlink()
     (tmp_path / "killed" / "evaluation.json").unlink()
-    again = together("resume", str(tmp_path / "killed"))
+    again = both(forking, tmp_path / "said", "resume", str(tmp_path / "killed"))
     assert again.returncode == 0, again.stderr
-    assert "at step 24" in again.stderr
+    assert "at step 16" in again.stderr
     assert_same(folder, tmp_path / "killed")
     assert files(folder) == files(tmp_path / "killed")
 
 
-def test_two_processes_judge_as_one(tmp_path: Path) -> None:
+def test_two_processes_judge_as_one(forking: Any, tmp_path: Path) -> None:
     """Growth that has to pay for itself, coarse pictures first, bands of colour judged: what the first finds holds."""
     judged = ("backbone.capacity=adaptive", "backbone.adaptive.price=0.01", "backbone.sh_judged=0.6")
-    coarse = ("scene.width=96", "scene.height=72", "training.coarse=2", "training.coarse_until=0.4")
+    coarse = ("iterations=26", "scene.width=64", "scene.height=48", "training.coarse=2", "training.coarse_until=0.4")
     words = (*OVERRIDES, *COMMON, "backbone.density.every=2500", *judged, *coarse)
-    two = together(*words, f"folder={tmp_path / 'two'}")
+    two = both(forking, tmp_path / "said", *words, f"folder={tmp_path / 'two'}")
     assert two.returncode == 0, two.stderr
     alone(*words, f"folder={tmp_path / 'one'}")
     told = [line for line in lines(tmp_path / "one") if "judged" in line or "degree_0" in line]
@@ -133,9 +175,9 @@ def test_two_processes_judge_as_one(tmp_path: Path) -> None:
     assert_same(tmp_path / "two", tmp_path / "one")
 
 
-def test_two_processes_with_networks_and_pseudo_views_equal_one(tmp_path: Path) -> None:
+def test_two_processes_with_networks_and_pseudo_views_equal_one(forking: Any, tmp_path: Path) -> None:
     """Growth across levels, and pseudo views that the first process makes for both."""
-    two = together(*OVERRIDES, *OCTREE, f"folder={tmp_path / 'two'}")
+    two = both(forking, tmp_path / "said", *OVERRIDES, *OCTREE, f"folder={tmp_path / 'two'}")
     assert two.returncode == 0, two.stderr
     alone(*OVERRIDES, *OCTREE, f"folder={tmp_path / 'one'}")
     assert_same(tmp_path / "two", tmp_path / "one")
@@ -149,10 +191,10 @@ def test_two_processes_with_networks_and_pseudo_views_equal_one(tmp_path: Path) 
 # -- what goes wrong ---------------------------------------------------------------------------------------------------
 
 
-def test_the_error_of_one_process_ends_both_with_one_sentence(tmp_path: Path) -> None:
+def test_the_error_of_one_process_ends_both_with_one_sentence(forking: Any, tmp_path: Path) -> None:
     words = (*OVERRIDES, *COMMON, f"folder={tmp_path / 'run'}")
-    failed = together(*words, program=(FAILING,), KIND="input", WHO="1")
-    assert failed.returncode == 1  # torchrun's, whatever the processes return
+    failed = both(forking, tmp_path / "said", *words, KIND="input", WHO="1")
+    assert failed.returncode != 0
     assert sentences(failed) == ["gsx: process 1 of 2 has stopped: a photograph cannot be read: mend it"]
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
     assert final(tmp_path / "run")  # of step 4, the last one taken
@@ -187,7 +229,7 @@ def test_a_stop_asked_of_one_process_stops_both_after_the_same_step(tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sentence"), [
     ("killed", "gsx: another process of this run has died without a word"),
-    ("drift", "gsx: ranks disagree at step 12"),
+    ("drift", "gsx: ranks disagree at step 8"),
 ])  # fmt: skip
 def test_a_process_that_dies_or_drifts_is_noticed(kind: str, sentence: str, tmp_path: Path) -> None:
     failed = together(*OVERRIDES, *COMMON, f"folder={tmp_path / 'run'}", program=(FAILING,), KIND=kind, WHO="1")
