@@ -11,7 +11,8 @@ PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 CPU_TORCH := https://download.pytorch.org/whl/cpu
 ANSWERS := $(BIN)/python -c 'from urllib.request import urlopen; urlopen("$(CPU_TORCH)/torch/", timeout=10)'
 # As many processes as cores, up to eight, with one thread each; a file's tests stay together and share what they set up.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
+# Compiled modules are kept, whatever the environment says: many tests start processes of their own.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 .PHONY: demo test test-slow test-faults test-faults-short test-times site lint wheel clean

@@ -1,5 +1,6 @@
 """Models of half of the training views each: what they are shown, what they show; the run goes on untouched."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -165,11 +166,26 @@ RUN = (
 )
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_a_run_killed_after_its_event_makes_the_same_of_it_again(kept: bool, tmp_path: Path) -> None:
-    """From the checkpoint of step 10, before the event at 12: with the file of half-models' renders, and without."""
-    whole, folder = tiny_run(tmp_path / "whole", RUN), tmp_path / "killed"
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """One that nothing happened to."""
+    return tiny_run(tmp_path_factory.mktemp("halves") / "whole", RUN)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stopped at step 13, after the event at 12."""
+    folder = tmp_path_factory.mktemp("halves") / "stopped"
     tiny_run(folder, RUN, stop_after=13)
+    return folder
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_run_killed_after_its_event_makes_the_same_of_it_again(
+    kept: bool, whole: Run, stopped: Path, tmp_path: Path
+) -> None:
+    """From the checkpoint of step 10, before the event at 12: with the file of half-models' renders, and without."""
+    folder = Path(shutil.copytree(stopped, tmp_path / "killed"))
     for path in (folder / "checkpoints").glob("step_0000013*"):
         path.unlink()
     (renders,) = (folder / "regenerators").glob("halves_0000012_4.safetensors")

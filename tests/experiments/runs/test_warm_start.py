@@ -15,7 +15,7 @@ from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
-       "training.checkpoint_every=100", "training.log_every=2")  # fmt: skip
+       "training.checkpoint_every=100", "training.log_every=2", "backbone.density.gradient=1e-3")  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
