@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import small_scene, spread
+from stopped_run import LIGHT, stopped_at
 from tiny import final_tensors, tiny_run
 from torch import Tensor
 
@@ -27,8 +28,6 @@ from gsx.core.training.backbone import Backbone, BackboneContext, remove_nonfini
 from gsx.core.training.parameter_table import gradients, size_of, table_tensors, zero_grad
 from gsx.core.training.resolution import Resolution
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.settings import Settings
 
 NAMES = ("scaffold", "octree_scaffold", "octree_gs3d")
@@ -390,8 +389,8 @@ def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: boo
 
 def test_growth_comes_134_times_in_the_published_run_and_234_with_levels() -> None:
     for name, calls, last in (("scaffold", 134, 14900), ("octree_scaffold", 234, 24900)):
-        backbone = small_anchors(name)
-        due = [step for step in range(1, 40001) if backbone.growing().due(step)]
+        growing = small_anchors(name).growing()
+        due = [step for step in range(1, 40001) if growing.due(step)]
         assert (len(due), due[0], due[-1]) == (calls, 1600, last)
 
 
@@ -539,7 +538,7 @@ def test_rows_that_are_not_finite_are_removed_with_all_that_is_theirs() -> None:
 
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
-RUN = ("iterations=14", "backbone.growth.every=400", "backbone.growth.gradient=1e-6", "training.checkpoint_every=50")
+RUN = (*LIGHT, "iterations=14", "backbone.growth.every=400", "backbone.growth.gradient=1e-6")
 MORE = {
     "scaffold": (
         "backbone.heads.bank=true",
@@ -592,12 +591,6 @@ def test_runs_grow_and_keep_everything(finished: tuple[str, Path]) -> None:
     assert wanted <= tensors.keys()
 
 
-def test_one_seed_gives_the_same_bits(finished: tuple[str, Path], tmp_path: Path) -> None:
-    name, folder = finished
-    tiny_run(tmp_path / "again", run_words(name))
-    assert_same(final_tensors(folder), final_tensors(tmp_path / "again"))
-
-
 def test_other_seeds_begin_with_other_networks() -> None:
     first, other = (dict(small_anchors("scaffold", seed=seed).table.networks.named()) for seed in (0, 1))
     assert not any(torch.equal(first[name], other[name]) for name in first)
@@ -606,7 +599,5 @@ def test_other_seeds_begin_with_other_networks() -> None:
 def test_resume_equals_never_having_stopped(finished: tuple[str, Path], tmp_path: Path) -> None:
     """Stopped between two growths: with anchors that grew, moments, and statistics on the way."""
     name, folder = finished
-    tiny_run(tmp_path / "run", run_words(name), stop_after=7)
-    run, settings = open_run(tmp_path / "run", plugins(), ())
-    execute(run, settings, plugins())
+    stopped_at(tmp_path / "run", run_words(name), 4)
     assert_same(final_tensors(folder), final_tensors(tmp_path / "run"))

@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
+from stopped_run import LIGHT, stopped_at
 from test_anchors import small_anchors
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
@@ -19,7 +21,6 @@ from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Budget, BudgetOptions, Growing, with_rows, worth_in_training
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
-from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import Scene, View
@@ -35,8 +36,6 @@ from gsx.core.training.parameter_table import ParameterTable, append_rows, detac
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
-from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import open_run
 
 PUBLISHED = Growing(500, 15000, 100)
 """3D-GS: steps 600, 700, ... 14900."""
@@ -71,10 +70,10 @@ def test_the_curve_of_a_budget_by_hand() -> None:
     assert budget.target(2000, 4) == 1500  # more points than primitives: the curve falls
 
 
-@pytest.mark.parametrize(("points", "primitives"), [(300, 500), (300, 120)])
+@pytest.mark.parametrize(("points", "primitives"), [(120, 200), (120, 50)])
 def test_a_budget_is_met(points: int, primitives: int, tmp_path: Path) -> None:
-    words = ("iterations=40", "backbone.capacity=budget", f"backbone.budget.primitives={primitives}", "eval.zoom=[1]")
-    run = tiny_run(tmp_path, (*words, f"scene.points={points}", "backbone.density.prune_opacity=0"))
+    words = (*LIGHT, "iterations=20", "backbone.capacity=budget", f"backbone.budget.primitives={primitives}")
+    run = tiny_run(tmp_path, (*words, f"scene.points={points}", "backbone.density.prune_opacity=0"), stop_after=12)
     assert len(run.backbone.table) == primitives
 
 
@@ -132,8 +131,15 @@ def test_a_window_lies_where_it_is_told() -> None:
 
 def test_training_does_not_see_validation_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Photographs white in their windows train to the same bits, until the windows move."""
-    words = ("iterations=30", "backbone.capacity=adaptive", "backbone.density.stop=29000", "rasterizer=eager")
-    plain = tiny_run(tmp_path / "plain", words, stop_after=5)
+    words = (
+        *LIGHT,
+        "scene.train_views=4",
+        "iterations=30",
+        "training.checkpoint_every=3",
+        "training.checkpoints_kept=9",
+    )
+    words = (*words, "backbone.capacity=adaptive", "backbone.density.stop=29000", "rasterizer=eager")
+    plain = tiny_run(tmp_path / "plain", words, stop_after=9)
     model, learnt_from = plain.backbone, Photographs.of
 
     def disturbed(self: Photographs, view: View) -> Tensor:
@@ -144,14 +150,11 @@ def test_training_does_not_see_validation_windows(tmp_path: Path, monkeypatch: p
         return out
 
     monkeypatch.setattr(Photographs, "of", disturbed)
-    tiny_run(tmp_path / "white", words, stop_after=5)
-    before, after = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "white")
+    tiny_run(tmp_path / "white", words, stop_after=9)
+    before, after = (load_file(tmp_path / name / "checkpoints/step_0000003.safetensors") for name in ("plain", "white"))
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
-    tiny_run(tmp_path / "later", words, stop_after=14)
-    monkeypatch.undo()
-    tiny_run(tmp_path / "whole", words, stop_after=14)
-    later, whole = final_tensors(tmp_path / "later"), final_tensors(tmp_path / "whole")
+    whole, later = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "white")
     assert not torch.equal(later["parameters.sh_dc"], whole["parameters.sh_dc"])
 
 
@@ -535,7 +538,7 @@ def test_reports_show_what_growth_gained() -> None:
 
 
 DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
-"""Events at steps 6, 12 and, of backbones published with 30,000 steps, 18 of 24."""
+"""Events at steps 3, 6 and, of backbones published with 30,000 steps, 9 of 12."""
 
 
 @pytest.mark.parametrize(
@@ -556,17 +559,14 @@ DENSE = ("start=0", "stop=28000", "gradient=1e-7", "every=1000")
 def test_adaptive_runs_resume_bit_for_bit(words: tuple[str, ...], part: str, tmp_path: Path) -> None:
     """What was found and decided is in the checkpoint."""
     dense = [f"backbone.{part}.{word}" for word in DENSE]
-    words = (*words, *dense, "iterations=24", "backbone.capacity=adaptive", "rasterizer=eager")
+    words = (*words, *dense, *LIGHT, "iterations=12", "backbone.capacity=adaptive", "rasterizer=eager")
     tiny_run(tmp_path / "whole", words)
     expected = final_tensors(tmp_path / "whole")
     assert len(expected["record.trials"]) > 0
     lines = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
     judged = [(line["step"], line["judged"], line["gain"]) for line in lines if "judged" in line]
     assert judged == [tuple(trial[[0, 1, 3]].tolist()) for trial in expected["record.trials"]]
-    for stop in (9, 13):
-        tiny_run(tmp_path / f"parts{stop}", words, stop_after=stop)
-        again, settings = open_run(tmp_path / f"parts{stop}", plugins(), ())
-        execute(again, settings, plugins())
-        found = final_tensors(tmp_path / f"parts{stop}")
-        assert expected.keys() == found.keys()
-        assert all(torch.equal(expected[name], found[name]) for name in expected)
+    stopped_at(tmp_path / "parts", words, 5, 7)
+    found = final_tensors(tmp_path / "parts")
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)

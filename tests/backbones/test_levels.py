@@ -173,10 +173,12 @@ def test_the_base_layer_has_cells_of_whole_pixels(pixels, base):
 def test_cells_in_pixels_where_a_level_is_drawn_first(mode, share):
     """Against a search for the farthest distance at which a camera draws each level."""
     levels, camera = single(count=4, mode=mode), camera_at(0, 0, 0)
-    distances = torch.linspace(0.2, 9, 20000).tolist()
-    highest = tops(levels, camera, distances)
+    distances = torch.linspace(0.2, 9, 20000)
     for level in range(1, 4):
-        farthest = max(d for d, top in zip(distances, highest, strict=True) if top >= level)
+        of = torch.full((len(distances),), level, dtype=torch.int16)
+        farthest = float(
+            distances[drawn(levels, at(*distances.tolist()), of, torch.zeros(len(of)), camera, 3)[0]].max()
+        )
         pixels = levels.size(level) * 50 / farthest / levels.pixels_per_cell
         assert pixels == pytest.approx(share, rel=0.01)
 

@@ -11,7 +11,8 @@ import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from small_scene import published_options, small_gs3d, small_scene, spread
-from tiny import OVERRIDES, final_tensors, tiny_run
+from stopped_run import LIGHT, stopped_at
+from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
@@ -39,15 +40,14 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 
 OPTIONS = MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=29900)
 UNIT = math.sqrt(0.2)
-DENSE = ("iterations=24", "eval.zoom=[1]", "backbone.density.every=400", "backbone.density.reset_passes=1",
-         "backbone.density.gradient=1e-6", "training.checkpoint_every=7", "backbone.density.absolute=true")  # fmt: skip
+DENSE = (*LIGHT, "iterations=12", "backbone.density.every=400", "backbone.density.reset_passes=1",
+         "backbone.density.gradient=1e-6", "training.checkpoint_every=4", "backbone.density.absolute=true")  # fmt: skip
 
 
 def axis_camera(fx: float = 100.0, *, cx: float = 50.0, fy: float = 80.0, cy: float = 20.0) -> Camera:
@@ -331,7 +331,8 @@ def test_sizes_are_computed_when_published(monkeypatch: pytest.MonkeyPatch, back
     monkeypatch.setattr(mip, "filter_sizes", counted)
     backbone = mip_gs3d(small_scene(spread(3), background=background))
     for step in range(1, 30001):
-        backbone.densify_and_prune(step)
+        if step % 100 in (0, 1, 50, 99):
+            backbone.densify_and_prune(step)
     assert steps == [0, *range(600, 15000, 100), *range(15100, 29900, 100)]
 
 
@@ -375,7 +376,7 @@ def test_a_reset_caps_what_is_drawn() -> None:
 LOGITS_AND_SCALES = st.lists(st.tuples(st.floats(-90, 90), st.floats(-20, 3)), min_size=1, max_size=20)
 
 
-@settings(deadline=None, max_examples=60, phases=[Phase.explicit, Phase.generate])
+@settings(deadline=None, max_examples=30, phases=[Phase.explicit, Phase.generate])
 @given(LOGITS_AND_SCALES, st.sampled_from([0.01, 1.0]))
 def test_a_reset_never_raises_an_opacity(rows: list[tuple[float, float]], highest: float) -> None:
     backbone = row_values([1.0] * len(rows), [0.5] * len(rows), reset_opacity=highest)
@@ -478,13 +479,13 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
         backbone.table["log_scales"].add_(1.0)
     truth = torch.zeros(12, dtype=torch.float64)
     for number, camera in enumerate(cameras_of(backbone)[:2]):
-        small = camera.resize(12, 8)
-        weights = torch.randn(3, 8, 12, generator=torch.Generator().manual_seed(number))
-        for pixel in range(96):
-            alone = torch.zeros(96).index_fill_(0, torch.tensor([pixel]), 1.0).view(8, 12)
+        small = camera.resize(9, 6)
+        weights = torch.randn(3, 6, 9, generator=torch.Generator().manual_seed(number))
+        for pixel in range(54):
+            alone = torch.zeros(54).index_fill_(0, torch.tensor([pixel]), 1.0).view(6, 9)
             screen = weighted_render(backbone, small, weights * alone, absolute=False)
             by_mean = screen.means2d_offset.grad.double().abs()
-            truth.index_add_(0, screen.ids, by_mean[:, 0] * 12 / 2 + by_mean[:, 1] * 8 / 2)
+            truth.index_add_(0, screen.ids, by_mean[:, 0] * 9 / 2 + by_mean[:, 1] * 6 / 2)
         drawn = backbone.draw(small, 1)
         picture = rasterize(drawn.splats, small, backbone.raster, absolute_gradient=True)
         (picture.image * weights).sum().backward()
@@ -510,7 +511,7 @@ def test_absolute_sums_are_saved_and_restored() -> None:
 
 
 def built(folder: Path, *overrides: str) -> Run:
-    composed = compose([*OVERRIDES, *overrides], plugins())
+    composed = tiny_settings(folder, *overrides)
     return build(composed, load_scene(composed), folder)
 
 
@@ -611,11 +612,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("stop", [5, 11, 13])
-def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path, stop: int) -> None:
-    tiny_run(tmp_path / "run", ("backbone=mip_splatting", *DENSE), stop_after=stop)
-    run, composed = open_run(tmp_path / "run", plugins())
-    execute(run, composed, plugins())
+def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path) -> None:
+    stopped_at(tmp_path / "run", ("backbone=mip_splatting", *DENSE), 2, 5, 7)
     whole, resumed = final_tensors(finished), final_tensors(tmp_path / "run")
     assert whole.keys() == resumed.keys()
     assert whole.keys() >= {"columns.filter", "statistics.absolute"}
@@ -630,9 +628,7 @@ TRUSTED = ("backbone=mip_splatting", *DENSE, "augmenter=upscale", "regenerator/u
 
 def test_what_pseudo_views_earned_stays_and_survives_an_interruption(tmp_path: Path) -> None:
     tiny_run(tmp_path / "whole", TRUSTED)
-    tiny_run(tmp_path / "run", TRUSTED, stop_after=13)
-    run, composed = open_run(tmp_path / "run", plugins(), (), training=True)
-    execute(run, composed, plugins())
+    run = stopped_at(tmp_path / "run", TRUSTED, 7)
     whole, resumed = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "run")
     assert whole.keys() == resumed.keys()
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
+from stopped_run import LIGHT
 from tiny import final_tensors, tiny_run
 from torch import Tensor
 
@@ -26,6 +27,8 @@ from gsx.experiments.runs.flight import depth_and_coverage
 from gsx.experiments.runs.open import open_run
 
 FAR = 200.0
+LIGHT_WITH_SKY = (*LIGHT, "scene.train_views=4", "scene.points=300")
+"""Of fewer views no two have sky in the same direction; a scene of fewer points is less wide than its sky."""
 
 
 @pytest.fixture
@@ -159,17 +162,19 @@ def test_without_need_training_is_bit_for_bit_that_without_a_sky(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sky, "OPEN", 1.0)
-    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
-    asked = tiny_run(tmp_path / "asked", ["iterations=12", "backbone.sky=auto"])
+    words = [*LIGHT_WITH_SKY, "iterations=14"]
+    plain = tiny_run(tmp_path / "plain", words, stop_after=5)
+    asked = tiny_run(tmp_path / "asked", [*words, "backbone.sky=auto"], stop_after=5)
     assert not_sky(asked.backbone.table).all()
+    assert len(sky.sky_of(asked.scene).points)
     for name, value in plain.backbone.table.parameters.items():
         assert torch.equal(value, asked.backbone.table[name]), name
 
 
 def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["backbone.sky=always", "iterations=60", "backbone.rates.shortened=0.4"]
+    words = [*LIGHT_WITH_SKY, "backbone.sky=always", "iterations=18", "backbone.rates.shortened=0.4"]
     whole = tiny_run(tmp_path / "whole", words)
-    tiny_run(tmp_path / "stopped", words, stop_after=40)
+    tiny_run(tmp_path / "stopped", words, stop_after=5)
     with monkeypatch.context() as looking:
         looking.setattr(sky, "sky_of", lambda scene: pytest.fail("a checkpoint tells what is sky"))
         run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
@@ -186,9 +191,10 @@ def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatc
 
 def test_depth_is_that_of_the_scene_alone(tmp_path: Path) -> None:
     """What is behind everything changes no weight before it: depth and alpha are those of a picture without it."""
-    run = tiny_run(tmp_path, ["backbone.sky=always", "iterations=12"])
+    run = tiny_run(tmp_path, [*LIGHT_WITH_SKY, "backbone.sky=always", "iterations=12"], stop_after=1)
     camera = run.scene.test[0].camera
     splats, near = splats_for(run, camera), not_sky(run.backbone.table)
+    assert not near.all()
     shown = render(run, camera, depth=True, supersample=1)
     alone = render(
         run, camera, splats=Splats(**{name: value[near] for name, value in vars(splats).items()}), depth=True

@@ -241,7 +241,7 @@ def opacity_tiny() -> tuple[Splats, Camera]:
     return with_opacity(ball(), 1e-7), view()
 
 
-@case("opacity 1e-7 where alpha_min is 1e-9", rules={"alpha_min": 1e-9})
+@case("opacity 1e-7 where alpha_min is 1e-9", rules={"alpha_min": 1e-9, "unrolled": 1})
 def opacity_tiny_drawn() -> tuple[Splats, Camera]:
     return with_opacity(ball(), 1e-7), view()
 

@@ -1,5 +1,7 @@
 """Every case, forward and backward, on every path, in both precisions and under both culling rules."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -13,11 +15,22 @@ REFUSED = [case for case in CASES if case.refused]
 STEP = 0.01
 """What one decision at a threshold changes at most: a splat of alpha 1/255, or the 1e-4 / (1 - 0.99) of light left."""
 FLOAT64 = {"image": 1e-11, "gradient": 1e-9}
+ALWAYS = [
+    ("eager", torch.float32, "published"),
+    ("eager", torch.float64, "tight"),
+    ("compiled", torch.float32, "tight"),
+]
+"""The other combinations are slow."""
+TRIED = list(itertools.product(paths(), (torch.float32, torch.float64), ("published", "tight")))
 
 
-@pytest.mark.parametrize("cull", ["published", "tight"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-@pytest.mark.parametrize("path", paths())
+@pytest.mark.parametrize(
+    ("path", "dtype", "cull"),
+    [
+        pytest.param(*how, id=f"{how[0]}-{str(how[1])[6:]}-{how[2]}", marks=[] if how in ALWAYS else [pytest.mark.slow])
+        for how in TRIED
+    ],
+)
 @pytest.mark.parametrize("case", RENDERED, ids=lambda case: case.name)
 def test_extreme(case: Case, path: str, dtype: torch.dtype, cull: str) -> None:
     found = measure(case, path, dtype, cull)

@@ -21,7 +21,7 @@ LARGEST = float(torch.finfo(torch.float32).max)
 EDGES = [0.0, -0.0, 1e-45, -1e-39, 1e-20, 1e-12, 1e-6, 1e4, 1e6, 1e12, -1e15, -1e19, 1e20, 1e30, -1e38, LARGEST]
 WILD = st.one_of(st.sampled_from(EDGES), st.floats(-LARGEST, LARGEST, width=32), st.floats(-4, 4, width=32))
 POISON = st.sampled_from([math.nan, math.inf, -math.inf])
-SEARCH = settings(max_examples=150, deadline=None)
+SEARCH = settings(max_examples=60, deadline=None)
 VIEW = view()
 GEOMETRY = ("means", "scales", "quats", "log_opacities")
 

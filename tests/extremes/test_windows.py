@@ -12,6 +12,8 @@ from gsx.core.rasterizer import Rendering, rasterize
 MOST = 1000
 """Splats of a case: a pixel takes them one by one."""
 CHOSEN = [case for case in CASES if not case.refused and len(case.make()[0]) <= MOST]
+SMALL = [case for case in CHOSEN if case.name.startswith(("scales", "needles", "discs", "points", "opacity"))]
+"""Those in which it matters how much a splat is dilated and what that does to its opacity."""
 
 
 def drawn(case: Case, dtype: torch.dtype, mip: bool) -> tuple[Rendering, dict[str, torch.Tensor]]:
@@ -24,8 +26,16 @@ def drawn(case: Case, dtype: torch.dtype, mip: bool) -> tuple[Rendering, dict[st
     return rendering, {name: value.grad for name, value in vars(live).items() if value.grad is not None}
 
 
-@pytest.mark.parametrize("mip", [False, True], ids=["plain", "mip"])
-@pytest.mark.parametrize("case", CHOSEN, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    ("case", "mip"),
+    [
+        *(pytest.param(case, True, id=f"{case.name}-mip") for case in CHOSEN),
+        *(
+            pytest.param(case, False, id=f"{case.name}-plain", marks=[] if case in SMALL else [pytest.mark.slow])
+            for case in CHOSEN
+        ),
+    ],
+)
 def test_extreme_windows(case: Case, mip: bool) -> None:
     single, gradients = drawn(case, torch.float32, mip)
     double, _ = drawn(case, torch.float64, mip)

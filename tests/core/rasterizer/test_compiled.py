@@ -54,21 +54,13 @@ def test_the_shipped_number_of_unrolled_splats() -> None:
     assert errors.gradient <= 1e-4
 
 
-def test_one_tile_size_after_another() -> None:
-    for tile in (8, 4, 16):  # one set of loops: each size compiles for itself, for any number of blocks
-        rules = replace(QUICK, tile_size=tile, unrolled=1)
-        for splats in (random_splats(250, seed=tile), opaque(90, tile)):
+def test_one_tile_size_and_form_of_the_exponent_after_another() -> None:
+    for tile, form in ((4, "direct"), (16, "expanded")):  # each compiles for itself, for any number of blocks
+        rules = replace(QUICK, tile_size=tile, exponent=form, unrolled=1)
+        for splats in (random_splats(250, seed=tile), opaque(90, tile), random_splats(200, seed=8)):
             errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
             assert errors.largest <= 1e-5
             assert errors.gradient <= 1e-4
-
-
-@pytest.mark.parametrize("form", ["direct", "expanded"])
-def test_other_forms_of_the_exponent(form: str) -> None:
-    rules, splats = replace(QUICK, exponent=form), random_splats(200, seed=8)
-    errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
-    assert errors.largest <= 2e-5
-    assert errors.gradient <= 2e-4
 
 
 def test_float64_splats_are_drawn_in_float64() -> None:
@@ -80,7 +72,8 @@ def test_float64_splats_are_drawn_in_float64() -> None:
 
 
 def test_absolute_gradient_is_that_of_the_eager_path() -> None:
-    def probe(rules: RasterSettings) -> torch.Tensor:
+    def probe(path: str) -> torch.Tensor:
+        rules = replace(QUICK, path=path, unrolled=1)
         rendering = rasterize(leaves(random_splats(200, seed=3)), front_camera(), rules, absolute_gradient=True)
         weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
         (rendering.image * weights).sum().backward()
@@ -88,7 +81,7 @@ def test_absolute_gradient_is_that_of_the_eager_path() -> None:
         assert rendering.screen.absgrad.grad is not None
         return rendering.screen.absgrad.grad
 
-    eager, compiled = probe(replace(QUICK, path="eager")), probe(QUICK)
+    eager, compiled = probe("eager"), probe("compiled")
     assert eager.abs().sum() > 0
     assert (compiled - eager).norm() <= 1e-5 * eager.norm()
 
@@ -138,8 +131,7 @@ def test_the_compilers_options_are_those_it_knows(monkeypatch: pytest.MonkeyPatc
 
 def test_a_crop_is_the_crop_of_the_picture() -> None:
     splats, camera = random_splats(300, seed=4), front_camera()
-    whole = rasterize(splats, camera, QUICK).image
-    part = rasterize(splats, camera.crop(8, 16, 24, 16), QUICK).image
+    whole, part = (render_with_gradients(splats, c, QUICK)[0].image for c in (camera, camera.crop(8, 16, 24, 16)))
     assert torch.equal(part, whole[:, 16:32, 8:32])
 
 
@@ -158,7 +150,7 @@ def test_nothing_compiles_anew_in_steady_state() -> None:
         draw(400, 5, schedule)
     before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
     assert before > 0
-    for count in (1, 40, 397, 700, 1500):
+    for count in (1, 40, 397, 1100):
         for schedule in ("chunks", "segments"):
             draw(count, count, schedule)
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from raster_scenes import changed, front_camera, gradients, leaves, random_splats, soft_splats
+from stopped_run import LIGHT
 from tiny import tiny_run
 from torch import Tensor
 
@@ -96,9 +97,9 @@ def by_quadrature(mean: tuple[float, float], covariance: Matrix, opacity: float,
 
 
 def test_windows_are_those_of_quadrature() -> None:
-    """Ten stacks of five random splats: each step from the window that the steps before have left."""
+    """Five stacks of five random splats: each step from the window that the steps before have left."""
     g = torch.Generator().manual_seed(3)
-    for _ in range(10):
+    for _ in range(5):
         window = fresh()
         for _ in range(5):
             long, short = (0.3 + torch.rand(2, generator=g)).tolist()
@@ -260,14 +261,14 @@ def test_published_gradients_through_two_splats() -> None:
 
 @pytest.mark.skipif(not available(), reason="no working compiler on this machine")
 def test_the_compiled_step_draws_the_same() -> None:
-    splats, camera = small_splats(), front_camera()
+    splats, camera = small_splats(), front_camera(48, 36)
     eager = rasterize(splats, camera, WINDOW).image
     compiled = rasterize(splats, camera, replace(WINDOW, path="compiled")).image
     assert (compiled - eager).abs().max() <= 2e-5
 
 
 def test_a_run_is_trained_and_looked_at_by_windows(tmp_path: Path) -> None:
-    words = ["iterations=12", "rasterizer=eager", "backbone=mip_splatting"]
+    words = [*LIGHT, "iterations=4", "scene.points=60", "rasterizer=eager", "backbone=mip_splatting"]
     found = {}
     for pixel in ("sample", "window"):
         tiny_run(tmp_path / pixel, [*words, f"rasterizer.pixel={pixel}"])

@@ -43,10 +43,10 @@ def axis_camera(size: int = 33):
 
 
 @pytest.mark.parametrize("cull", ["published", "tight"])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_scene_matches_float64_truth(seed: int, cull: str) -> None:
     fields, settings = random_fields(150, seed), RasterSettings(cull=cull)
-    camera = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=70, height=52)
+    camera = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=50, height=38)
     background = torch.tensor([0.2, 0.5, 0.9])
     fast = {name: value.clone().requires_grad_() for name, value in fields.items()}
     slow = {name: value.double().requires_grad_() for name, value in fields.items()}
@@ -84,7 +84,7 @@ def small_scene(seed: int) -> tuple[dict[str, torch.Tensor], RasterSettings]:
     return fields, RasterSettings(cull="tight", alpha_min=1e-9, tile_size=4, chunk=4)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_gradients_pass_gradcheck_in_float64(seed: int) -> None:
     fields, settings = small_scene(seed)
     camera = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=6, height=5)

@@ -1,22 +1,31 @@
 """The absolute gradient against per-pixel Jacobians of the truth, and sums that come out the same every time."""
 
+import hashlib
+from functools import cache
+from inspect import getsource
+
 import pytest
 import torch
-from raster_scenes import changed, front_camera, leaves, random_splats, run_script
+from raster_scenes import changed, front_camera, leaves, random_splats, render_with_gradients, run_script
 
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.reference import alpha_maps, frame_pixels
 
 
-def brute_force(
-    splats: Splats, rules: RasterSettings, weights: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def scene_of(seed: int) -> tuple[Splats, torch.Tensor]:
+    """(splats, weights of a picture)."""
+    weights = torch.randn(3, 52, 70, generator=torch.Generator().manual_seed(seed)).double()
+    return changed(random_splats(60, seed), dtype=torch.float64), weights
+
+
+@cache
+def brute_force(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(gradient of every screen mean, its absolute values added up over pixels, rows), from the reference's alphas.
 
     The derivative of a splat's alpha by its mean is minus that by the pixel's position.
     """
-    camera = front_camera()
+    (splats, weights), rules, camera = scene_of(seed), RasterSettings(cull="tight"), front_camera()
     xy = frame_pixels(camera).requires_grad_()
     alpha, rows = alpha_maps(splats, camera, rules, xy)
     by_mean = torch.stack([-torch.autograd.grad(map.sum(), xy, retain_graph=True)[0] for map in alpha])
@@ -31,9 +40,8 @@ def brute_force(
 @pytest.mark.parametrize("exponent", ["squares", "direct", "expanded"])
 @pytest.mark.parametrize("seed", range(3))
 def test_absolute_gradient_is_that_of_every_pixel_of_the_truth(seed: int, exponent: str) -> None:
-    splats, rules = changed(random_splats(60, seed), dtype=torch.float64), RasterSettings(cull="tight")
-    weights = torch.randn(3, 52, 70, generator=torch.Generator().manual_seed(seed)).double()
-    signed, absolute, rows = brute_force(splats, rules, weights)
+    splats, weights = scene_of(seed)
+    signed, absolute, rows = brute_force(seed)
     rules = RasterSettings(cull="tight", exponent=exponent)
     rendering = rasterize(leaves(splats), front_camera(), rules, absolute_gradient=True)
     (rendering.image * weights).sum().backward()
@@ -45,20 +53,29 @@ def test_absolute_gradient_is_that_of_every_pixel_of_the_truth(seed: int, expone
     assert float(screen.absgrad.grad.sum()) > 3 * float(screen.means2d_offset.grad.abs().sum())  # the two do differ
 
 
-REPEATED = """
-import hashlib, json, sys, torch
+def bits() -> list[list[str]]:
+    """Of a picture and its gradients, twice with one thread and twice with two."""
+    found, usual = [], torch.get_num_threads()
+    for threads in (1, 1, 2, 2):
+        torch.set_num_threads(threads)
+        rendering, slopes = render_with_gradients(random_splats(800), front_camera(160, 120), RasterSettings())
+        values = [rendering.image.detach(), *slopes.values()]
+        found.append([hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest() for value in values])
+    torch.set_num_threads(usual)
+    return found
+
+
+OTHER_PROCESS = f"""
+import hashlib, json, torch
 from raster_scenes import front_camera, random_splats, render_with_gradients
 from gsx.core.rasterizer import RasterSettings
-torch.set_num_threads(int(sys.argv[1]))
-def bits():
-    rendering, found = render_with_gradients(random_splats(800), front_camera(160, 120), RasterSettings())
-    values = [rendering.image.detach(), *found.values()]
-    return [hashlib.sha256(value.contiguous().numpy().tobytes()).hexdigest() for value in values]
-print(json.dumps([bits() for _ in range(2)]))
+{getsource(bits)}
+print(json.dumps(bits()))
 """
 
 
 def test_pictures_and_gradients_are_the_same_bits_in_every_run_with_one_thread_and_with_two() -> None:
-    for threads in ("1", "2"):
-        first, *others = [run for _ in range(2) for run in run_script(REPEATED, threads)]  # in two processes
-        assert all(other == first for other in others), threads
+    here, there = bits(), run_script(OTHER_PROCESS)
+    for first in (0, 2):  # with one thread, with two
+        pictures = [*here[first : first + 2], *there[first : first + 2]]
+        assert all(picture == pictures[0] for picture in pictures), first
