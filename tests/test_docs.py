@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,11 +32,18 @@ def test_source_files_named_in_backticks_exist(page: Path) -> None:
         assert (ROOT / name).exists(), name
 
 
+@cache
+def composed(words: tuple[str, ...]) -> None:
+    """Compose a command that several pages may have, once."""
+    from gsx.builtin import plugins
+    from gsx.experiments.runs.compose import compose
+
+    compose(words, plugins())
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if "```sh" in page.read_text()], ids=lambda page: page.name)
 def test_commands_of_pages_are_accepted(page: Path) -> None:
-    from gsx.builtin import plugins
     from gsx.cli.dispatch import VERBS
-    from gsx.experiments.runs.compose import compose
 
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.S)
     commands = [line.split("#")[0].strip() for block in blocks for line in block.splitlines() if line.startswith("gsx")]
@@ -44,7 +52,7 @@ def test_commands_of_pages_are_accepted(page: Path) -> None:
         if words and words[0] in (*VERBS, "FOLDER"):  # what stands for a path is told when it is given
             continue
         if not any(word.startswith("-") for word in words):
-            compose([word for word in words if word != "init=FILE"], plugins())
+            composed(tuple(word for word in words if word != "init=FILE"))
 
 
 def test_the_commands_of_the_readme_are_found() -> None:
@@ -58,8 +66,10 @@ def test_keys_named_for_those_who_come_from_elsewhere_exist() -> None:
 
     text = (ROOT / "docs" / "coming-from.md").read_text()
     with Compositions(plugins()) as compositions:
-        backbones = compositions.choices("backbone")
-        words = [[f"backbone={name}", f"scene={scene}"] for name in backbones for scene in ("colmap", "blender")]
+        words = [
+            ["scene=blender"],
+            *([f"backbone={name}", "scene=colmap"] for name in compositions.choices("backbone")),
+        ]
         known = {key for one in words for key in compositions.keys(one)}
     rows = [row.split("|")[-2] for row in text.splitlines() if row.startswith(("| `", "| -"))]
     named = 0

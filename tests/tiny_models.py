@@ -215,14 +215,14 @@ def make_transparent(vae: AutoencoderKL, large: float = 50.0) -> None:
 def train_denoiser(pipe: Any, steps: int) -> None:
     """Teach a UNet to see the little noise that image-to-image adds to latents."""
     generator = torch.Generator().manual_seed(0)
-    shown = pictures(64, 32, 32, generator)
+    shown = pictures(32, 16, 16, generator)
     with torch.no_grad():
         latents = pipe.vae.encode(2 * shown - 1).latent_dist.mean * pipe.vae.config.scaling_factor
         words, _, pooled, _ = pipe.encode_prompt("sharp", do_classifier_free_guidance=False)
-    told = {"text_embeds": pooled.expand(4, -1), "time_ids": torch.tensor([[32.0, 32, 0, 0, 32, 32]]).expand(4, -1)}
-    optimiser = torch.optim.Adam(pipe.unet.parameters(), lr=2e-3)
+    told = {"text_embeds": pooled.expand(4, -1), "time_ids": torch.tensor([[16.0, 16, 0, 0, 16, 16]]).expand(4, -1)}
+    optimiser = torch.optim.Adam(pipe.unet.parameters(), lr=5e-3)
     for _ in range(steps):
-        picked, when = (torch.randint(low, high, (4,), generator=generator) for low, high in ((0, 64), (9, 59)))
+        picked, when = (torch.randint(low, high, (4,), generator=generator) for low, high in ((0, 32), (9, 59)))
         kept = pipe.scheduler.alphas_cumprod[when].view(-1, 1, 1, 1)
         noise = torch.randn(latents[picked].shape, generator=generator)
         noisy = kept.sqrt() * latents[picked] + (1 - kept).sqrt() * noise
@@ -254,6 +254,6 @@ def save_models(folder: Path) -> dict[str, Path]:
         torch.nn.init.zeros_(still.unet.conv_out.bias)
         still.save_pretrained(folder / "still")
         useful = transparent_turbo(words, 1.0)
-        train_denoiser(useful, 120)
+        train_denoiser(useful, 40)
         useful.save_pretrained(folder / "useful")
     return {path.name: path for path in folder.iterdir()}

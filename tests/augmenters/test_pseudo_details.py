@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,23 +27,33 @@ from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run, start
+from gsx.experiments.runs.settings import Settings
 
 PLAIN = ("regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager")
 
 
-def run_at(folder: Path, step: int, *words: str) -> Run:
-    """A tiny run of 80 steps that stands at a step without having been trained there.
-
-    Windows are long enough for every training view to be picked in them.
-    """
+@cache
+def composed(*words: str) -> Settings:
+    """A tiny run of 80 steps. Windows are long enough for every training view to be picked in them."""
     chosen = [name for name in ("upscale", "bootstrap") if any("augmenter=" in w and name in w for w in words)]
     long = [f"augmenter.{name}.timing.{key}=4000" for name in chosen for key in ("every", "span")]
     if "bootstrap" in chosen:
         long.append("augmenter.bootstrap.timing.start=" + ("22000" if "upscale" in chosen else "20000"))
-    run = start(tiny_settings(folder, "iterations=80", *PLAIN, *long, *words), plugins())
+    return tiny_settings(Path("unused"), "iterations=80", *PLAIN, *long, *words)
+
+
+def run_at(folder: Path, step: int, *words: str, **options: Any) -> Run:
+    """A run that stands at a step without having been trained there; options: of its augmenter."""
+    folder.mkdir()
+    settings = composed(*words)
+    chosen = {name: replace(one, options=replace(one.options, **options)) for name, one in settings.augmenters.items()}
+    settings = replace(settings, augmenters=chosen)
+    run = build(settings, load_scene(settings), folder, training=True)
     run.step = step
     return run
 
@@ -90,9 +101,7 @@ def own_loss(run: Run, view: int) -> Tensor:
 ])  # fmt: skip
 def test_the_hybrid_loss_by_hand(backbone: str, mode: str, taken: float, tmp_path: Path) -> None:
     """(1 - lambda) L_o + lambda / M sum L1, or L_o + 1 / M sum L1, with its gradients."""
-    run = run_at(
-        tmp_path / "run", 44, f"backbone={backbone}", "augmenter=upscale_paper", f"augmenter.upscale.mode={mode}"
-    )
+    run = run_at(tmp_path / "run", 44, f"backbone={backbone}", "augmenter=upscale_paper", mode=mode)
     picked = run.sampler.count - 1
     run.sampler.order = [picked]
     step = backward(run)
@@ -146,8 +155,8 @@ def test_two_augmenters_take_both_their_shares(tmp_path: Path) -> None:
 
 def test_frozen_pseudo_views_leave_the_colour_network_to_the_photographs(tmp_path: Path) -> None:
     """de-MLP: its gradient is that of (1 - lambda) L_o alone, while anchors feel the pseudo views."""
-    words = ("backbone=octree_scaffold", "augmenter=bootstrap", "augmenter.bootstrap.freeze_shared=active")
-    run = run_at(tmp_path / "run", 40, *words)
+    words = ("backbone=octree_scaffold", "augmenter=bootstrap")
+    run = run_at(tmp_path / "run", 40, *words, freeze_shared="active")
     run.sampler.order = [1]
     backward(run)
     found = copied_gradients(run)
@@ -182,8 +191,8 @@ def test_trust_weighs_pixels() -> None:
 @pytest.mark.parametrize("background", ["false", "true"])
 def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """0.32 / 2 times the mean squares, by hand; the photograph's own scale is drawn once, unless backgrounds differ."""
-    words = ("augmenter=upscale", "augmenter.upscale.gain=0.32", f"training.random_background={background}")
-    run = run_at(tmp_path / "run", 60, *words)
+    words = ("augmenter=upscale", *["training.random_background=true"] * (background == "true"))
+    run = run_at(tmp_path / "run", 60, *words, gain=0.32)
     run.sampler.order = [2]
     renders = []
     monkeypatch.setattr("gsx.core.training.trainer.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
@@ -225,14 +234,14 @@ def compose_camera() -> Any:
 
 def test_pixels_of_small_windows_can_weigh_like_those_of_whole_pictures(tmp_path: Path) -> None:
     """48 x 36 px: windows of 12 x 9 seen at 24 x 18 are a quarter of the pixels."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.per_pixel=true")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", per_pixel=True)
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([0.25 / 3] * 3)
 
 
 def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.scales=[2,4]")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", scales=[2, 4])
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 6] * 6)
@@ -285,7 +294,7 @@ def test_only_views_that_a_window_asks_for_are_made_and_they_are_as_if_all_were(
 
 
 def test_exact_projection_gives_back_the_photograph(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.project=exact")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", project="exact")
     augmenter_of(run).term(run, 45, 0)
     for parent, views in augmenter_of(run).views.items():
         sums = views[0].target.long().view(3, 9, 2, 12, 2).sum((2, 4))
@@ -298,8 +307,8 @@ def test_everything_is_reduced_as_the_scene_says(tmp_path: Path) -> None:
 
     These thumbnails are too harsh for it: a few of their pixels no picture between black and white reduces to.
     """
-    words = ("coarse_weight=0.5", "gate=1.0", "project=exact", "variants=0")
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *(f"augmenter.upscale.{word}" for word in words))
+    options = {"coarse_weight": 0.5, "gate": 1.0, "project": "exact", "variants": 0}
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", **options)
     bicubic = Reduction(filter="bicubic")
     run.scene = replace(run.scene, reduction=bicubic)
     augmenter = augmenter_of(run)
@@ -332,7 +341,7 @@ def test_restored_views_show_what_the_model_shows(tmp_path: Path) -> None:
 
 
 def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.zoom=none")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", zoom="none")
     augmenter_of(run).term(run, 45, 0)
     for views in augmenter_of(run).views.values():
         for view in views:
@@ -342,7 +351,7 @@ def test_the_other_reading_adds_no_zoom(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("window", ["center", "random", "grid", "error"])
 def test_windows_lie_inside_the_raster(window: str, tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", f"augmenter.upscale.window={window}")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", window=window)
     augmenter_of(run).term(run, 45, 0)
     places = set()
     for parent, views in augmenter_of(run).views.items():
@@ -355,7 +364,7 @@ def test_windows_lie_inside_the_raster(window: str, tmp_path: Path) -> None:
 
 
 def test_only_the_first_cameras(tmp_path: Path) -> None:
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.first_cameras=2")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", first_cameras=2)
     assert augmenter_of(run).term(run, 45, 5) is None
     assert sorted(augmenter_of(run).views) == [0, 1]
 
@@ -392,15 +401,14 @@ def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
 
 
 def test_scales_in_turn(tmp_path: Path) -> None:
-    words = ("augmenter=upscale_paper", "augmenter.upscale.scales=[2,4,8]", "augmenter.upscale.progressive=true",
-             "augmenter.upscale.narrow=1.0")  # fmt: skip
-    augmenter = augmenter_of(run_at(tmp_path / "run", 44, *words))
+    options = {"scales": [2, 4, 8], "progressive": True, "narrow": 1.0}
+    augmenter = augmenter_of(run_at(tmp_path / "run", 44, "augmenter=upscale_paper", **options))
     assert [augmenter.planner.scales_of(event) for event in augmenter.events] == [[2]] * 2 + [[4]] * 2 + [[8]]
 
 
 def test_a_known_lower_resolution_enters_the_loss(tmp_path: Path) -> None:
     """Only where the photograph is known: the zoomed copy of the training camera."""
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "augmenter.upscale.coarse_weight=0.5")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", coarse_weight=0.5)
     augmenter_of(run).term(run, 45, 0)
     base, *moved = augmenter_of(run).views[0]
     assert all(view.coarse is None for view in moved)
@@ -416,12 +424,7 @@ def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path
     """At the training cameras' own density nothing is finer; zoomed in twice almost everything is."""
     shares = []
     for scale in (1, 2):
-        words = (
-            "augmenter=upscale_paper",
-            "augmenter.upscale.weight_map=finer",
-            f"augmenter.upscale.scales=[{scale}]",
-        )
-        run = run_at(tmp_path / f"run{scale}", 44, "augmenter=upscale_paper", *words)
+        run = run_at(tmp_path / f"run{scale}", 44, "augmenter=upscale_paper", weight_map="finer", scales=[scale])
         augmenter_of(run).term(run, 45, 0)
         views = [view for views in augmenter_of(run).views.values() for view in views]
         pixel_weight = [
@@ -433,8 +436,7 @@ def test_pixels_that_a_photograph_shows_as_finely_can_be_left_out(tmp_path: Path
 
 def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
     """Of a scene of which nothing is left but what the left of each picture shows."""
-    words = ("augmenter=upscale_paper", "augmenter.upscale.variants=0", "augmenter.upscale.window=random")
-    run = run_at(tmp_path / "run", 44, *words, "augmenter.upscale.scales=[4]")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", variants=0, window="random", scales=[4])
     least = {}
     for wanted in (0.0, 0.8):
         alphas = []
@@ -452,13 +454,13 @@ def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
     assert least[0.8] >= 0.8
 
 
-@pytest.mark.parametrize(("words", "least"), [(("augmenter.upscale.project=exact",), 1.0), ((), 0.0)])
+@pytest.mark.parametrize(("project", "least"), [("exact", 1.0), ("none", 0.0)])
 def test_the_share_of_consistent_pixels_is_told(
-    words: tuple[str, ...], least: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    project: str, least: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Lanczos' filter does not give the photograph back when it is averaged; its exact projection does."""
     caplog.set_level("INFO")
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", *words)
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", project=project)
     augmenter_of(run).term(run, 45, 0)
     share = load_views(augmenter_of(run).store.path(run, 44))[1]["consistent"]
     assert share == 1.0 if least else 0.0 < share < 0.9
@@ -526,7 +528,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
                 for image, request in zip(super().regenerate(requests), requests, strict=True)
             ]
 
-    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", first_cameras=1)
     plain = with_regenerator(run, Spoiling(10**9, None))
     plain.term(run, 45, 0)
     errors = []
@@ -543,14 +545,16 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
 # -- runs --------------------------------------------------------------------------------------------------------------
 
 RUN = (
-    "iterations=40",
+    "iterations=20",
     *PLAIN,
     "augmenter=[upscale_paper,bootstrap]",
-    "augmenter.upscale.timing.every=4000",
-    "augmenter.bootstrap.timing.every=4000",
-    "augmenter.upscale.timing.span=2000",  # two steps: a run can be stopped inside a window
-    "augmenter.bootstrap.timing.span=2000",
+    "augmenter.upscale.timing.every=8000",
+    "augmenter.bootstrap.timing.every=8000",
+    "augmenter.upscale.timing.span=4000",  # two steps: a run can be stopped inside a window
+    "augmenter.bootstrap.timing.span=4000",
     "training.checkpoint_every=100",
+    "scene.points=150",
+    "eval.zoom=[1]",
 )
 
 
@@ -563,8 +567,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_window_is_active_and_logged(finished: Path) -> None:
     plan = json.loads((finished / "environment.json").read_text())["plan"]
-    assert plan["upscale"]["events"] == list(range(22, 39, 4))
-    assert plan["bootstrap"]["events"] == list(range(20, 39, 4))
+    assert plan["upscale"]["events"] == [11, 15, 19]
+    assert plan["bootstrap"]["events"] == [10, 14, 18]
     pictures = [path.name for path in (finished / "pseudo").glob("*.png")]
     for name in ("upscale", "bootstrap"):
         assert {int(p.split("_")[1]) for p in pictures if p.startswith(name)} == set(plan[name]["events"])
@@ -573,7 +577,7 @@ def test_every_window_is_active_and_logged(finished: Path) -> None:
 def test_the_report_shows_pseudo_views_and_what_became_of_them(finished: Path) -> None:
     entries = json.loads((finished / "pseudo" / "index.json").read_text())["views"]
     assert {entry["augmenter"] for entry in entries} == {"upscale", "bootstrap"}
-    assert {entry["event"] for entry in entries} == {36, 38}
+    assert {entry["event"] for entry in entries} == {18, 19}
     for entry in entries:
         made, after = (read_image(finished / "pseudo" / entry[kind]) for kind in ("made", "after"))
         assert made.shape[1:] == (after.shape[1], 3 * after.shape[2])
@@ -581,7 +585,7 @@ def test_the_report_shows_pseudo_views_and_what_became_of_them(finished: Path) -
     assert page.count("after training</figcaption>") == len(entries) > 3
 
 
-@pytest.mark.parametrize("stop", [21, 25])
+@pytest.mark.parametrize("stop", [11, 16])
 def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
     tiny_run(tmp_path / "run", RUN, stop_after=stop)
     run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
@@ -594,13 +598,13 @@ def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished:
 def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_window(
     finished: Path, tmp_path: Path
 ) -> None:
-    """The checkpoint of step 21 needs the views of 20, though those of 22, 24 and 26 have been made since."""
+    """The checkpoint of step 11 needs the views of 10, though those of 11, 14 and 15 have been made since."""
     folder = tmp_path / "run"
-    tiny_run(folder, (*RUN, "training.checkpoint_every=7"), stop_after=27)
-    for path in (folder / "checkpoints").glob("step_0000027*"):
+    tiny_run(folder, (*RUN, "training.checkpoint_every=11"), stop_after=17)
+    for path in (folder / "checkpoints").glob("step_0000017*"):
         path.unlink()
     run, settings = open_run(folder, plugins(), (), training=True)
-    assert run.step == 21
+    assert run.step == 11
     execute(run, settings, plugins())
     whole, parts = final_tensors(finished), final_tensors(folder)
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
@@ -608,38 +612,37 @@ def test_a_run_killed_after_the_next_event_goes_on_from_a_checkpoint_inside_a_wi
 
 def test_files_of_events_that_no_checkpoint_needs_are_removed(finished: Path) -> None:
     kept = sorted(path.name for path in (finished / "pseudo").glob("*.safetensors"))
-    assert kept == ["bootstrap_0000036.safetensors", "upscale_0000038.safetensors"]
+    assert kept == ["bootstrap_0000018.safetensors", "upscale_0000019.safetensors"]
 
 
 def test_a_longer_run_waits_for_its_next_event(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of 40 steps the last events are at 38; of 60 those around 40 are at 39, which was never made, and 42."""
+    """Of 20 steps the last event is at 17; of 30 those around 20 are at 19, which was never made, and 22."""
     caplog.set_level("INFO")
     words = tuple(word for word in RUN if not word.startswith("augmenter"))
-    tiny_run(
-        tmp_path / "run",
-        (*words, "augmenter=bootstrap", "augmenter.bootstrap.timing.span=1500", "augmenter.bootstrap.first_cameras=1"),
-    )
-    run, settings = open_run(tmp_path / "run", plugins(), ["iterations=60"], training=True)
-    assert augmenter_of(run).events[:5] == [30, 33, 36, 39, 42]
+    timing = [f"augmenter.bootstrap.timing.{word}" for word in ("start=21400", "stop=36000", "every=4000", "span=3000")]
+    first = tiny_run(tmp_path / "run", (*words, "augmenter=bootstrap", "augmenter.bootstrap.first_cameras=1", *timing))
+    assert augmenter_of(first).events == [11, 13, 15, 17]
+    run, settings = open_run(tmp_path / "run", plugins(), ["iterations=30"], training=True)
+    assert augmenter_of(run).events == [16, 19, 22, 25]
     execute(run, settings, plugins())
     assert run.complete
     assert "rests until its next event" in caplog.text
 
 
 def test_before_the_first_window_a_run_is_that_of_the_control(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "augmented", RUN, stop_after=20)
+    tiny_run(tmp_path / "augmented", RUN, stop_after=10)
     control = tuple(word for word in RUN if not word.startswith("augmenter"))
-    tiny_run(tmp_path / "control", control, stop_after=20)
+    tiny_run(tmp_path / "control", control, stop_after=10)
     a, b = final_tensors(tmp_path / "augmented"), final_tensors(tmp_path / "control")
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_a_lost_file_of_pseudo_views_is_named(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "run", RUN, stop_after=21)
-    path = tmp_path / "run" / "pseudo" / "bootstrap_0000020.safetensors"
+    tiny_run(tmp_path / "run", RUN, stop_after=11)
+    path = tmp_path / "run" / "pseudo" / "bootstrap_0000010.safetensors"
     path.unlink()
     run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
-    with pytest.raises(InputError, match=r"bootstrap_0000020.safetensors cannot be read.*step 20.*train anew"):
+    with pytest.raises(InputError, match=r"bootstrap_0000010.safetensors cannot be read.*step 10.*train anew"):
         execute(run, settings, plugins())
 
 
@@ -712,7 +715,7 @@ def term_of(run: Run) -> Term | None:
 def test_the_oracle_gives_the_true_pixels(tmp_path: Path) -> None:
     """The built-in scene has truth at any density; of cameras moved at random the untrained model shows another one."""
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", "regenerator/upscale=oracle", "scene.samples=16",
-                 "augmenter.upscale.variants=0")  # fmt: skip
+                 variants=0, first_cameras=1)  # fmt: skip
     assert term_of(run) is not None
     view = augmenter_of(run).views[0][0]
     finer = run.scene.train[0].source.image(view.camera)
@@ -729,7 +732,7 @@ def test_what_cannot_work_is_refused_before_training(tmp_path: Path) -> None:
         (up, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,1.0]"): "take the whole loss",
     }.items():
         with pytest.raises(ConfigError, match=complaint):
-            run_at(tmp_path / "run", 0, *words)
+            start(tiny_settings(tmp_path / "run", *PLAIN, *words), plugins())
         assert not (tmp_path / "run").exists()
 
 

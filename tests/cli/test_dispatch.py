@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from io import TextIOWrapper
 from pathlib import Path
 
 import pytest
@@ -22,13 +23,15 @@ from gsx.core.data.images import write_image
 from gsx.core.rasterizer import RasterSettings
 
 GSX = [sys.executable, "-m", "gsx"]
+FEW = ("scene.points=100", "scene.train_views=3")
+Multirun = tuple[Path, subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> Path:
     """A finished tiny run."""
     folder = tmp_path_factory.mktemp("cli") / "run"
-    tiny_run(folder, ["iterations=3"])
+    tiny_run(folder, [*FEW, "iterations=2"])
     return folder
 
 
@@ -55,7 +58,7 @@ def test_plugins_lists_builtins(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words(tmp_path / "run", "iterations=2")) == 0
+    assert main(words(tmp_path / "run", *FEW, "iterations=2")) == 0
     captured = capsys.readouterr()
     assert captured.out.strip() == str(tmp_path / "run" / "report.html")
     assert re.search(r"step 2/2 .* it/s .* loss .* PSNR .* splats .* MB .* ETA", captured.err)
@@ -90,6 +93,7 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
     monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
     monkeypatch.setattr("gsx.core.rasterizer.compiled.takes", lambda settings, **rest: settings.path == "compiled")
     monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.compiles", lambda settings, device: False)
+    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda device: False)
 
     def evaluated(*overrides: str) -> tuple[str, set[str], str]:
         asked.clear()
@@ -111,17 +115,20 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
 
 
 def test_trade_of_a_run_a_file_and_the_built_in_scene(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    quick, eager = ["--knobs", "cull,tile_size", "--repeats", "1"], ["rasterizer.path=eager"]  # nothing to compile
-    assert main(["trade", "rasterizer", str(run_folder), *quick, "--views=3", *eager, "rasterizer.chunk=8"]) == 0
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.complaint", lambda device: "not asked for here")
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.available", lambda device: False)
+    quick, eager = ["--repeats", "1"], ["rasterizer.path=eager"]  # nothing to compile
+    asked = [*quick, "--knobs=cull", "--views=1", *eager, "rasterizer.chunk=8"]
+    assert main(["trade", "rasterizer", str(run_folder), *asked]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == str(run_folder / "trade" / "trade.html")
     assert "cull=tight" in out
     assert "every pixel within 0.001: " in out
     content = json.loads((run_folder / "trade" / "trade.json").read_text())
     assert content["base"]["chunk"] == 8
-    assert len(content["views"]) == 3
+    assert len(content["views"]) == 1
 
     file = tmp_path / "x.ply"
     assert main(["export", str(run_folder), str(file)]) == 0
@@ -130,7 +137,8 @@ def test_trade_of_a_run_a_file_and_the_built_in_scene(
     assert (tmp_path / "a" / "b" / "trade.html").is_file()
     assert "every pixel within 1: " in capsys.readouterr().out
 
-    small = ["scene.width=48", "scene.height=36", "scene.points=200", "device=cpu", "--to", str(tmp_path / "c")]
+    small = ["scene.width=48", "scene.height=36", "scene.points=100", "scene.train_views=3", "scene.test_views=1"]
+    small += ["scene.samples=1", "device=cpu", "--knobs", "cull,tile_size", "--to", str(tmp_path / "c")]
     assert main(["trade", "rasterizer", *small, *quick]) == 0
     assert "points of scene demo" in capsys.readouterr().err
     assert len(json.loads((tmp_path / "c" / "trade.json").read_text())["views"]) == 1
@@ -193,45 +201,80 @@ def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-@pytest.mark.parametrize("asked", ["--help", "--cfg job", "plugins"])
-def test_text_that_cannot_be_written_is_one_sentence(asked: str) -> None:
+def test_text_that_cannot_be_written_is_one_sentence() -> None:
     with Path("/dev/full").open("w") as full:
-        ended = subprocess.run([*GSX, *asked.split()], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        ended = subprocess.run([*GSX, "--help"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert ended.returncode == 2
     assert [line[:8] for line in ended.stderr.splitlines()] == ["gsx: No "], ended.stderr
 
 
-@pytest.mark.parametrize("asked", ["--help", "--cfg job"])
-def test_a_reader_that_has_seen_enough_is_no_error(asked: str) -> None:
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("asked", ["--cfg job", "plugins"])
+def test_text_of_any_command_that_cannot_be_written_is_one_sentence(
+    asked: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with TextIOWrapper(Path("/dev/full").open("wb", buffering=0), write_through=True) as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(asked.split()) == 2
+    assert [line[:8] for line in capsys.readouterr().err.splitlines()] == ["gsx: No "]
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     read, write = os.pipe()
     os.close(read)
-    ended = subprocess.run([*GSX, *asked.split()], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    ended = subprocess.run([*GSX, "--help"], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert (ended.returncode, ended.stderr) == (141, "")
 
 
-def test_multirun_makes_a_run_for_every_combination(tmp_path: Path) -> None:
-    command = [*GSX, "-m", *OVERRIDES, "iterations=1", "seed=0,1", f"output={tmp_path / 'out'}"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    runs = list((tmp_path / "out").glob("*/*/*/evaluation.json"))
-    assert len(runs) == 2
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "Hydra left files of its own"
+def test_a_reader_that_has_seen_enough_of_a_configuration_is_no_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as unread:
+        monkeypatch.setattr(sys, "stdout", unread)
+        assert main(["--cfg", "job"]) == 141
+    assert capsys.readouterr().err == ""
 
 
-def test_a_multirun_ends_with_one_report_over_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "out"
-    earlier = subprocess.run([*GSX, *OVERRIDES, "iterations=1", f"output={output}"], check=True, capture_output=True)
-    assert earlier.returncode == 0
-    sweep = ["-m", *OVERRIDES, "iterations=1", "backbone=gs3d,scaffold", f"output={output}"]
-    done = subprocess.run([*GSX, *sweep], check=True, capture_output=True, text=True)
-    report = Path(done.stdout.splitlines()[-1])
+@pytest.fixture(scope="module")
+def multirun(tmp_path_factory: pytest.TempPathFactory) -> Multirun:
+    """The outputs of a run and of a multirun over two more, started where modules have the names of libraries."""
+    folder = tmp_path_factory.mktemp("multirun")
+    for name in ("torch", "pluggy", "numpy"):
+        (folder / f"{name}.py").write_text("raise SystemExit('mine')")
+    few = [*OVERRIDES, *FEW, "iterations=1", f"output={folder / 'out'}"]
+    sweep = [*GSX, "-m", *few, "backbone=gs3d,mip_splatting"]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("GSX_CACHE", str(tmp_path_factory.mktemp("cache")))
+        assert main(few) == 0
+        return folder / "out", subprocess.run(sweep, capture_output=True, text=True, check=False, cwd=folder)
+
+
+def test_multirun_makes_a_run_for_every_combination(multirun: Multirun) -> None:
+    output, ended = multirun
+    assert ended.returncode == 0, ended.stderr
+    runs = sorted(path.parts[-3] for path in output.glob("*/*/*/evaluation.json"))
+    assert runs == ["gs3d", "gs3d", "mip_splatting"]  # one of them is from before
+    left = {path.name for path in output.parent.iterdir()}
+    assert left == {"out", "torch.py", "pluggy.py", "numpy.py"}, "Hydra left files of its own"
+
+
+def test_a_multirun_ends_with_one_report_over_its_runs(multirun: Multirun) -> None:
+    output, ended = multirun
+    report = Path(ended.stdout.splitlines()[-1])
     assert report.name == "report.html"
     assert output / "sweeps" in report.parents
     rows = list(csv.DictReader((report.parent / "report.csv").read_text().splitlines()))
-    assert [row["backbone"] for row in rows] == ["gs3d", "scaffold"]  # not the earlier run
+    assert [row["backbone"] for row in rows] == ["gs3d", "mip_splatting"]  # not the earlier run
     assert all((report.parent / row["run"] / "config.yaml").is_file() for row in rows)
     assert 'href="../../demo/' in report.read_text()
+
+
+def test_modules_in_the_current_folder_are_not_taken_for_libraries(multirun: Multirun) -> None:
+    _, ended = multirun
+    assert (ended.returncode, "mine" in ended.stderr) == (0, False)
 
 
 def test_a_mistake_in_a_multirun_is_refused_before_it_starts(capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,13 +287,6 @@ def test_a_wrong_value_in_a_multirun_is_kept_nowhere(tmp_path: Path, capsys: pyt
     assert main(["-m", "seed=0,1", "tracker=[mlflow]", address, f"output={tmp_path / 'out'}"]) == 2
     assert "holds a password" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_modules_in_the_current_folder_are_not_taken_for_libraries(tmp_path: Path) -> None:
-    for name in ("torch", "pluggy", "numpy"):
-        (tmp_path / f"{name}.py").write_text("raise SystemExit('mine')")
-    ended = subprocess.run([*GSX, "plugins"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def one_image_scene(folder: Path) -> Path:
@@ -303,7 +339,7 @@ def strange_camera(folder: Path) -> Path:
 def stopped_run(folder: Path) -> Path:
     """An interrupted tiny run."""
     logging.getLogger("gsx").handlers.clear()  # of an earlier test, on a stream that is closed by now
-    tiny_run(folder, ["iterations=4"], stop_after=2)
+    tiny_run(folder, [*FEW, "iterations=2"], stop_after=1)
     return folder
 
 
@@ -429,13 +465,13 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_partial_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    assert main(words(tmp_path / "run", "iterations=1")) == 2
+    assert main(words(tmp_path / "run", *FEW, "iterations=1")) == 2
     assert "No space left on device" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*partial*"))
 
 
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(tmp_path: Path) -> None:
-    command = [*GSX, *words(tmp_path / "run", "iterations=100000", "rasterizer=eager")]
+    command = [*GSX, *words(tmp_path / "run", *FEW, "iterations=100000", "rasterizer=eager", "training.log_every=1")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 120

@@ -19,6 +19,7 @@ from gsx.experiments.runs.job import train
 from gsx.regenerators.called import Called, CalledOptions
 
 PROMPTS: list[str] = []
+SMALL = ["iterations=12", "scene.points=100", "eval.zoom=[1]"]
 
 
 def blocks(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float, level: float = 0) -> Tensor:
@@ -30,7 +31,7 @@ def blocks(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float
 def test_a_function_redraws_the_views_of_a_run(tmp_path: Path) -> None:
     """It is told the prompt, with the name of the scene."""
     PROMPTS.clear()
-    words = ["augmenter=upscale", "iterations=12", "augmenter.upscale.prompt='{scene}, sharp'"]
+    words = [*SMALL, "augmenter=upscale", "augmenter.upscale.prompt='{scene}, sharp'"]
     words += ["regenerator/upscale=callable", "regenerator.upscale.function=test_called:blocks"]
     tiny_run(tmp_path / "run", words)
     assert set(PROMPTS) == {"demo, sharp"}
@@ -47,7 +48,7 @@ def stray(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float)
 
 def test_projection_saves_pictures_of_an_upscaler_that_strays(tmp_path: Path) -> None:
     """Of photographs and of renders; without it the run ends, and says what to set."""
-    words = ["augmenter=upscale_paper", "iterations=12", "regenerator/upscale=callable"]
+    words = [*SMALL, "augmenter=upscale_paper", "regenerator/upscale=callable"]
     words += ["regenerator.upscale.function=test_called:stray"]
     words += [f"augmenter.upscale.checks.agreement.{word}" for word in ("action=drop", "limit=30")]
     with pytest.raises(TrainingError, match=r"dB from its input.*augmenter.upscale.project=exact"):
@@ -60,7 +61,7 @@ def test_projection_saves_pictures_of_an_upscaler_that_strays(tmp_path: Path) ->
 
 def test_a_finished_run_is_looked_at_without_its_regenerator(tmp_path: Path) -> None:
     """It may have been trained elsewhere; going on with it is refused."""
-    words = ["augmenter=upscale", "iterations=12", "regenerator/upscale=callable"]
+    words = [*SMALL, "augmenter=upscale", "regenerator/upscale=callable"]
     run = tiny_run(tmp_path / "run", [*words, "regenerator.upscale.function=test_called:blocks"])
     config = run.folder / "config.yaml"
     config.write_text(config.read_text().replace("test_called:blocks", "no_longer:there"))
@@ -76,7 +77,7 @@ def test_code_that_a_folder_names_runs_only_where_it_is_trusted(
         "from pathlib import Path\nPath('was_here').touch()\nfrom test_called import blocks\n"
     )
     monkeypatch.chdir(tmp_path)
-    words_ = ["augmenter=upscale", "iterations=12", "regenerator/upscale=callable"]
+    words_ = [*SMALL, "augmenter=upscale", "regenerator/upscale=callable"]
     named = "regenerator.upscale.function=theirs:blocks"
     loaded, settings = plugins(), tiny_settings(tmp_path / "run", *words_, named)
     with loaded.listening([StopAfter(3)]):

@@ -17,7 +17,7 @@ from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOp
 
 
 def options(**changes: float) -> RestorerOptions:
-    values = {"channels": 8, "steps": 120, "later_steps": 10, "again": 1.0, "batch": 4, "crop": 32, "rate": 3e-3}
+    values = {"channels": 8, "steps": 80, "later_steps": 10, "again": 1.0, "batch": 4, "crop": 32, "rate": 3e-3}
     values["halves"] = 0.35
     return RestorerOptions(name="scene_restorer", **(values | changes))  # type: ignore[arg-type]
 
@@ -116,10 +116,10 @@ def test_a_resumed_run_learns_on_from_the_event_before(tmp_path: Path) -> None:
 
 def test_it_learns_again_when_the_run_has_become_much_longer(tmp_path: Path) -> None:
     """From 40 by half more each time: at 40, 60 and 90, also for a run that was resumed in between."""
-    whole, given = SceneRestorer(options(steps=20, again=1.5)), context_for(tmp_path / "run")
+    whole, given = SceneRestorer(options(steps=12, again=1.5)), context_for(tmp_path / "run")
     learnt = [bool(whole.prepare(at_step(given, step))) for step in range(40, 100, 10)]
     assert learnt == [True, False, True, False, False, True]
-    resumed = SceneRestorer(options(steps=20, again=1.5))
+    resumed = SceneRestorer(options(steps=12, again=1.5))
     assert resumed.prepare(at_step(given, 70)) == {}
     image = blurred(stripes(0).float() / 255)
     assert not torch.equal(restored(resumed, image), image)
@@ -135,7 +135,7 @@ def test_it_learns_from_renders_by_models_that_were_not_fitted_to_the_photograph
         asked.append(share)
         return [blurred(photo) for photo in photos.values()]
 
-    restorer = SceneRestorer(options(halves=0.4))
+    restorer = SceneRestorer(options(steps=40, halves=0.4))
     figures = restorer.prepare(replace(given, render=lambda seen: photos[seen], held_out=held_out))
     assert asked == [0.4]
     expected = sum(float((blurred(photo) - photo).square().mean()) for photo in list(photos.values())[1::2]) / 4

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, parameters, portions
 
-RUN = ("iterations=24", "eval.zoom=[1,2]", "training.checkpoint_every=7", "training.log_every=2",
-       "tracker=[mlflow]", "tracker.mlflow.seconds=0")  # fmt: skip
+RUN = ("iterations=12", "scene.points=100", "scene.train_views=3", "training.checkpoint_every=4",
+       "training.log_every=2", "tracker=[mlflow]", "tracker.mlflow.seconds=0")  # fmt: skip
 
 
 def kept(folder: Path) -> tuple[Any, str]:
@@ -62,8 +63,15 @@ def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(output: Path) -> Path:
-    tiny_run(output / "finished", (*RUN, f"output={output}"))
+def empty(output: Path) -> Path:
+    """A copy of the database as it is before the first run: with its tables, and nothing in them."""
+    client_of(f"sqlite:///{output / 'mlflow.db'}")
+    return Path(shutil.copy(output / "mlflow.db", output / "empty.db"))
+
+
+@pytest.fixture(scope="module")
+def finished(output: Path, empty: Path) -> Path:
+    tiny_run(output / "finished", (*RUN, "eval.zoom=[1,2]", f"output={output}"))
     return output / "finished"
 
 
@@ -78,10 +86,10 @@ def test_the_run_is_named_and_has_its_parameters_and_files(finished: Path, outpu
     found = client.get_run(run_id)
     assert (found.info.run_name, found.info.status) == ("finished", "FINISHED")
     assert client.get_experiment(found.info.experiment_id).name == "demo"
-    config = tiny_settings(finished, *RUN, f"output={output}").resolved
+    config = tiny_settings(finished, *RUN, "eval.zoom=[1,2]", f"output={output}").resolved
     told = {key: value for key, value in config.items() if key != "tracker"}  # addresses may hold passwords
     assert found.data.params == {key: str(value) for key, value in flattened(told).items()}
-    assert found.data.params["iterations"] == "24"
+    assert found.data.params["iterations"] == "12"
     assert found.data.tags["gsx.folder"] == str(finished)
     assert {file.path for file in client.list_artifacts(run_id)} == {"config.yaml", "evaluation.json", "report.html"}
     copies = output / "mlflow_files" / "demo" / run_id / "artifacts"
@@ -90,7 +98,7 @@ def test_the_run_is_named_and_has_its_parameters_and_files(finished: Path, outpu
 
 def test_an_interrupted_run_is_killed_and_goes_on_as_the_same_run(output: Path) -> None:
     folder = output / "interrupted"
-    tiny_run(folder, (*RUN, f"output={output}"), stop_after=11)
+    tiny_run(folder, (*RUN, f"output={output}"), stop_after=5)
     before = kept(folder)[1]
     assert status(folder) == "KILLED"
     run, settings = open_run(folder, plugins())
@@ -100,14 +108,14 @@ def test_an_interrupted_run_is_killed_and_goes_on_as_the_same_run(output: Path) 
 
 
 def test_a_killed_run_goes_on_without_doubled_points(output: Path) -> None:
-    # checkpoints at 7 and 14: what a kill at step 18 leaves are points later than the checkpoint
+    # checkpoints at 4 and 8: what a kill at step 10 leaves are points later than the checkpoint
     folder = output / "killed"
-    tiny_run(folder, (*RUN, f"output={output}"), stop_after=18)
-    for path in (folder / "checkpoints").glob("step_0000018.*"):
+    tiny_run(folder, (*RUN, f"output={output}"), stop_after=10)
+    for path in (folder / "checkpoints").glob("step_0000010.*"):
         path.unlink()
-    assert curves(folder)["loss"][-1][0] == 18
+    assert curves(folder)["loss"][-1][0] == 10
     run, settings = open_run(folder, plugins())
-    assert run.step == 14
+    assert run.step == 8
     execute(run, settings, plugins())
     timed = {"seconds", "memory_mb"}  # of the first time for steps that were repeated
     found, expected = curves(folder), expected_curves(folder)
@@ -118,11 +126,12 @@ def test_a_killed_run_goes_on_without_doubled_points(output: Path) -> None:
 
 
 def test_a_run_that_goes_on_elsewhere_is_begun_there_with_all_its_points(
-    output: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    output: Path, empty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    shutil.copy(empty, tmp_path / "other.db")
     folder = output / "moved"
-    tiny_run(folder, (*RUN, f"output={output}"), stop_after=11)
+    tiny_run(folder, (*RUN, f"output={output}"), stop_after=5)
     run, settings = open_run(folder, plugins(), [f"tracker.mlflow.uri=sqlite:///{tmp_path / 'other.db'}"])
     execute(run, settings, plugins())
     assert json.loads((folder / "mlflow.json").read_text())["uri"] == f"sqlite:///{tmp_path / 'other.db'}"
@@ -158,7 +167,7 @@ def test_points_wait_for_their_time(output: Path, monkeypatch: pytest.MonkeyPatc
     assert client.get_experiment(client.get_run(run_id).info.experiment_id).name == "own name"
 
 
-def test_a_store_that_breaks_ends_no_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_store_that_breaks_ends_no_run(empty: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     class Breaks:
         """Takes the table of metrics away at step 5."""
 
@@ -168,6 +177,7 @@ def test_a_store_that_breaks_ends_no_run(tmp_path: Path, caplog: pytest.LogCaptu
                 with sqlite3.connect(tmp_path / "mlflow.db") as connection:
                     connection.execute("drop table metrics")
 
+    shutil.copy(empty, tmp_path / "mlflow.db")
     settings, loaded = tiny_settings(tmp_path / "run", *RUN, f"output={tmp_path}"), plugins()
     run = start(settings, loaded)
     with loaded.listening([Breaks()]):
@@ -182,7 +192,7 @@ def test_a_server_that_is_down_ends_no_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    tiny_run(tmp_path / "run", ("iterations=2", "tracker=[mlflow]", "tracker.mlflow.uri=http://127.0.0.1:9"))
+    tiny_run(tmp_path / "run", ("iterations=1", "tracker=[mlflow]", "tracker.mlflow.uri=http://127.0.0.1:9"))
     assert caplog.text.count("tracker mlflow failed at step 0") == 1
     assert (tmp_path / "run" / "report.html").is_file()
 
@@ -221,5 +231,8 @@ def test_a_password_in_the_address_is_refused_and_not_repeated(uri: str, tmp_pat
     with pytest.raises(ConfigError, match="holds a password") as refused:
         tiny_settings(tmp_path / "run", "tracker=[mlflow]", f"tracker.mlflow.uri='{uri}'")
     assert "secret" not in str(refused.value)
+
+
+def test_an_address_may_name_a_user_and_where_the_password_is(tmp_path: Path) -> None:
     told = "tracker.mlflow.uri='postgresql://me@host/x?passfile=/home/me/.pgpass'"
     assert tiny_settings(tmp_path / "run", "tracker=[mlflow]", told)

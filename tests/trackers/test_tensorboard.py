@@ -18,8 +18,8 @@ from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
 from gsx.trackers.tensorboard import events_folder
 
-RUN = ("iterations=24", "eval.zoom=[1,2]", "training.checkpoint_every=7", "training.log_every=2",
-       "tracker=[tensorboard]")  # fmt: skip
+RUN = ("iterations=12", "scene.points=100", "scene.train_views=3", "training.checkpoint_every=4",
+       "training.log_every=2", "tracker=[tensorboard]")  # fmt: skip
 
 
 def read(folder: Path) -> EventAccumulator:
@@ -46,7 +46,7 @@ def assert_curves_are_those_of_the_file(folder: Path) -> None:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tensorboard") / "run"
     pseudo = ("augmenter=[upscale]", "regenerator/upscale=lanczos", "augmenter.upscale.project=exact")
-    tiny_run(folder, (*RUN, *pseudo))
+    tiny_run(folder, (*RUN, *pseudo, "eval.zoom=[1,2]"))
     return folder
 
 
@@ -65,7 +65,7 @@ def test_the_evaluation_is_that_of_the_file(finished: Path) -> None:
     assert {"evaluation/psnr", "evaluation/x2/psnr"} <= expected.keys()
     found = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"] if tag.startswith("evaluation/")}
     assert {tag: [(p.step, p.value) for p in points] for tag, points in found.items()} == {
-        tag: [(24, pytest.approx(value, rel=1e-6))] for tag, value in expected.items()
+        tag: [(12, pytest.approx(value, rel=1e-6))] for tag, value in expected.items()
     }
 
 
@@ -75,9 +75,9 @@ def test_pictures_and_the_configuration_are_there(finished: Path) -> None:
     expected = sorted(f"{name}/{kind}" for name in names for kind in ("render", "truth"))
     assert sorted(events.Tags()["images"]) == expected
     (picture,) = events.Images(expected[0])
-    assert (picture.step, picture.width, picture.height) == (24, 48, 36)
+    assert (picture.step, picture.width, picture.height) == (12, 48, 36)
     (text,) = events.Tensors("config/text_summary")
-    assert "    iterations: 24\n" in text.tensor_proto.string_val[0].decode()
+    assert "    iterations: 12\n" in text.tensor_proto.string_val[0].decode()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -87,36 +87,37 @@ def test_as_many_pictures_as_asked_for(count: int, tmp_path: Path) -> None:
 
 
 def test_a_killed_run_goes_on_without_doubled_points(tmp_path: Path) -> None:
-    # checkpoints at 7 and 14: what a kill at step 18 leaves are events later than the checkpoint
+    # checkpoints at 4 and 8: what a kill at step 10 leaves are events later than the checkpoint
     folder = tmp_path / "run"
-    tiny_run(folder, RUN, stop_after=18)
-    for path in (folder / "checkpoints").glob("step_0000018.*"):
+    tiny_run(folder, RUN, stop_after=10)
+    for path in (folder / "checkpoints").glob("step_0000010.*"):
         path.unlink()
-    assert read(folder / "tensorboard").Scalars("loss")[-1].step == 18
+    assert read(folder / "tensorboard").Scalars("loss")[-1].step == 10
     run, settings = open_run(folder, plugins())
-    assert run.step == 14
+    assert run.step == 8
     execute(run, settings, plugins())
     assert_curves_are_those_of_the_file(folder)
-    assert lines(folder)[-1]["step"] == 24
+    assert lines(folder)[-1]["step"] == 12
 
 
 def test_lines_of_a_trunk_are_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
-    tiny_run(tmp_path / "first", (*RUN, "init=warm_start", "tracker=[]"), stop_after=13)
+    tiny_run(tmp_path / "first", (*RUN, "init=warm_start", "tracker=[]"), stop_after=7)
     tiny_run(tmp_path / "second", (*RUN, "init=warm_start"))
+    assert (tmp_path / "second" / "branch.json").is_file()
     assert_curves_are_those_of_the_file(tmp_path / "second")
     assert lines(tmp_path / "second")[0]["step"] == 1
 
 
 def test_lines_are_on_disk_when_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Look:
-        """Reads at step 8, and hears of it after the tracker."""
+        """Reads at step 4, and hears of it after the tracker."""
 
         steps: list[int]
 
         @hookimpl(trylast=True)
         def gsx_step_finished(self, run: Run) -> None:
-            if run.step == 8:
+            if run.step == 4:
                 Look.steps = [point.step for point in read(run.folder / "tensorboard").Scalars("loss")]
 
     def slow(writer: RecordWriter, data: bytes) -> None:
@@ -127,9 +128,9 @@ def test_lines_are_on_disk_when_they_are_written(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(RecordWriter, "write", slow)
     settings, loaded = tiny_settings(tmp_path / "run", *RUN), plugins()
     run = start(settings, loaded)
-    with loaded.listening([Look(), StopAfter(10)]):
+    with loaded.listening([Look(), StopAfter(5)]):
         execute(run, settings, loaded)
-    assert Look.steps == [line["step"] for line in lines(tmp_path / "run") if line["step"] <= 8]
+    assert Look.steps == [line["step"] for line in lines(tmp_path / "run") if line["step"] <= 4]
 
 
 def test_why_a_run_failed_is_said(tmp_path: Path) -> None:

@@ -110,11 +110,13 @@ def test_options_that_say_nothing_are_refused(key: str, value: object) -> None:
 
 # -- runs ------------------------------------------------------------------------------------------------------------
 
-SIZE = ("scene.width=96", "scene.height=80")
+SIZE = ("scene.width=80", "scene.height=64", "eval.zoom=[1]")
 MOVED = (
-    *(*SIZE, "scene.disturb.blur=8", "training.blur.when=always", "training.blur.start=0.5"),
-    *("iterations=60", "backbone.rates.shortened=0.4", "scene.points=3000", "backbone.max_primitives=14000"),
+    *(*SIZE, "scene.disturb.blur=8", "training.blur.when=always", "training.blur.start=0.5", "training.blur.times=3"),
+    *("iterations=40", "backbone.rates.shortened=0.4", "scene.points=3000", "backbone.max_primitives=10000"),
 )
+SHORTER = (*MOVED, "iterations=12", "scene.points=300")
+"""Movements are asked for before steps 7, 9 and 11."""
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +131,7 @@ def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     told = [line for line in run.curves if "blur_seconds" in line]
     assert [line["step"] for line in told] == run.blur.steps()
     assert f"moved in {len(run.blur.movements)} training photographs" in " ".join(remarks_of(gathered(run.curves)))
-    size, far = torch.tensor([96.0, 80.0], dtype=torch.float64), 0
+    size, far = torch.tensor([80.0, 64.0], dtype=torch.float64), 0
     for view in run.scene.train:
         made = torch.tensor(movement_of(view.name, 8.0), dtype=torch.float64)
         found = size * torch.tensor(run.blur.movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
@@ -137,14 +139,14 @@ def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     assert far <= 1
 
 
-def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(
-    moved: tuple[Run, Path], tmp_path: Path
-) -> None:
-    tiny_run(tmp_path / "stopped", MOVED, stop_after=40)
+def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(tmp_path: Path) -> None:
+    whole = tiny_run(tmp_path / "whole", SHORTER)
+    assert [line["step"] for line in whole.curves if "blur_seconds" in line] == [7, 9, 11]
+    tiny_run(tmp_path / "stopped", SHORTER, stop_after=8)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.blur.movements
     execute(run, settings, plugins())
-    a, b = final_tensors(moved[1]), final_tensors(tmp_path / "stopped")
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert any(name.startswith("blur.of ") for name in a)
     assert all(torch.equal(a[name], b[name]) for name in a)
@@ -175,9 +177,9 @@ def test_halves_take_the_movements_that_were_found(moved: tuple[Run, Path]) -> N
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
-    plain = tiny_run(tmp_path / "plain", [*SIZE, "iterations=12"])
+    plain = tiny_run(tmp_path / "plain", [*SIZE, "iterations=6"])
     words = ["training.blur.when=auto", "training.blur.sharpness=10", "training.blur.explained=0.5"]
-    judged = tiny_run(tmp_path / "judged", [*SIZE, "iterations=12", *words])
+    judged = tiny_run(tmp_path / "judged", [*SIZE, "iterations=6", *words])
     assert not plain.blur.movements
     assert [line["blurred"] for line in judged.curves if "blur_seconds" in line] == [0]
     assert [line["blur_suspects"] for line in judged.curves if "blur_seconds" in line] == [6]

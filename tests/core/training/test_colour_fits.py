@@ -58,9 +58,8 @@ def pictures(model: GS3D) -> Tensor:
         return torch.stack([rasterize(model.draw(one, STEP).splats, one, model.raster).image for one in cameras])
 
 
-def change_with(model: GS3D, coefficients: Tensor) -> float:
+def change_with(model: GS3D, coefficients: Tensor, before: Tensor) -> float:
     """Squared change of all pictures where the colours are of that degree."""
-    before = pictures(model)
     kept = {name: model.table[name].detach().clone() for name in ("sh_dc", "sh_rest")}
     with torch.no_grad():
         model.table["sh_rest"].zero_()
@@ -70,6 +69,15 @@ def change_with(model: GS3D, coefficients: Tensor) -> float:
         for name, value in kept.items():
             model.table[name].copy_(value)
     return float((after - before).double().square().sum())
+
+
+@pytest.fixture(scope="module")
+def alone() -> tuple[GS3D, ColourFits, Tensor]:
+    """(one Gaussian, its fits with signs drawn often, its pictures)."""
+    model = model_seen_from(AROUND)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evidence, "DRAWS", 12 * 300)
+        return model, fits_of(model), pictures(model)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -84,38 +92,35 @@ def test_colours_of_that_degree_are_kept(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_the_change_told_is_that_of_pictures(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one Gaussian, with signs drawn often: for the fit, and for bands cut off."""
-    monkeypatch.setattr(evidence, "DRAWS", 12 * 300)
-    model = model_seen_from(AROUND)
-    fits = fits_of(model)
+def test_the_change_told_is_that_of_pictures(degree: int, alone: tuple[GS3D, ColourFits, Tensor]) -> None:
+    """Of one Gaussian: for the fit, and for bands cut off."""
+    model, fits, before = alone
     for coefficients in (fitted(fits, degree), own_coefficients(model.table, degree)):
-        actual = change_with(model, coefficients)
+        actual = change_with(model, coefficients, before)
         assert actual > 1e-3
         assert float(squared_change(fits, coefficients)) == pytest.approx(actual, rel=0.1)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_no_other_coefficients_change_pictures_less(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_other_coefficients_change_pictures_less(degree: int, alone: tuple[GS3D, ColourFits, Tensor]) -> None:
     """Renders with the fit moved a little along each coefficient, to either side."""
-    monkeypatch.setattr(evidence, "DRAWS", 12 * 300)
-    model = model_seen_from(AROUND)
-    best = fitted(fits_of(model), degree)
-    least = change_with(model, best)
+    model, fits, before = alone
+    best = fitted(fits, degree)
+    least = change_with(model, best, before)
     for index in range(len(best)):
         for moved in (-0.03, 0.03):
             other = best.clone()
             other[index] += moved
-            assert change_with(model, other) > least
+            assert change_with(model, other, before) > least
 
 
 def test_what_bands_are_in_the_mean_is_not_lost() -> None:
     """Seen from one side, bands do what a constant colour can do: cutting them off costs most of what they are."""
     model = model_seen_from(ONE_SIDE, rows=3)
-    fits = fits_of(model)
-    cut, fit = (change_with(model, one) for one in (own_coefficients(model.table, 0), fitted(fits, 0)))
+    fits, before = fits_of(model), pictures(model)
+    cut, fit = (change_with(model, one, before) for one in (own_coefficients(model.table, 0), fitted(fits, 0)))
     assert fit < 0.25 * cut
-    assert change_with(model, fitted(fits, 1)) < 0.1 * fit
+    assert change_with(model, fitted(fits, 1), before) < 0.1 * fit
 
 
 def test_rows_that_no_view_shows_keep_what_they_have() -> None:

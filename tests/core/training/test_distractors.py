@@ -124,17 +124,21 @@ def test_views_are_the_same_until_others_are_found() -> None:
 BEFORE_IT = (
     "scene.disturb.covered=0.1",
     "training.distractors.when=always",
-    "training.distractors.start=0.5",
+    "training.distractors.start=0.6",
     "training.distractors.until=0.8",
-    "iterations=60",
+    "training.distractors.times=3",
+    "iterations=40",
     "backbone.rates.shortened=0.4",
+    "backbone.max_primitives=1200",
+    "scene.points=900",
+    "eval.zoom=[1]",
 )
 
 
 def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photographs(tmp_path: Path) -> None:
     """Of what covers them most is found; not much of the rest."""
     whole = tiny_run(tmp_path / "whole", BEFORE_IT)
-    tiny_run(tmp_path / "stopped", BEFORE_IT, stop_after=40)
+    tiny_run(tmp_path / "stopped", BEFORE_IT, stop_after=26)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.distractors.marked is not None
     execute(run, settings, plugins())
@@ -169,7 +173,10 @@ def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Movements are shares of a view's sides: those of the smaller view that was rendered."""
-    run, seen = tiny_run(tmp_path, ["iterations=1", "scene.width=80", "scene.height=64"]), list[tuple[object, ...]]()
+    run, seen = (
+        tiny_run(tmp_path, ["iterations=1", "eval.zoom=[1]", "scene.width=80", "scene.height=64"]),
+        list[tuple[object, ...]](),
+    )
 
     def applied(image: Tensor, view: View) -> Tensor:
         seen.append(((image.shape[2], image.shape[1]), view.camera.size))
@@ -182,9 +189,10 @@ def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
-    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
+    short = ["iterations=6", "eval.zoom=[1]"]
+    plain = tiny_run(tmp_path / "plain", short)
     asked = ["training.distractors.when=auto", "training.distractors.share=0.9"]
-    judged = tiny_run(tmp_path / "judged", ["iterations=12", *asked])
+    judged = tiny_run(tmp_path / "judged", [*short, *asked])
     assert plain.distractors.marked is None
     assert judged.distractors.marked is None
     assert [line["distractors"] for line in judged.curves if "distractor_share" in line] == [0]
@@ -195,7 +203,7 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
 
 def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_path: Path) -> None:
     """All but the first photograph count whole, and of that the left half does not."""
-    run = tiny_run(tmp_path, ["iterations=4"])
+    run = tiny_run(tmp_path, ["iterations=4", "eval.zoom=[1]"])
     blocks = [torch.zeros(9, 12, dtype=torch.bool) for _ in run.scene.train]
     blocks[0][:, :6] = True
     before = run.backbone.table["means"].clone()

@@ -1,6 +1,7 @@
 """Several views in one step: gradients, losses and statistics by hand from single views; order, failures, resuming."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +29,25 @@ from gsx.core.training.parameter_table import (
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import backward, train_step
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.open import open_run, start
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import Settings
 
 PLAIN = ("iterations=40", "rasterizer=eager")
 
 
+@cache
+def composed(*words: str) -> Settings:
+    return tiny_settings(Path("unused"), *PLAIN, *words)
+
+
 def fresh(folder: Path, *words: str) -> Run:
     """A run at step 0 whose next views are 4, 1, 5."""
-    run = start(tiny_settings(folder, *PLAIN, *words), plugins())
+    folder.mkdir()
+    settings = composed(*words)
+    run = build(settings, load_scene(settings), folder, training=True)
     run.sampler.order = [0, 5, 1, 4]
     return run
 
@@ -350,7 +361,10 @@ def test_a_batch_without_views_is_refused(batch: int, tmp_path: Path) -> None:
 
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
-DENSE = (*PLAIN, "iterations=20", "training.batch=2", "backbone.density.every=400", "backbone.density.gradient=1e-6")
+DENSE = (
+    *(*PLAIN, "iterations=14", "training.batch=2", "scene.points=100", "eval.zoom=[1]"),
+    *("backbone.density.every=400", "backbone.density.stop=28000", "backbone.density.gradient=0.002"),
+)
 
 
 def final(folder: Path) -> dict[str, Tensor]:
@@ -359,8 +373,9 @@ def final(folder: Path) -> dict[str, Tensor]:
 
 def test_a_resumed_run_of_batches_equals_one_that_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", DENSE)
-    assert any("cloned" in line for line in whole.curves), "the test needs density events"
-    tiny_run(tmp_path / "run", DENSE, stop_after=7)
+    grown = [line["step"] for line in whole.curves if "cloned" in line]
+    assert grown == [6, 12], "the test needs density events before and after the stop"
+    tiny_run(tmp_path / "run", DENSE, stop_after=8)
     run, settings = open_run(tmp_path / "run", plugins(), training=True)
     execute(run, settings, plugins())
     assert_same(final(tmp_path / "run"), final(tmp_path / "whole"))

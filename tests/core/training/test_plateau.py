@@ -16,6 +16,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
+from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.execute import execute
@@ -29,6 +30,9 @@ WORDS = (
     "rasterizer=eager",
     "training.log_every=1",
     "training.test_points=0",
+    "scene.points=100",
+    "backbone.max_primitives=150",
+    "eval.zoom=[1]",
 )
 """Six views: windows begin after step 10, are judged after step 16, then after 22 and 28; the last part is from 32."""
 LEAVES_OUT = (*WORDS, "training.plateau.price=100")
@@ -110,9 +114,16 @@ def test_rounding_counts_where_pixels_do(monkeypatch: pytest.MonkeyPatch) -> Non
     assert rounding_in(windows).tolist() == pytest.approx([300 / 12 / 255**2, 3 * (64 - 8) / 12 / 255**2])
 
 
-def test_steps_that_gain_too_little_are_left_out(tmp_path: Path) -> None:
-    run = tiny_run(tmp_path / "run", LEAVES_OUT)
-    assert steps_of(tmp_path / "run") == [*range(1, 17), *range(32, 41)]
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
+    """(a finished run that left steps out, its folder)."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    return tiny_run(folder, LEAVES_OUT), folder
+
+
+def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> None:
+    run, folder = whole
+    assert steps_of(folder) == [*range(1, 17), *range(32, 41)]
     assert run.plateau.found[:, 0].tolist() == [16]
     assert run.curves[16]["steps_left_out"] == 15
 
@@ -174,24 +185,23 @@ def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.M
     taken.clear()
     tiny_run(tmp_path / "later", words, stop_after=18)
     monkeypatch.undo()
-    tiny_run(tmp_path / "whole", words, stop_after=18)
-    plain_end, white, later, whole = (final_tensors(tmp_path / name) for name in ("plain", "white", "later", "whole"))
+    tiny_run(tmp_path / "longer", words, stop_after=18)
+    plain_end, white, later, longer = (final_tensors(tmp_path / name) for name in ("plain", "white", "later", "longer"))
     parameters = [name for name in plain_end if name.startswith("parameters.")]
     assert all(torch.equal(plain_end[name], white[name]) for name in parameters)
-    assert not all(torch.equal(later[name], whole[name]) for name in parameters)
+    assert not all(torch.equal(later[name], longer[name]) for name in parameters)
 
 
 @pytest.mark.parametrize("stop", [12, 15, 16, 33])
-def test_resuming_equals_never_having_stopped(stop: int, tmp_path: Path) -> None:
+def test_resuming_equals_never_having_stopped(stop: int, whole: tuple[Run, Path], tmp_path: Path) -> None:
     """Before the windows are judged, just then, and after steps were left out."""
-    tiny_run(tmp_path / "whole", LEAVES_OUT)
     tiny_run(tmp_path / "parts", LEAVES_OUT, stop_after=stop)
     again, settings = open_run(tmp_path / "parts", plugins(), ())
     execute(again, settings, plugins())
-    expected, found = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "parts")
+    expected, found = final_tensors(whole[1]), final_tensors(tmp_path / "parts")
     assert expected.keys() == found.keys()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
-    assert steps_of(tmp_path / "parts") == steps_of(tmp_path / "whole")
+    assert steps_of(tmp_path / "parts") == steps_of(whole[1])
 
 
 def test_options_are_checked_together(tmp_path: Path) -> None:

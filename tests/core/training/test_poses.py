@@ -87,12 +87,12 @@ def waves(across: float, down: float) -> Tensor:
 
 
 def test_the_spread_of_shifts_is_that_of_poses() -> None:
-    shifts = 0.8 * numbers(40, 2)
+    shifts = 0.8 * numbers(20, 2)
     found = spread_of_shifts((waves(0, 0), waves(*shift), None, 1.0) for shift in shifts.tolist())
     assert found == pytest.approx(float(shifts.var(0).mean().sqrt()), rel=0.05)
     small = spread_of_shifts((waves(0, 0), waves(*shift), None, 2.0) for shift in shifts.tolist())
     assert small == pytest.approx(2 * found)  # px of photographs twice as large
-    halves = [torch.cat([waves(a, 0)[..., :48], waves(b, 0)[..., 48:]], 2) for a, b in numbers(40, 2).tolist()]
+    halves = [torch.cat([waves(a, 0)[..., :48], waves(b, 0)[..., 48:]], 2) for a, b in numbers(20, 2).tolist()]
     assert (
         spread_of_shifts((waves(0, 0), one, None, 1.0) for one in halves) < 0.45
     )  # halves that do not agree tell nothing
@@ -213,24 +213,35 @@ WRONG = (
     "training.poses.when=always",
     "training.poses.times=3",
     "iterations=12",
+    "scene.points=150",
+    "eval.zoom=[1]",
 )
 
 
-def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(tmp_path: Path) -> None:
-    whole = tiny_run(tmp_path / "whole", WRONG)
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
+    """(a finished run with corrected poses, its folder)."""
+    folder = tmp_path_factory.mktemp("corrected") / "run"
+    return tiny_run(folder, WRONG), folder
+
+
+def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple[Run, Path], tmp_path: Path) -> None:
+    whole, folder = corrected
     assert whole.poses.matrices is not None
     assert len(whole.poses.matrices) == 6
     tiny_run(tmp_path / "stopped", WRONG, stop_after=4)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.poses.matrices is not None
     execute(run, settings, plugins())
-    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "poses.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(tmp_path: Path) -> None:
+def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(
+    corrected: tuple[Run, Path], tmp_path: Path
+) -> None:
     """Asked to stop while the views of step 4 are rendered, before which poses are corrected a second time."""
 
     def stop(run: Run, number: int, view: View, *rest: object) -> Step:
@@ -238,20 +249,21 @@ def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(t
             raise Stopped("asked to")
         return view_loss(run, number, view, *rest)
 
-    whole = tiny_run(tmp_path / "whole", WRONG)
+    whole, folder = corrected
     with patch.object(trainer, "view_loss", stop):
         tiny_run(tmp_path / "stopped", WRONG)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert (run.step, run.poses.corrected) == (3, 4)
     execute(run, settings, plugins())
     assert torch.equal(run.poses.matrices, whole.poses.matrices)
-    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
-    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
-    judged = tiny_run(tmp_path / "judged", ["iterations=12", "training.poses.when=auto", "training.poses.spread=50"])
+    short = ["iterations=6", "eval.zoom=[1]"]
+    plain = tiny_run(tmp_path / "plain", short)
+    judged = tiny_run(tmp_path / "judged", [*short, "training.poses.when=auto", "training.poses.spread=50"])
     assert plain.poses.matrices is None
     assert judged.poses.matrices is None
     assert [line["poses"] for line in judged.curves if "pose_spread" in line] == [0]

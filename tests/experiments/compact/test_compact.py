@@ -2,7 +2,9 @@
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -12,12 +14,13 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
-from gsx.core.data.scene import View
+from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply
 from gsx.core.plugins import hookimpl
 from gsx.core.quality.metrics import psnr
+from gsx.core.training import evidence
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Step
@@ -39,13 +42,30 @@ from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import Settings
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scenes_loaded_once() -> Iterator[None]:
+    """By their options."""
+    loaded: dict[str, Scene] = {}
+
+    def load(settings: Settings) -> Scene:
+        key = repr(settings.scene.options)
+        if key not in loaded:
+            loaded[key] = load_scene(settings)
+        return loaded[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsx.experiments.runs.open.load_scene", load)
+        yield
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 60 steps."""
+    """A run of 24 steps."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    words = ("iterations=60", "backbone.sh_degree=2", "backbone.density.gradient=0.003", "rasterizer=eager")
+    words = ("iterations=24", "backbone.sh_degree=2", "backbone.density.gradient=0.003", "rasterizer=eager")
     tiny_run(path, (*words, "eval.zoom=[1,2]"))
     return path
 
@@ -58,6 +78,26 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(1)
 
 
+@pytest.fixture(scope="module")
+def prepared(folder: Path) -> Shrinking:
+    return Shrinking(opened(folder), ShrinkOptions(max_drop=0.0, steps=0, zooms=(1.0,)), plugins(), generator())
+
+
+@pytest.fixture
+def shrinking(prepared: Shrinking) -> Shrinking:
+    """Of the whole model, which nothing has been tried on; tries learn nothing."""
+    prepared.tried = []
+    prepared.cut(0.0, prepared.untouched.degree, merging=False)
+    return prepared
+
+
+@pytest.fixture
+def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The share that goes is found to a quarter; what rows are worth by fewer signs."""
+    monkeypatch.setattr(evidence, "DRAWS", 6)
+    monkeypatch.setattr(compacting, "ShrinkOptions", partial(ShrinkOptions, tries=2))
+
+
 def add_faint(run: Run) -> Tensor:
     """Copies of all rows with an opacity of 1e-6; which these are."""
     old = len(run.backbone.table)
@@ -65,7 +105,8 @@ def add_faint(run: Run) -> Tensor:
     return torch.arange(2 * old) >= old
 
 
-def test_what_cannot_be_seen_is_worth_least(folder: Path) -> None:
+def test_what_cannot_be_seen_is_worth_least(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evidence, "DRAWS", 6)
     run = opened(folder)
     faint = add_faint(run)
     worth = worth_of(run, run.scene.train, generator())
@@ -80,12 +121,12 @@ def test_what_cannot_be_seen_is_worth_least(folder: Path) -> None:
 def test_worth_is_what_pictures_lose() -> None:
     """Renders without each of a few splats, at the views' own size; the mean over many signs."""
     run = opened_small()
-    seeds = [torch.Generator().manual_seed(seed) for seed in range(40)]
-    worth = torch.stack([worth_of(run, run.scene.train, seed) for seed in seeds]).mean(0)
-    changes = []
+    seeds, views = [torch.Generator().manual_seed(seed) for seed in range(10)], run.scene.train[:3]
+    worth = torch.stack([worth_of(run, views, seed) for seed in seeds]).mean(0)
+    whole, changes = [render(run, view.camera).image for view in views], []
     for row in range(len(worth)):
         less = opened_small(without=row)
-        pairs = [(render(run, v.camera).image, render(less, v.camera).image) for v in run.scene.train]
+        pairs = [(image, render(less, view.camera).image) for image, view in zip(whole, views, strict=True)]
         changes.append(sum(float((a - b).square().sum()) for a, b in pairs))
     seen = torch.tensor(changes) > 0.1
     assert int(seen.sum()) > 4
@@ -93,9 +134,14 @@ def test_worth_is_what_pictures_lose() -> None:
     assert float(torch.corrcoef(logs)[0, 1]) > 0.9
 
 
+@cache
+def small() -> Settings:
+    return tiny_settings(Path("unused"), "scene.points=12")
+
+
 def opened_small(without: int | None = None) -> Run:
     """A model of 12 large splats."""
-    settings = tiny_settings(Path("unused"), "scene.points=12")
+    settings = small()
     run = build(settings, load_scene(settings), Path())
     with torch.no_grad():
         run.backbone.table["log_scales"].fill_(-1.0)
@@ -159,11 +205,10 @@ def test_it_learns_on_from_the_views_that_are_not_judged_by(folder: Path) -> Non
     assert run.resolution is resolution
 
 
-def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(folder: Path) -> None:
-    run = opened(folder)
+def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrinking) -> None:
+    run = shrinking.run
     before = run.backbone.table["means"].detach().clone()
-    options = ShrinkOptions(max_drop=-5.0, steps=0, tries=2, zooms=(1.0,))
-    shrinking = Shrinking(run, options, plugins(), generator())
+    shrinking.options = replace(shrinking.options, max_drop=-5.0, tries=2)
     best = shrinking.smallest()
     assert best not in shrinking.tried
     shrinking.take(best)
@@ -194,10 +239,10 @@ def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytes
     ],
 )
 def test_the_smallest_within_the_budget_is_found(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, drops: dict[int, float], degree: int, most: float
+    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch, drops: dict[int, float], degree: int, most: float
 ) -> None:
     """By drops that grow with the share, of which 0.3 dB are allowed."""
-    shrinking = Shrinking(opened(folder), ShrinkOptions(max_drop=0.3, steps=0, tries=5), plugins(), generator())
+    shrinking.options = replace(shrinking.options, max_drop=0.3, tries=5)
     with_drops(shrinking, drops, monkeypatch)
     best = shrinking.smallest()
     assert [made.removed for made in shrinking.tried[2:7]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
@@ -216,11 +261,11 @@ def test_the_smallest_within_the_budget_is_found(
     ],
 )
 def test_a_model_that_leaves_room_for_a_quantised_file_is_taken_if_its_file_is_smaller(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, lost: float, taken: float
+    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch, lost: float, taken: float
 ) -> None:
-    run = opened(folder)
+    run = shrinking.run
     rows = len(run.backbone.table)
-    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
+    shrinking.options = replace(shrinking.options, max_drop=0.1)
     tries = [
         replace(shrinking.untouched, removed=share, megabytes=(1 - share) * shrinking.untouched.megabytes, drop=drop)
         for share, drop in ((0.5, 0.09), (0.25, 0.03), (0.75, 0.4))
@@ -239,11 +284,11 @@ def test_a_model_that_leaves_room_for_a_quantised_file_is_taken_if_its_file_is_s
 
 
 def test_a_file_that_loses_more_than_it_was_expected_to_is_not_taken(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = opened(folder)
+    run = shrinking.run
     rows = len(run.backbone.table)
-    shrinking = Shrinking(run, ShrinkOptions(max_drop=0.1, steps=0), plugins(), generator())
+    shrinking.options = replace(shrinking.options, max_drop=0.1)
     best = replace(shrinking.untouched, removed=0.5, megabytes=0.5 * shrinking.untouched.megabytes, drop=0.09)
     shrinking.tried.append(best)
     shrinking.take(best)
@@ -263,6 +308,7 @@ def test_figures_tell_nothing_that_photographs_cannot(found: float, told: float)
     assert above_rounding(found) == pytest.approx(told, abs=0.002)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:
     """With a checkpoint that opens, figures, files within the promise, and a page with both."""
     to = tmp_path / "small"
@@ -286,6 +332,7 @@ def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:
     assert learnt == pytest.approx(figures(big, judges(big)[1], [1.0])["1"], abs=1.0)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_bands_that_go_are_not_in_the_files(folder: Path, tmp_path: Path) -> None:
     """Everything may be lost, so that only the constant colours are left: 17 numbers and three normals a splat."""
     compact(folder, tmp_path / "small", 50.0, 1, [], plugins())
@@ -297,8 +344,9 @@ def test_bands_that_go_are_not_in_the_files(folder: Path, tmp_path: Path) -> Non
     assert read_run(tmp_path / "small").evaluation["megabytes"] == pytest.approx(found["chosen"]["megabytes"], rel=1e-6)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_anchors_are_made_smaller(tmp_path: Path) -> None:
-    words = ("backbone=scaffold", "iterations=20", "rasterizer=eager", "training.batch=2")
+    words = ("backbone=scaffold", "iterations=6", "rasterizer=eager", "training.batch=2", "eval.zoom=[1]")
     tiny_run(tmp_path / "run", words)
     compact(tmp_path / "run", tmp_path / "small", 50.0, 1, [], plugins())
     found = json.loads((tmp_path / "small" / "compact.json").read_text())
@@ -309,9 +357,9 @@ def test_anchors_are_made_smaller(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_made_smaller_is_told_and_leaves_nothing(folder: Path, tmp_path: Path) -> None:
-    tiny_run(tmp_path / "stopped", ("iterations=20", "rasterizer=eager"), stop_after=5)
+    tiny_run(tmp_path / "stopped", ("iterations=2", "rasterizer=eager"), stop_after=1)
     tiny_run(tmp_path / "judged", ("iterations=0", f"init={folder / 'point_cloud.ply'}", "rasterizer=eager"))
-    with pytest.raises(InputError, match="is at step 5 of 20"):
+    with pytest.raises(InputError, match="is at step 1 of 2"):
         compact(tmp_path / "stopped", tmp_path / "a", 0.1, 1, [], plugins())
     with pytest.raises(InputError, match="trained nothing: give that file"):
         compact(tmp_path / "judged", tmp_path / "b", 0.1, 1, [], plugins())
@@ -320,26 +368,28 @@ def test_what_cannot_be_made_smaller_is_told_and_leaves_nothing(folder: Path, tm
 
 
 def test_an_error_leaves_no_folder(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*given: object) -> Try:
+    def fail(*given: object) -> Shrinking:
         raise MemoryError
 
-    monkeypatch.setattr(Shrinking, "attempt", fail)
+    monkeypatch.setattr(compacting, "Shrinking", fail)
     with pytest.raises(MemoryError):
         compact(folder, tmp_path / "small", 0.1, 1, [], plugins())
     assert not (tmp_path / "small").exists()
 
 
 def test_masked_pixels_make_no_row_worth_anything(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evidence, "DRAWS", 6)
     run = opened(folder)
     assert float(worth_of(run, run.scene.train, generator()).max()) > 0
     monkeypatch.setattr(View, "counted", lambda view: torch.zeros(36, 48, dtype=torch.bool))
     assert float(worth_of(run, run.scene.train, generator()).max()) == 0
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_splat_file_is_made_smaller(folder: Path, tmp_path: Path) -> None:
-    scene = [f"scene.{key}" for key in ("width=48", "height=36", "train_views=6", "test_views=2", "samples=1")]
+    scene = [f"scene.{key}" for key in ("width=48", "height=36", "train_views=4", "test_views=1", "samples=1")]
     words = ["compact", str(folder / "point_cloud.ply"), "scene=demo", *scene, "rasterizer=eager", "device=cpu"]
-    assert main([*words, "--max-drop-db", "1", "--steps", "2", "--to", str(tmp_path / "small")]) == 0
+    assert main([*words, "eval.zoom=[1]", "--max-drop-db", "1", "--steps", "1", "--to", str(tmp_path / "small")]) == 0
     found = json.loads((tmp_path / "small" / "compact.json").read_text())
     assert found["chosen"]["primitives"] < found["before"]["primitives"]
     assert (tmp_path / "small" / "report.html").is_file()

@@ -1,6 +1,8 @@
 """Composition: every file composes, typed options, nearest matches."""
 
 from dataclasses import replace
+from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -9,13 +11,15 @@ from omegaconf import OmegaConf
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.compose import Compositions, compose
-from gsx.experiments.runs.settings import read_config, typed, write_config
+from gsx.experiments.runs.settings import Settings, read_config, typed, write_config
 from gsx.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[3] / "conf"
 GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks", "trade"})
 """Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py; what gsx trade tries in
 test_training_trade.py."""
+APART = ("augmenter", "experiment", "protocol", "rasterizer", "tracker")
+"""Groups whose files set nothing that those of another of them set, so that one of each is composed at once."""
 NEEDS = {
     ("preset", "scaffold"): ("backbone=scaffold", "scene=blender"),
     ("preset", "octree"): ("backbone=octree_scaffold",),
@@ -26,15 +30,36 @@ NEEDS = {
 """What the settings of a dataset are for."""
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@cache
+def composed(*words: str) -> Settings:
+    """What several tests look at and none changes."""
+    return compose(words, plugins())
+
+
+def options_of(group: str) -> list[str]:
+    """Names of its files."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("group", [group for group in GROUPS if group not in APART])
 def test_every_file_composes_and_fits_its_schema(group: str) -> None:
     with Compositions(plugins()) as compositions:
-        for option in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
-            plus = "+" if group == "experiment" else ""  # not in the defaults: it is asked for or absent
-            chosen = f"{plus}{group}={option}"
-            settings = compositions.settings([*NEEDS.get((group, option.split("_")[0]), ()), chosen])
+        for option in options_of(group):
+            settings = compositions.settings([*NEEDS.get((group, option.split("_")[0]), ()), f"{group}={option}"])
             if group in ("scene", "backbone"):
                 assert getattr(settings, group).component.name == option
+
+
+def test_every_file_of_what_is_chosen_apart_composes_and_fits_its_schema() -> None:
+    with Compositions(plugins()) as compositions:
+        for row in zip_longest(*([f"{group}={option}" for option in options_of(group)] for group in APART)):
+            chosen = [word.replace("experiment=", "+experiment=") for word in row if word]  # which has no default
+            settings = compositions.settings(chosen)
+            asked = [word.split("=")[0] for word in chosen]
+            assert (len(settings.augmenters), len(settings.trackers)) == (
+                asked.count("augmenter"),
+                asked.count("tracker"),
+            )
 
 
 def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
@@ -59,8 +84,6 @@ def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
         (["scene=colmap", "budget=quick"], 1500),
         (["scene=colmap", "backbone=octree_scaffold", "scene.iterations=700"], 700),
         (["scene=colmap", "variant=octree_ub"], 40000),
-        (["scene=colmap", "variant=up_3dgs"], 30000),
-        (["scene=colmap", "variant=octree_gs_8"], 80000),
         (["scene=colmap", "variant=octree_ub", "iterations=5"], 5),
         ([], 900),  # the built-in scene
         (["backbone=octree_scaffold"], 900),
@@ -69,7 +92,7 @@ def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:
     ],
 )
 def test_a_run_is_as_long_as_its_method_was_published(words: list[str], iterations: int) -> None:
-    assert compose(words, plugins()).general.iterations == iterations
+    assert composed(*words).general.iterations == iterations
 
 
 def test_a_backbone_that_names_no_length_is_run_as_long_as_3d_gs() -> None:
@@ -82,7 +105,7 @@ def compose_length(words: list[str]) -> int:
 
 
 def test_published_values_of_gs3d() -> None:
-    options = compose(["backbone=gs3d"], plugins()).backbone.options
+    options = composed("backbone=gs3d").backbone.options
     assert (options.rates.means_first, options.rates.means_last) == (1.6e-4, 1.6e-6)
     assert options.rates.sh_rest == pytest.approx(options.rates.sh_dc / 20)
     density = options.density
@@ -91,18 +114,16 @@ def test_published_values_of_gs3d() -> None:
 
 @pytest.mark.parametrize("backbone", ["gs3d", "mip_splatting"])
 def test_the_preset_for_zooming_in_holds_for_both_forms_of_gaussians(backbone: str) -> None:
-    plain, zoom = (compose([f"backbone={backbone}", *words], plugins()) for words in ([], ["preset=zoom"]))
+    plain, zoom = composed(f"backbone={backbone}"), composed(f"backbone={backbone}", "preset=zoom")
     assert (plain.training.supersample, plain.backbone.options.rates.shortened) == (1, 0.0)
     assert (zoom.training.supersample, zoom.training.supersample_from) == (2, 0.8)
     assert (zoom.backbone.options.filter, zoom.backbone.options.rates.shortened) == ("mip", 0.4)
-    published = compose([f"backbone={backbone}", "preset=zoom", "iterations=30000"], plugins()).backbone.options
+    published = composed(f"backbone={backbone}", "preset=zoom", "iterations=30000").backbone.options
     assert published.rates == replace(plain.backbone.options.rates, shortened=0.4)  # the same where nothing is shorter
 
 
 def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
-    default, spelt, plain = (
-        compose(words, plugins()) for words in ([], ["backbone=gs3d", "preset=zoom"], ["backbone=gs3d"])
-    )
+    default, spelt, plain = composed(), composed("backbone=gs3d", "preset=zoom"), composed("backbone=gs3d")
     assert default.backbone.component.name == "gs3d_zoom"
     assert replace(default.backbone.options, name="gs3d") == spelt.backbone.options
     assert default.training == spelt.training

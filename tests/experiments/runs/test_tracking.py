@@ -32,7 +32,8 @@ from gsx.trackers.figures import evaluation_figures, line_figures
 
 ROOT = Path(__file__).parents[3]
 BOTH = ("tracker=[tensorboard,mlflow]", "tracker.mlflow.seconds=0")
-DENSE = ("iterations=24", "backbone.density.every=400", "backbone.density.reset_passes=1",
+FEW = ("scene.points=100", "scene.train_views=3")
+DENSE = (*FEW, "iterations=12", "backbone.density.every=400", "backbone.density.reset_passes=1",
          "backbone.density.gradient=1e-6", "training.checkpoint_every=5")  # fmt: skip
 
 
@@ -97,7 +98,7 @@ def loaded() -> Plugins:
 def heard_run(folder: Path, *more: str, listener: object | None = None) -> None:
     """A run of 4 steps, each with its line, with the tracker above."""
     known = loaded()
-    given = ("iterations=4", "training.log_every=1", "+tracker.heard.name=heard", *more)
+    given = (*FEW, "iterations=4", "training.log_every=1", "+tracker.heard.name=heard", *more)
     settings = compose(words(folder, *given), known)
     run = start(settings, known)
     with known.listening([listener] if listener else []):
@@ -117,7 +118,7 @@ def test_the_tracker_of_the_documentation_works(tmp_path: Path) -> None:
     exec(textwrap.dedent(code.group(1)), module)
     plugin = type("Documented", (), {"gsx_register": staticmethod(module["gsx_register"])})()
     known = load_plugins([("gsx", builtin), ("documented", plugin)], points=[])
-    given = ("iterations=2", "+tracker.noted.name=noted", f"+tracker.noted.file={tmp_path / 'notes'}")
+    given = (*FEW, "iterations=2", "+tracker.noted.name=noted", f"+tracker.noted.file={tmp_path / 'notes'}")
     settings = compose(words(tmp_path / "run", *given), known)
     execute(start(settings, known), settings, known)
     assert re.fullmatch(r"run: \d+\.\d\d dB\n", (tmp_path / "notes").read_text())
@@ -188,14 +189,49 @@ def test_a_misspelt_hook_of_a_tracker_is_refused() -> None:
         Tracking("wrong", Unmarked())
 
 
-def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "without", DENSE)
-    tiny_run(tmp_path / "with", (*DENSE, *BOTH, f"output={tmp_path}"))
-    without, with_trackers = final_tensors(tmp_path / "without"), final_tensors(tmp_path / "with")
+OFFLINE = """
+import socket, sys, time
+asked = []
+def refuse(*words, **more):
+    asked.append(words)
+    raise OSError("no network in this test")
+socket.socket.connect = socket.getaddrinfo = refuse
+from gsx.cli.dispatch import main
+from gsx.builtin import plugins
+plugins()
+assert not {"tensorboard", "mlflow"} & set(sys.modules), "imported before they were chosen"
+code = main(sys.argv[1:])
+assert {"tensorboard", "mlflow"} <= set(sys.modules)
+from mlflow.telemetry.client import get_telemetry_client
+assert get_telemetry_client() is None, "telemetry is on"
+time.sleep(1)  # it would ask from another thread
+assert not asked, asked
+sys.exit(code)
+"""
+Tracked = tuple[Path, subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracked:
+    """A run with both trackers, in a process of its own, as a user's: MLflow's telemetry is always off inside pytest
+    and CI."""
+    folder = tmp_path_factory.mktemp("tracked")
+    hidden = ("PYTEST", "CI", "MLFLOW", "DO_NOT_TRACK", "GITHUB", "BUILD")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(hidden)}
+    environment["GSX_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    command = [sys.executable, "-c", OFFLINE, *words(folder / "run", *DENSE, *BOTH, f"output={folder}")]
+    return folder, subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=folder)
+
+
+def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Tracked) -> None:
+    folder, _ = tracked
+    run = tiny_run(tmp_path / "without", DENSE)
+    assert any("split" in line for line in run.curves)
+    without, with_trackers = final_tensors(tmp_path / "without"), final_tensors(folder / "run")
     assert without.keys() == with_trackers.keys()
     assert all(torch.equal(without[name], with_trackers[name]) for name in without)
-    assert (tmp_path / "mlflow.db").is_file()
-    assert (tmp_path / "with" / "tensorboard").is_dir()
+    assert (folder / "mlflow.db").is_file()
+    assert (folder / "run" / "tensorboard").is_dir()
 
 
 def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
@@ -255,12 +291,12 @@ def test_a_missing_package_is_refused_before_anything_is_done(
 def test_a_package_that_went_missing_is_refused_when_a_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tiny_run(tmp_path / "run", ("iterations=4", "tracker=[tensorboard]"), stop_after=2)
+    tiny_run(tmp_path / "run", (*FEW, "iterations=2", "tracker=[tensorboard]"), stop_after=1)
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     assert main(["resume", str(tmp_path / "run")]) == 2
     assert "pip install 'gsx[tensorboard]'" in capsys.readouterr().err
     run, _ = open_run(tmp_path / "run", plugins())  # to look at a run needs no tracker
-    assert run.step == 2
+    assert run.step == 1
 
 
 def test_trackers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -285,37 +321,12 @@ def test_numbers_are_named_as_in_the_files() -> None:
     assert evaluation_figures(evaluation) == {"evaluation/psnr": 21.0, "evaluation/x2/psnr": 20.0}
 
 
-OFFLINE = """
-import socket, sys, time
-asked = []
-def refuse(*words, **more):
-    asked.append(words)
-    raise OSError("no network in this test")
-socket.socket.connect = socket.getaddrinfo = refuse
-from gsx.cli.dispatch import main
-from gsx.builtin import plugins
-plugins()
-assert not {"tensorboard", "mlflow"} & set(sys.modules), "imported before they were chosen"
-code = main(sys.argv[1:])
-assert {"tensorboard", "mlflow"} <= set(sys.modules)
-from mlflow.telemetry.client import get_telemetry_client
-assert get_telemetry_client() is None, "telemetry is on"
-time.sleep(1)  # it would ask from another thread
-assert not asked, asked
-sys.exit(code)
-"""
-
-
-def test_nothing_is_asked_of_the_network_and_little_is_said(tmp_path: Path) -> None:
-    """In a process of its own, as a user's: MLflow's telemetry is always off inside pytest and CI."""
-    hidden = ("PYTEST", "CI", "MLFLOW", "DO_NOT_TRACK", "GITHUB", "BUILD")
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(hidden)}
-    command = [sys.executable, "-c", OFFLINE, *words(tmp_path / "run", "iterations=2", *BOTH, f"output={tmp_path}")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
+def test_nothing_is_asked_of_the_network_and_little_is_said(tracked: Tracked) -> None:
+    folder, result = tracked
     assert result.returncode == 0, result.stderr
-    assert result.stdout == f"{tmp_path / 'run' / 'report.html'}\n"
+    assert result.stdout == f"{folder / 'run' / 'report.html'}\n"
     assert not re.search(r"(?i)warn|alembic|INFO", result.stderr), result.stderr
-    names = {path.name for path in tmp_path.iterdir()}
+    names = {path.name for path in folder.iterdir()}
     assert names == {"run", "mlflow.db", "mlflow_files", ".mlflow.lock"}
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ from gsx.experiments.run_folder.run_key import (
     place_of,
     scene_stamp,
 )
-from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.runs.settings import write_config
+from gsx.experiments.runs.compose import Compositions, compose
+from gsx.experiments.runs.settings import Settings, write_config
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, plan_lines, planned
-from gsx.experiments.tables.sweep import run_table
+from gsx.experiments.tables.sweep import experiment_of, run_table
 
 ROWS = {"control": "octree_gs", "UP": "octree_up", "UB": "octree_ub", "early": "octree_ub_start_10k",
         "same": "octree_ub_infer_1", "other": "3d_gs"}  # fmt: skip
@@ -31,11 +32,20 @@ def experiment(**more: Any) -> Experiment:
     return Experiment(name="t", title="T", published="", datasets=["demo"], baseline="control", rows=ROWS, **more)
 
 
-def cells(table: Experiment, folder: Path, *words: str) -> list[Cell]:
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@cache
+def composed(*words: str) -> Settings:
+    """What several tests ask for and none changes; its output folder is relative to that of the test."""
+    return compose(words, plugins())
+
+
+def cells(table: Experiment, *words: str) -> list[Cell]:
     """As `gsx +experiment=... budget=quick` plans them."""
-    with Compositions(plugins()) as compositions:
-        common = [f"output={folder}", "budget=quick", *words]
-        return list(cells_of(table, DATASETS, lambda variant: common, compositions.settings))
+    return list(cells_of(table, DATASETS, lambda variant: ["budget=quick", *words], lambda given: composed(*given)))
 
 
 def words_of(plan: Any) -> list[list[tuple[str, str]]]:
@@ -60,10 +70,10 @@ def finish(cell: Cell) -> None:
     (cell.folder / "status.json").write_text(json.dumps({"state": "ok", "step": steps}))
 
 
-def test_controls_go_first_and_leave_their_state_where_others_set_out(tmp_path: Path) -> None:
+def test_controls_go_first_and_leave_their_state_where_others_set_out() -> None:
     """Of 2,000 steps pseudo views begin at 10/40 = 500, 20/40 = 1,000 and 22/40 = 1,100."""
     table = experiment()
-    every = cells(table, tmp_path)
+    every = cells(table)
     plan = planned(table, DATASETS, every, together=True)
     assert words_of(plan) == [
         [("3d_gs", "scratch"), ("octree_gs", "[500,1000,1100]")],
@@ -77,16 +87,16 @@ def test_controls_go_first_and_leave_their_state_where_others_set_out(tmp_path: 
             ("octree_gs", "octree_up", "octree_ub", "octree_ub_start_10k", "3d_gs")]  # fmt: skip
 
 
-def test_without_a_control_the_one_that_begins_last_leads(tmp_path: Path) -> None:
+def test_without_a_control_the_one_that_begins_last_leads() -> None:
     table = experiment(only=["UP", "early"])
-    plan = planned(table, DATASETS, cells(table, tmp_path), together=True)
+    plan = planned(table, DATASETS, cells(table), together=True)
     assert words_of(plan) == [[("octree_up", "[500]")], [("octree_ub_start_10k", "[500]")]]
 
 
-def test_what_is_finished_is_left_out_whoever_asked_for_it(tmp_path: Path) -> None:
+def test_what_is_finished_is_left_out_whoever_asked_for_it() -> None:
     """UB and `same` are one run, under whichever name it was trained."""
     table = experiment(only=["UB", "same", "UP"])
-    every = cells(table, tmp_path)
+    every = cells(table)
     assert every[1].row == "UB"
     assert every[1].folder == every[2].folder
     finish(every[2])
@@ -94,19 +104,19 @@ def test_what_is_finished_is_left_out_whoever_asked_for_it(tmp_path: Path) -> No
     assert (plan.done, words_of(plan)) == (1, [[("octree_up", "scratch")]])
 
 
-def test_a_run_judged_otherwise_is_due_again_and_a_failed_one_too(tmp_path: Path) -> None:
+def test_a_run_judged_otherwise_is_due_again_and_a_failed_one_too() -> None:
     table = experiment(only=["other"])
-    (cell,) = cells(table, tmp_path)
+    (cell,) = cells(table)
     finish(cell)
     assert planned(table, DATASETS, [cell]).done == 1
-    assert planned(table, DATASETS, cells(table, tmp_path, "eval.zoom=[1,8]")).done == 0
+    assert planned(table, DATASETS, cells(table, "eval.zoom=[1,8]")).done == 0
     (cell.folder / "status.json").write_text(json.dumps({"state": "failed", "step": 5}))
     assert planned(table, DATASETS, [cell]).done == 0
 
 
-def test_seeds_share_nothing(tmp_path: Path) -> None:
+def test_seeds_share_nothing() -> None:
     table = experiment(only=["control", "UP"], seeds=[0, 1])
-    plan = planned(table, DATASETS, cells(table, tmp_path), together=True)
+    plan = planned(table, DATASETS, cells(table), together=True)
     assert [len(phase) for phase in plan.phases] == [2, 2]
     assert len({cell.folder for cell in plan.cells}) == 4
 
@@ -119,10 +129,10 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
             return composition_key(settings.resolved, "", settings.idle)
 
         plain = key()
-        for word in ("output=elsewhere", "device=cpu", "init=warm_start", "warm_start_at=[3]",
-                     "eval.zoom=[1,2]", "reuse=true", "training.log_every=3", "regenerator/upscale=lanczos",
-                     "length=900", "scene.cache_gb=1"):  # fmt: skip
-            assert key(word) == plain, word
+        for words in (["output=elsewhere", "device=cpu", "init=warm_start", "warm_start_at=[3]", "eval.zoom=[1,2]"],
+                      ["reuse=true", "training.log_every=3", "regenerator/upscale=lanczos", "length=900",
+                       "scene.cache_gb=1"]):  # fmt: skip
+            assert key(*words) == plain, words
         for word in ("seed=1", "iterations=901", "backbone=scaffold", "augmenter=upscale", "scene.samples=7",
                      "rasterizer.tile_size=16", "training.ssim_weight=0.1"):  # fmt: skip
             assert key(word) != plain, word
@@ -147,38 +157,37 @@ def own_scene(root: Path, content: str) -> Path:
 
 def test_a_scene_is_what_its_folder_holds(tmp_path: Path) -> None:
     """Not what the folder is called: by `dataset=own` two roots may have different scenes of one name."""
-    with Compositions(plugins()) as compositions:
 
-        def place(root: str, *words: str) -> Path:
-            given = ["dataset=own", "+dataset.scenes.yard=Yard", "dataset.scene=yard", f"data_root={tmp_path / root}"]
-            settings = compositions.settings([*given, f"output={tmp_path / 'out'}", *words])
-            return place_of(settings.resolved, scene_stamp(settings.resolved), settings.idle)
+    def place(root: str, *words: str) -> Path:
+        given = ["dataset=own", "+dataset.scenes.yard=Yard", "dataset.scene=yard", f"data_root={tmp_path / root}"]
+        settings = composed(*given, *words)
+        return place_of(settings.resolved, scene_stamp(settings.resolved), settings.idle)
 
-        own_scene(tmp_path / "a", "one")
-        photo = own_scene(tmp_path / "b", "another")
-        first, second = place("a"), place("b")
-        assert first != second
-        assert first == place("a", f"scene.path={tmp_path / 'a' / 'yard'}")
-        (tmp_path / "a").rename(tmp_path / "c")
-        assert place("c") == first
-        absent = place("a")
-        assert absent not in (first, second, place("nowhere"))
-        os.utime(photo, ns=(0, 10**9))
-        assert place("b") == second
-        content = photo.read_bytes()
-        photo.write_bytes(bytes(len(content)))
-        assert place("b") != second
-        photo.write_bytes(content)
-        assert place("b") == second
-        (tmp_path / "points.ply").write_text("1")
-        named = [place("b", "scene.images=../../points.ply")]
-        (tmp_path / "points.ply").write_text("22")
-        assert place("b", "scene.images=../../points.ply") not in named
+    own_scene(tmp_path / "a", "one")
+    photo = own_scene(tmp_path / "b", "another")
+    first, second = place("a"), place("b")
+    assert first != second
+    assert first == place("a", f"scene.path={tmp_path / 'a' / 'yard'}")
+    (tmp_path / "a").rename(tmp_path / "c")
+    assert place("c") == first
+    absent = place("a")
+    assert absent not in (first, second, place("nowhere"))
+    os.utime(photo, ns=(0, 10**9))
+    assert place("b") == second
+    content = photo.read_bytes()
+    photo.write_bytes(bytes(len(content)))
+    assert place("b") != second
+    photo.write_bytes(content)
+    assert place("b") == second
+    (tmp_path / "points.ply").write_text("1")
+    named = [place("b", "scene.images=../../points.ply")]
+    (tmp_path / "points.ply").write_text("22")
+    assert place("b", "scene.images=../../points.ply") not in named
 
 
-def test_a_run_is_compared_with_what_it_was_trained_on(tmp_path: Path) -> None:
+def test_a_run_is_compared_with_what_it_was_trained_on() -> None:
     table = experiment(only=["other"])
-    (cell,) = cells(table, tmp_path)
+    (cell,) = cells(table)
     finish(cell)
     files = read_run(cell.folder)
     idle = cell.settings.idle
@@ -195,12 +204,15 @@ def test_a_run_is_compared_with_what_it_was_trained_on(tmp_path: Path) -> None:
         (["seed=3"], "experiment.seeds="),
         (["dataset.scene=demo"], "experiment.scenes="),
         (["variant=octree_ub"], "experiment.only="),
-        (["regenerator.upscale.modl=x"], "Did you mean 'regenerator.upscale.model'"),
+        (
+            ["regenerator.upscale.modl=x", "experiment.only=[3D-GS,3D-GS-UP]"],
+            "Did you mean 'regenerator.upscale.model'",
+        ),
         (["experiment.seeds=[1,1]"], "different ones"),
         (["experiment.only=[3DGS]"], "Did you mean '3D-GS'"),
         (["experiment.scenes=[demmo]"], "Did you mean 'demo'"),
         (["experiment.seeds=[]"], "different ones"),
-        (["backbone.voxxel=1"], "no configuration key"),
+        (["backbone.voxxel=1", "experiment.only=[3D-GS,Octree-3D-GS]"], "no configuration key"),
         (["hydra/launcher=slurrm"], "slurrm"),
     ],
 )
@@ -240,10 +252,11 @@ def test_a_row_may_be_overrides_instead_of_a_variant(tmp_path: Path) -> None:
 
 
 def test_every_row_of_overrides_composes(tmp_path: Path) -> None:
-    words = ["+experiment=zoom_truth", "dataset=demo", f"output={tmp_path}", "experiment.dry=true", "budget=smoke"]
-    commands, code = run_table([*words, "experiment.seeds=[0]"], plugins(), lambda config: None)
-    assert code == 0
-    assert len(set(commands.splitlines())) == 20
+    chosen, common = ["+experiment=zoom_truth", "experiment.seeds=[0]"], [f"output={tmp_path}", "budget=smoke"]
+    with Compositions(plugins()) as compositions:
+        table = experiment_of(chosen, compositions)
+        every = list(cells_of(table, DATASETS, lambda row: common, compositions.settings))
+    assert len({cell.folder for cell in every}) == len(table.rows) == 20
 
 
 def test_a_changed_experiment_is_another_table_and_says_so(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch.nn.functional import logsigmoid
 
+from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splat_files import write_gaussians
@@ -34,7 +35,7 @@ from gsx.experiments.trade.rasterizer.knobs import (
     pooled_psnr,
     single_changes,
 )
-from gsx.experiments.trade.rasterizer.measure import at_pace, resolved, sweep, timed, unsteady
+from gsx.experiments.trade.rasterizer.measure import at_pace, resolved, sweep, timed, unsteady, usable_paths
 from gsx.experiments.trade.rasterizer.page import write_trade
 from gsx.experiments.trade.rasterizer.subject import Shot, Subject, framing_cameras, open_subject
 
@@ -223,6 +224,15 @@ def test_single_changes_are_valid_settings_and_change_something(cull: str, cuda:
 def test_without_a_compiler_neither_path_nor_schedule_is_tried() -> None:
     trials = single_changes(RasterSettings(), [RasterSettings()], cuda=False, knobs=KNOBS)
     assert {trial.knob for trial in trials} == {"base", *KNOBS} - {"path", "schedule"}
+
+
+@pytest.mark.parametrize("complaint", ["", "no compiler"])
+def test_paths_that_do_not_work_here_are_not_tried(complaint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.complaint", lambda device: complaint)
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.available", lambda device: not complaint)
+    presets, notes = usable_paths(plugins(), torch.device("cpu"))
+    assert [preset.path for preset in presets] == ["eager", "compiled"][: 1 if complaint else 2]
+    assert notes == ["only eager settings are tried: nothing compiles here (no compiler)"][: bool(complaint)]
 
 
 def test_from_compiled_settings_eager_and_the_other_schedule_are_tried() -> None:
@@ -433,8 +443,6 @@ def test_a_file_without_finite_splats_is_refused() -> None:
 
 
 def test_a_splat_file_becomes_a_subject(tmp_path: Path) -> None:
-    from gsx.builtin import plugins
-
     g = torch.Generator().manual_seed(0)
     gaussians = Gaussians(
         means=torch.randn(50, 3, generator=g),

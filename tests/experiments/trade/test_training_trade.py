@@ -129,8 +129,8 @@ def evaluation(folder: Path) -> dict[str, float]:
 
 def test_the_command_advised_gives_what_was_promised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And what is there is not trained again; what cannot be composed says why."""
-    words = [*OVERRIDES, "iterations=12", "rasterizer=eager"]
-    asked = ["--trades", "colour,levels", "--budget-mb", "0.05", "--to", str(tmp_path / "t"), "--combinations", "0"]
+    words = [*OVERRIDES, "scene.points=100", "scene.train_views=3", "iterations=4", "rasterizer=eager"]
+    asked = ["--trades", "colour,levels", "--budget-mb", "0.015", "--to", str(tmp_path / "t"), "--combinations", "0"]
     assert main(["trade", "training", *words, "backbone.sh_judged=0", *asked]) == 0
     out = capsys.readouterr().out.splitlines()
     content = json.loads((tmp_path / "t" / "trade.json").read_text())
@@ -144,7 +144,7 @@ def test_the_command_advised_gives_what_was_promised(tmp_path: Path, capsys: pyt
     found = evaluation(tmp_path / "again")
     assert (
         found["megabytes"]
-        <= 0.06
+        <= 0.015
         < evaluation(tmp_path / "t" / content["rows"][0]["outcomes"][0]["folder"])["megabytes"]
     )
     promised = next(one for one in content["rows"] if one["overrides"] and set(one["overrides"]) <= set(call))
