@@ -1,8 +1,10 @@
 """The smallest experiment that exercises everything: the built-in scene as thumbnails, a dozen steps."""
 
+import copy
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +44,18 @@ loaded: dict[str, Scene] = {}
 """Built-in scenes by their options: their points take longer to find than some runs to train."""
 
 
+@cache
+def composed(*more: str) -> Settings:
+    """The tiny experiment in a folder that is named later."""
+    return compose(words(Path("later"), *more), plugins())
+
+
 def tiny_settings(folder: Path, *more: str) -> Settings:
     """The composed tiny experiment; the built-in scene is made once by each process."""
-    settings = compose(words(folder, *more), plugins())
+    settings = composed(*more)
+    general = replace(settings.general, folder=str(folder))
+    resolved = copy.deepcopy(settings.resolved) | {"folder": str(folder)}
+    settings = replace(settings, general=general, resolved=resolved)
     chosen = settings.scene
     if chosen.component.name != "demo":
         return settings

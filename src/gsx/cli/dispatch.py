@@ -9,7 +9,7 @@ from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
-from gsx.cli.messages import explained, set_up_logging, unheard
+from gsx.cli.messages import discard_unwritten, explained, set_up_logging, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
@@ -67,7 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError as error:
         return unheard(error)
     except BaseException as error:
-        return explained(error)
+        code = explained(error)
+        discard_unwritten()
+        return code
 
 
 def dispatch_together(arguments: list[str]) -> int:

@@ -37,9 +37,23 @@ def unheard(error: BrokenPipeError) -> int:
     """Say nothing more on standard output, if it is that which nobody reads any more (`gsx plugins | head -3`)."""
     if not unread():
         return explained(error)
+    discard_output()
+    return UNHEARD
+
+
+def discard_output() -> None:
+    """Nothing more goes to standard output. What it has not taken is lost: Python would try once more at its end, and
+    complain in words of its own."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
-    return UNHEARD
+
+
+def discard_unwritten() -> None:
+    """The same, if standard output takes nothing (a full disk)."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        discard_output()
 
 
 def unread() -> bool:
