@@ -1,6 +1,6 @@
 """Composition: every file composes, typed options, nearest matches."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
+from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.runs.compose import Compositions, compose
 from gsx.experiments.runs.settings import Settings, read_config, typed, write_config
 from gsx.scenes.options import SceneOptions
@@ -129,6 +130,18 @@ def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
     assert default.training == spelt.training
     assert (plain.backbone.options.filter, plain.training.supersample) == ("none", 1)
     assert plain.backbone.options.rates.shortened == 0
+
+
+def test_compositions_share_nothing_that_can_be_changed() -> None:
+    """What was checked once is not checked again, but each gets its own; a number of another type is another."""
+    words = ["backbone=gs3d", "eval.zoom=[1,2]"]
+    first, second = compose(words, plugins()), compose(words, plugins())
+    assert first.evaluation == second.evaluation
+    first.evaluation.zoom.append(8.0)
+    assert second.evaluation.zoom == compose(words, plugins()).evaluation.zoom == [1.0, 2.0]
+    assert typed(EvalOptions, asdict(second.evaluation) | {"tile_pixels": 4096}, "eval").tile_pixels == 4096
+    with pytest.raises(ConfigError, match="tile_pixels"):
+        typed(EvalOptions, asdict(second.evaluation) | {"tile_pixels": 4096.0}, "eval")
 
 
 def test_a_run_folders_configuration_looks_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
