@@ -34,6 +34,16 @@ OVERRIDES = (
     "device=cpu",
 )
 
+LIGHT = (
+    "scene.points=120",
+    "scene.train_views=3",
+    "scene.test_views=1",
+    "training.test_points=0",
+    "rasterizer.chunk=64",
+)
+"""Lighter still: few points, an event every three steps at most, one picture to evaluate, the rasterizer's loop in
+fewer turns."""
+
 
 def words(folder: Path, *more: str) -> list[str]:
     """Command-line overrides of a tiny run in `folder`."""
@@ -78,11 +88,15 @@ def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = No
     return run
 
 
-def stopped_and_resumed(folder: Path, more: Sequence[str], stop_after: int) -> Run:
-    """The same run, stopped after a step, opened from its folder again and run to its end."""
-    tiny_run(folder, more, stop_after)
-    run, settings = open_run(folder, plugins(), training=True)
-    execute(run, settings, plugins())
+def stopped_at(folder: Path, more: Sequence[str], *stops: int) -> Run:
+    """The run stopped after each of these steps, each time opened from its folder again, and at last run to its end."""
+    tiny_run(folder, more, stops[0])
+    for stop in (*stops[1:], None):
+        loaded = plugins()
+        run, settings = open_run(folder, loaded, training=True)
+        with loaded.listening([] if stop is None else [StopAfter(stop)]):
+            execute(run, settings, loaded)
+        assert run.step == stop or (stop is None and run.complete)
     return run
 
 

@@ -2,14 +2,13 @@
 
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from regenerating import of_role
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
@@ -37,20 +36,19 @@ from gsx.experiments.runs.settings import Settings
 PLAIN = ("regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager")
 
 
-@cache
-def composed(*words: str) -> Settings:
+def settings_of(folder: Path, *words: str) -> Settings:
     """A tiny run of 80 steps. Windows are long enough for every training view to be picked in them."""
     chosen = [name for name in ("upscale", "bootstrap") if any("augmenter=" in w and name in w for w in words)]
     long = [f"augmenter.{name}.timing.{key}=4000" for name in chosen for key in ("every", "span")]
     if "bootstrap" in chosen:
         long.append("augmenter.bootstrap.timing.start=" + ("22000" if "upscale" in chosen else "20000"))
-    return tiny_settings(Path("unused"), "iterations=80", *PLAIN, *long, *words)
+    return tiny_settings(folder, "iterations=80", *PLAIN, *long, *words)
 
 
 def run_at(folder: Path, step: int, *words: str, **options: Any) -> Run:
     """A run that stands at a step without having been trained there; options: of its augmenter."""
     folder.mkdir()
-    settings = composed(*words)
+    settings = settings_of(folder, *words)
     chosen = {name: replace(one, options=replace(one.options, **options)) for name, one in settings.augmenters.items()}
     settings = replace(settings, augmenters=chosen)
     run = build(settings, load_scene(settings), folder, training=True)
@@ -587,9 +585,7 @@ def test_the_report_shows_pseudo_views_and_what_became_of_them(finished: Path) -
 
 @pytest.mark.parametrize("stop", [11, 16])
 def test_resume_inside_a_window_equals_never_having_stopped(stop: int, finished: Path, tmp_path: Path) -> None:
-    tiny_run(tmp_path / "run", RUN, stop_after=stop)
-    run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
-    execute(run, settings, plugins())
+    stopped_at(tmp_path / "run", RUN, stop)
     whole, parts = final_tensors(finished), final_tensors(tmp_path / "run")
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)

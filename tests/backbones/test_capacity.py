@@ -12,9 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
-from stopped_run import LIGHT, stopped_at
 from test_anchors import small_anchors
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import LIGHT, final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import small_scene, spread
-from stopped_run import LIGHT, stopped_at
-from tiny import final_tensors, tiny_run
+from tiny import LIGHT, final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.backbones.clone_split import (

@@ -11,8 +11,7 @@ import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from small_scene import published_options, small_gs3d, small_scene, spread
-from stopped_run import LIGHT, stopped_at
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import LIGHT, final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 

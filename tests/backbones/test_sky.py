@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
-from stopped_run import LIGHT
-from tiny import final_tensors, tiny_run
+from tiny import LIGHT, final_tensors, tiny_run
 from torch import Tensor
 
 from gsx.backbones import sky

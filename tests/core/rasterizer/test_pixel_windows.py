@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from raster_scenes import changed, front_camera, gradients, leaves, random_splats, soft_splats
-from stopped_run import LIGHT
-from tiny import tiny_run
+from tiny import LIGHT, tiny_run
 from torch import Tensor
 
 from gsx.core.compiling import available

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import final_tensors, stopped_and_resumed, tiny_run
+from tiny import final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.core.data.window import Window
@@ -164,7 +164,7 @@ SHADED = (
 def test_a_run_with_grids_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", SHADED)
     assert whole.exposures.grids is not None
-    stopped_and_resumed(tmp_path / "stopped", SHADED, stop_after=9)
+    stopped_at(tmp_path / "stopped", SHADED, 9)
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "exposure.grids" in a

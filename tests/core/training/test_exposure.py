@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import final_tensors, stopped_and_resumed, tiny_run
+from tiny import final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.core.errors import ConfigError
@@ -188,7 +188,7 @@ DISTURBED = (
 def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", DISTURBED)
     assert whole.exposures.matrices is not None
-    stopped_and_resumed(tmp_path / "stopped", DISTURBED, stop_after=13)
+    stopped_at(tmp_path / "stopped", DISTURBED, 13)
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "exposure.matrices" in a

@@ -1,7 +1,6 @@
 """Several views in one step: gradients, losses and statistics by hand from single views; order, failures, resuming."""
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from safetensors.torch import load_file
-from tiny import tiny_run, tiny_settings
+from tiny import stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
@@ -30,23 +29,16 @@ from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import backward, train_step
 from gsx.experiments.runs.build import build
-from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.settings import Settings
 
 PLAIN = ("iterations=40", "rasterizer=eager")
-
-
-@cache
-def composed(*words: str) -> Settings:
-    return tiny_settings(Path("unused"), *PLAIN, *words)
 
 
 def fresh(folder: Path, *words: str) -> Run:
     """A run at step 0 whose next views are 4, 1, 5."""
     folder.mkdir()
-    settings = composed(*words)
+    settings = tiny_settings(folder, *PLAIN, *words)
     run = build(settings, load_scene(settings), folder, training=True)
     run.sampler.order = [0, 5, 1, 4]
     return run
@@ -375,9 +367,7 @@ def test_a_resumed_run_of_batches_equals_one_that_never_stopped(tmp_path: Path) 
     whole = tiny_run(tmp_path / "whole", DENSE)
     grown = [line["step"] for line in whole.curves if "cloned" in line]
     assert grown == [6, 12], "the test needs density events before and after the stop"
-    tiny_run(tmp_path / "run", DENSE, stop_after=8)
-    run, settings = open_run(tmp_path / "run", plugins(), training=True)
-    execute(run, settings, plugins())
+    stopped_at(tmp_path / "run", DENSE, 8)
     assert_same(final(tmp_path / "run"), final(tmp_path / "whole"))
 
 

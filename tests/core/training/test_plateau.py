@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import small_scene, spread
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
-from gsx.builtin import plugins
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
@@ -19,9 +18,7 @@ from gsx.core.training.plateau import Plateau, PlateauOptions
 from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
 from gsx.experiments.runs.build import build
-from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.load_scene import load_scene
-from gsx.experiments.runs.open import open_run
 
 WORDS = (
     "backbone.density.stop=6000",
@@ -195,9 +192,7 @@ def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("stop", [15, 16, 33])
 def test_resuming_equals_never_having_stopped(stop: int, whole: tuple[Run, Path], tmp_path: Path) -> None:
     """Before the windows are judged, just then, and after steps were left out."""
-    tiny_run(tmp_path / "parts", LEAVES_OUT, stop_after=stop)
-    again, settings = open_run(tmp_path / "parts", plugins(), ())
-    execute(again, settings, plugins())
+    stopped_at(tmp_path / "parts", LEAVES_OUT, stop)
     expected, found = final_tensors(whole[1]), final_tensors(tmp_path / "parts")
     assert expected.keys() == found.keys()
     assert all(torch.equal(expected[name], found[name]) for name in expected)

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -134,14 +134,9 @@ def test_worth_is_what_pictures_lose() -> None:
     assert float(torch.corrcoef(logs)[0, 1]) > 0.9
 
 
-@cache
-def small() -> Settings:
-    return tiny_settings(Path("unused"), "scene.points=12")
-
-
 def opened_small(without: int | None = None) -> Run:
     """A model of 12 large splats."""
-    settings = small()
+    settings = tiny_settings(Path("unused"), "scene.points=12")
     run = build(settings, load_scene(settings), Path())
     with torch.no_grad():
         run.backbone.table["log_scales"].fill_(-1.0)

@@ -9,7 +9,7 @@ from hydra.plugins.config_source import ConfigLoadError
 
 from gsx.builtin import plugins
 from gsx.experiments.runs.compose import MODULE, Compositions
-from gsx.experiments.runs.config_files import HYDRAS, OURS, ParsedOnce, in_folder
+from gsx.experiments.runs.config_files import HYDRAS, OURS, ParsedOnce, parsed_once
 
 CONF = Path(__file__).parents[3] / "conf"
 GROUPS = ["", *(str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir() and path.name[0] != "_")]
@@ -55,9 +55,9 @@ def test_a_file_that_was_edited_is_read_again(tmp_path: Path, monkeypatch: pytes
 
 
 def test_packages_in_folders_are_parsed_once_and_others_left_to_hydra() -> None:
-    assert in_folder(f"{HYDRAS}{MODULE}")
-    assert not in_folder(f"{HYDRAS}no_such_package_at_all")
-    assert not in_folder("file:///tmp")
+    assert parsed_once(f"{HYDRAS}{MODULE}") == f"{OURS}{MODULE}"
+    for path in (f"{HYDRAS}no_such_package_at_all", "file:///tmp"):
+        assert parsed_once(path) == path
     with Compositions(plugins()):
         from hydra.core.global_hydra import GlobalHydra
 

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
@@ -38,7 +40,8 @@ class Version:
 @lru_cache(maxsize=1024)
 def parsed(version: Version) -> tuple[Any, dict[str, str | None]]:
     """(contents of a YAML file, what its `# @key value` header says)."""
-    return OmegaConf.load(version.file), ConfigSource._get_header_dict(version.file.read_text(encoding="utf-8"))
+    text = version.file.read_text(encoding="utf-8")
+    return OmegaConf.load(StringIO(text)), ConfigSource._get_header_dict(text)
 
 
 class ParsedOnce(ConfigSource):
@@ -101,23 +104,22 @@ class GsxSearchPath(SearchPathPlugin):
         for path in self.extra:
             search_path.append(provider="gsx", path=path)
         for element in search_path.get_path():
-            if element.path is not None and in_folder(element.path):
-                element.path = OURS + element.path.removeprefix(HYDRAS).replace("/", ".").rstrip(".")
+            element.path = parsed_once(element.path)
 
 
-def in_folder(path: str) -> bool:
-    """Whether a search path is that of a package that lies in a folder: Hydra itself reads those in archives."""
+def parsed_once(path: str) -> str:
+    """The search path to take in place of one of a package in a folder; others are Hydra's, also those in archives."""
+    if not path.startswith(HYDRAS):
+        return path
+    module = path.removeprefix(HYDRAS).replace("/", ".").rstrip(".")
     try:
-        module = path.removeprefix(HYDRAS).replace("/", ".").rstrip(".")
-        return path.startswith(HYDRAS) and Path(str(resources.files(module))).is_dir()
+        return OURS + module if Path(str(resources.files(module))).is_dir() else path
     except (ModuleNotFoundError, TypeError, ValueError):
-        return False
+        return path
 
 
 def register(extra: Sequence[str]) -> None:
     """Let Hydra search these paths, too, from now on."""
-    from hydra.core.plugins import Plugins
-
     GsxSearchPath.extra = tuple(extra)
     for plugin in (ParsedOnce, GsxSearchPath):
         Plugins.instance().register(plugin)
