@@ -14,10 +14,9 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -25,6 +24,7 @@ import torch
 from measuring.limits import BACKWARD_FLOPS, FLOAT, FORWARD_FLOPS, Limit, best, measured_limits, sizes_of
 from measuring.machine import ROOT, describe_machine, shown_command, told_load
 from measuring.results import Section, stamped, text_table, write_results
+from measuring.revisions import checked_out
 from measuring.runs import train
 from measuring.stages import measure_stages
 
@@ -74,21 +74,6 @@ def stages_by(source: Path, run: Path, steps: int) -> dict[str, Any]:
     environment = os.environ | {"PYTHONPATH": str(source)}
     done = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout.splitlines()[-1])
-
-
-@contextmanager
-def checked_out(revision: str) -> Iterator[Path]:
-    """The source of a revision, for a while."""
-    with TemporaryDirectory() as folder:
-        tree = Path(folder) / "tree"
-        subprocess.run(["git", "-C", str(ROOT), "worktree", "add", "--detach", str(tree), revision], check=True)
-        try:
-            link = tree / "src" / "gsx" / "conf"
-            if not link.exists():
-                link.symlink_to(tree / "conf")
-            yield tree / "src"
-        finally:
-            subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(tree)], check=True)
 
 
 def least_times(counts: Mapping[str, float], limits: Sequence[Limit]) -> dict[str, tuple[float, str]]:

@@ -3,11 +3,13 @@
 import functools
 import types
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
+
+from gsx.core.kept_code import KeptFunction, record
 
 Result = TypeVar("Result")
 WHOLE_LOOPS: dict[str, str | int | bool] = {
@@ -24,10 +26,15 @@ def complaint(device: str) -> str:
     """Why nothing can be compiled for this device; empty where it can. Asked by compiling a few operations,
     those of a vector library among them."""
     try:
-        torch.compile(lambda x: 2 * x.exp() + x.log(), fullgraph=True)(torch.ones(32, device=device))
+        compile_rows(few_operations)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return ""
+
+
+def few_operations(x: Tensor) -> Tensor:
+    """What is compiled to see whether anything can be."""
+    return 2 * x.exp() + x.log()
 
 
 def available(device: str = "cpu") -> bool:
@@ -53,7 +60,7 @@ def compile_rows(function: Callable[..., Any], *last: Any, options: dict[str, An
         rows, tensors = len(arguments[0]), [a for a in arguments if isinstance(a, Tensor)]
         return [(a, axis) for a in tensors for axis in range(min(2, a.dim())) if a.shape[axis] == rows]
 
-    return sizes_free(torch.compile(with_last(function, *last), options=options), varying)
+    return compiled_once(with_last(function, *last), varying, options)
 
 
 @functools.lru_cache
@@ -73,16 +80,48 @@ def fused(function: Callable[..., Result]) -> Callable[..., Result]:
     return call
 
 
-def sizes_free(
-    compiled: Callable[..., Any], varying: Callable[[tuple[Any, ...]], Iterable[tuple[Tensor, int]]]
+Varying: TypeAlias = Callable[[tuple[Any, ...]], list[tuple[Tensor, int]]]
+"""Which sizes (tensor, axis) of given arguments may be others the next time."""
+
+
+def compiled_once(
+    function: Callable[..., Any],
+    varying: Varying,
+    options: dict[str, Any] | None = None,
+    unchecked: Iterable[str] = (),
 ) -> Callable[..., Any]:
-    """Tells torch which sizes (tensor, axis) vary, so that one compilation serves all: at the first call with gradients
-    of these arguments, and at that without, which torch compiles apart. Parameters are handed on as tensors: whatever
-    it is told, torch takes their own sizes for constants."""
-    marked: set[tuple[bool, ...]] = set()
+    """`function` of tensors through torch.compile, once whatever the sizes are that vary.
+
+    On a CPU its code is kept on disk (kept_code.py), elsewhere torch traces it anew in each process. Parameters are
+    handed on as tensors: whatever it is told, torch takes their own sizes for constants. `options`: of the compiler;
+    `unchecked`: conditions of torch's, by type, that need not be checked.
+    """
+    left_out, given_options = set(unchecked), options or {}
+    kept = KeptFunction(function, varying, given_options, left_out)
+    if left_out:
+        keep = {"guard_filter_fn": lambda guards: [guard.guard_type not in left_out for guard in guards]}
+        given_options = given_options | keep
+    traced = sizes_free(torch.compile(function, fullgraph=bool(left_out), options=given_options or None), varying)
 
     def call(*given: Any) -> Any:
         arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
+        first = arguments[0]
+        if (first[0] if isinstance(first, list) else first).device.type != "cpu":
+            return traced(*arguments)
+        if record(kept, arguments):
+            return function(*arguments)
+        code = kept.code_for(arguments)
+        return traced(*arguments) if code is None else code.run(*arguments)
+
+    return call
+
+
+def sizes_free(compiled: Callable[..., Any], varying: Varying) -> Callable[..., Any]:
+    """Tells torch which sizes vary, so that one compilation serves all: at the first call with gradients of these
+    arguments, and at that without, which torch compiles apart."""
+    marked: set[tuple[bool, ...]] = set()
+
+    def call(*arguments: Any) -> Any:
         kind = (torch.is_grad_enabled(), *(a.requires_grad for a in arguments if isinstance(a, Tensor)))
         if kind not in marked:
             marked.add(kind)

@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from compilations import new_code
 from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.compiling import available
+from gsx.core.gaussians.bands import compiled_contraction
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
 
 R3 = 1 / math.sqrt(3)
@@ -172,9 +174,11 @@ def test_colours_of_parameters_compile_once_whatever_their_number() -> None:
         colours_of(constant, rest, offsets, 3, compiled=True).sum().backward()
         assert rest.grad is not None
 
-    learn(9)
-    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
-    assert before > 0
-    for count in (14, 40, 23):
-        learn(count)
-    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
+    compiled_contraction.cache_clear()
+    with new_code() as first:
+        learn(9)
+    assert "contraction" in first
+    with new_code() as later:
+        for count in (14, 40, 23):
+            learn(count)
+    assert later == []

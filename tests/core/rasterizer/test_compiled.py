@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from compilations import new_code
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
 from gsx.core.gaussians.splats import Splats
@@ -21,7 +22,8 @@ from gsx.core.rasterizer import (
     rasterize_fixed,
 )
 from gsx.core.rasterizer.compiled import available, takes
-from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial, thresholds
+from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial, kernels, thresholds
+from gsx.core.rasterizer.segment_kernels import segment_kernels
 from gsx.core.rasterizer.segments import parts
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
@@ -143,17 +145,20 @@ def test_two_runs_give_the_same_bits() -> None:
 
 def test_nothing_compiles_anew_in_steady_state() -> None:
     def draw(count: int, seed: int, schedule: str) -> None:
-        render_with_gradients(random_splats(count, seed=seed), front_camera(), replace(QUICK, schedule=schedule))
-        render_with_gradients(opaque(count, seed), front_camera(), replace(QUICK, schedule=schedule))
+        for splats in (random_splats(count, seed=seed), opaque(count, seed)):
+            render_with_gradients(splats, front_camera(), replace(QUICK, schedule=schedule))
 
-    for schedule in ("chunks", "segments"):
-        draw(400, 5, schedule)
-    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
-    assert before > 0
-    for count in (1, 40, 397, 1100):
+    kernels.cache_clear()
+    segment_kernels.cache_clear()
+    with new_code() as first:
         for schedule in ("chunks", "segments"):
-            draw(count, count, schedule)
-    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
+            draw(400, 5, schedule)
+    assert {"blend", "moments", "entry_slopes"} <= set(first)
+    with new_code() as later:
+        for count in (1, 40, 397, 1100):
+            for schedule in ("chunks", "segments"):
+                draw(count, count, schedule)
+    assert later == []
 
 
 @pytest.mark.parametrize("alpha_min", [0.05, 1 / 255, 1e-3, 1e-6])

@@ -1,13 +1,22 @@
-"""Compiling beside what is drawn: the settings are handed over when that is done, and only then."""
+"""What is compiled before the first step, and beside what is drawn: there the settings are handed over when that is
+done, and only then."""
 
+import json
+from dataclasses import asdict
+from pathlib import Path
 from threading import Event
 
 import pytest
 import torch
+from tiny import tiny_settings
 
+from gsx.builtin import plugins
+from gsx.core.kept_code import Call, KeptFunction, recorded
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import rasterizer_path
-from gsx.experiments.runs.rasterizer_path import compile_beside
+from gsx.experiments.runs.open import start
+from gsx.experiments.runs.rasterizer_path import compile_beside, help_compiling, learn_little
 
 CPU = torch.device("cpu")
 
@@ -51,3 +60,45 @@ def test_a_compiler_that_fails_changes_nothing(compiler, caplog):
 def test_who_asks_for_the_eager_path_keeps_it(compiler):
     compiler(lambda *_, **__: pytest.fail("compiled"))
     assert not compile_beside(RasterSettings(path="eager"), CPU, pytest.fail).is_alive()
+
+
+def files_of(calls: list[Call]) -> dict[str, Path]:
+    """Where code for these calls is kept, by what it is called."""
+    found = {}
+    for function, arguments, gradients in calls:
+        with torch.set_grad_enabled(gradients):
+            file = function.file(arguments)
+        assert file is not None
+        found[f"{function.function.__name__} {file.stem}"] = file
+    return found
+
+
+@pytest.mark.parametrize("backbone", ["gs3d", "gs3d_zoom", "mip_splatting", "octree_gs3d", "scaffold"])
+def test_the_first_step_needs_nothing_that_is_not_compiled_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backbone: str
+) -> None:
+    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
+    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
+    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+    run = start(tiny_settings(tmp_path / "run", f"backbone={backbone}", "rasterizer=compiled"), plugins())
+    with recorded() as ahead:
+        learn_little(run.raster, CPU)
+    with recorded() as taken:
+        train_step(run, plugins())
+    assert {call[0].function.__name__ for call in taken} >= {"blend", "moments", "make_rows", "geometry"}
+    further = {name.split()[0] for name in set(files_of(taken)) - set(files_of(ahead))}
+    assert further == ({"select"} if backbone in ("octree_gs3d", "scaffold") else set())  # of anchors, and of parts
+
+
+def test_the_helper_makes_the_same_from_the_other_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
+    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
+    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+    monkeypatch.setattr(KeptFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
+    rules = RasterSettings(path="compiled", dilation=0.2)
+    with recorded() as calls:
+        learn_little(rules, CPU)
+    help_compiling(json.dumps({"settings": asdict(rules), "threads": torch.get_num_threads()}))
+    assert made == list(dict.fromkeys(list(files_of(calls[::-1]).values())))
+    assert len(made) == len(files_of(calls)) >= 9

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
-from gsx.core.compiling import sizes_free, with_last
+from gsx.core.compiling import compiled_once, with_last
 from gsx.core.quality.similarity import compiled_slopes, similarity, ssim_slopes
 from gsx.core.shapes import Float
 
@@ -80,7 +80,7 @@ def compiled_photometric(ssim_weight: float) -> Callable[..., tuple[Tensor, Tens
     def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
         return [(picture, axis) for picture in arguments for axis in (1, 2)]
 
-    return sizes_free(torch.compile(with_last(photometric_and_gradient, ssim_weight, False)), varying)
+    return compiled_once(with_last(photometric_and_gradient, ssim_weight, False), varying)
 
 
 class Photometric(torch.autograd.Function):

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import WHOLE_LOOPS, sizes_free, with_last
+from gsx.core.compiling import WHOLE_LOOPS, compiled_once, with_last
 from gsx.core.shapes import Float, Int
 
 TABLE = 6
@@ -356,15 +356,14 @@ def kernels(rules: Rules) -> Kernels:
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     """`loop` of these rules through torch.compile."""
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
-    if loop.__name__ in SHARING:
-        # no guards on symbols, which are the number of blocks, the same in all arguments, and where in storage a view
-        # begins, which enters no code; every other size, dtypes, strides and devices are guarded one by one, and 32-bit
-        # indices suffice (RasterSettings.compiled_values)
-        options["guard_filter_fn"] = lambda guards: [guard.guard_type != "SHAPE_ENV" for guard in guards]
+    # loops over blocks: no conditions on symbols, which are the number of blocks, the same in all arguments, and where
+    # in storage a view begins, which enters no code; every other size, dtypes, strides and devices are checked one by
+    # one, and 32-bit indices suffice (RasterSettings.compiled_values)
+    unchecked = {"SHAPE_ENV"} if loop.__name__ in SHARING else set()
     names = [name for name in signature(loop).parameters if name != "rules"]
 
     def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
         given = [value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE]
         return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
 
-    return sizes_free(torch.compile(with_last(loop, rules), fullgraph=True, options=options), varying)
+    return compiled_once(with_last(loop, rules), varying, options, unchecked)

@@ -140,7 +140,7 @@ def told_of(what: str) -> Iterator[None]:
 
 def follow(run: Run, plugins: Plugins) -> None:
     """Train as another process does, and write nothing."""
-    warm(run.raster, run.device)
+    warm(run.raster, run.device, helped=False)
     with plugins.listening([Guard(), Agreement()]):
         train(run, plugins)
 

@@ -1,17 +1,24 @@
 """What a training run does about the compiled path before its first step."""
 
+import json
 import logging
+import subprocess
+import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, replace
 from threading import Thread
 
 import torch
+from torch.nn import Parameter
 
 from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
+from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
+from gsx.core.kept_code import lacking, make_ahead, recorded
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.path import compiles
@@ -34,20 +41,60 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     return replace(settings, path=path)
 
 
-def warm(settings: RasterSettings, device: torch.device) -> None:
-    """Have the rasterizer and the loss compiled before the first step, and say so."""
+def warm(settings: RasterSettings, device: torch.device, helped: bool = True) -> None:
+    """Have the rasterizer and the loss compiled before the first step, and say so; `helped`: by a second process."""
     if compiles(settings, device.type):
         logger.info("compiling the rasterizer once; later runs find it on disk ...")
-        logger.info("compiled in %.0f s", compile_now(settings, device))
+        logger.info("compiled in %.0f s", compile_now(settings, device, helped))
 
 
-def compile_now(settings: RasterSettings, device: torch.device) -> float:
-    """Learn from a small picture, so that all loops get compiled; returns the seconds it took."""
+def compile_now(settings: RasterSettings, device: torch.device, helped: bool = False) -> float:
+    """Learn from a small picture, so that all loops get compiled, unless all are kept; returns the seconds it took."""
     begun = time.perf_counter()
-    as_training = replace(settings, training_focal=0.0)
-    image = rasterize(warm_splats(device), warm_camera(), as_training).image
-    photometric(image, torch.zeros_like(image), 0.2, compiled=True).backward()
+    with recorded() as calls:
+        learn_little(settings, device)
+    if not calls or lacking(calls):
+        with helper(settings) if calls and helped and torch.get_num_threads() > 1 else nullcontext():
+            make_ahead(calls)
+            learn_little(settings, device)
     return time.perf_counter() - begun
+
+
+def learn_little(settings: RasterSettings, device: torch.device) -> None:
+    """All that a step compiles, on a small picture."""
+    splats = warm_splats(device)
+    rest = Parameter(torch.zeros(len(splats), 15, 3, device=device))
+    colours = colours_of(splats.colours[:, None], rest, splats.means, degree=3, compiled=True)
+    as_training = replace(settings, training_focal=0.0)
+    image = rasterize(replace(splats, colours=colours), warm_camera(), as_training).image
+    photometric(image, torch.zeros_like(image), 0.2, compiled=True).backward()
+
+
+@contextmanager
+def helper(settings: RasterSettings) -> Iterator[None]:
+    """A process that compiles the same from the other end, as long as the context lasts."""
+    words = json.dumps({"settings": asdict(settings), "threads": torch.get_num_threads()})
+    code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def help_compiling(words: str) -> None:
+    """What that process does."""
+    given = json.loads(words)
+    torch.set_num_threads(given["threads"])
+    with recorded() as calls:
+        learn_little(RasterSettings(**given["settings"]), torch.device("cpu"))
+    make_ahead(calls[::-1])
 
 
 def compile_beside(settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]) -> Thread:

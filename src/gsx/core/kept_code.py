@@ -1,0 +1,345 @@
+"""Compiled functions that are kept on disk between processes, on a CPU.
+
+torch keeps what it has written and compiled, but traces a function anew in every process before it looks for that:
+seconds for each loop that is unrolled. Here the whole is kept, with the conditions under which it holds, by
+`aot_compile` (torch >= 2.10, experimental): to load it takes milliseconds. Whatever fails is left to torch.compile.
+"""
+
+import functools
+import hashlib
+import inspect
+import io
+import logging
+import os
+import platform
+import shutil
+import types
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor
+
+from gsx.core.cache import content_key, file_stamp
+from gsx.core.errors import InputError, first_line
+from gsx.core.files import replace_file
+from gsx.core.locks import lock
+
+logger = logging.getLogger(__name__)
+
+FOLDER = "functions"
+"""Below the folder in which torch keeps its code."""
+MOST = 8
+"""Codes of one function for one kind of arguments: as many as torch makes before it gives up."""
+CHECKED = ("TENSOR_MATCH", "DUPLICATE_INPUT", "SHAPE_ENV")
+"""Types of torch's conditions that are checked at a call: dtypes, formats, constant sizes, arguments that are one, what
+holds of sizes that vary. Other values are looked up, and what the function calls is in the name of the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """What torch made of a function: whether it is right for arguments by name, and the code."""
+
+    holds: Callable[[dict[str, Any]], bool]
+    run: Callable[..., Any]
+
+
+def place() -> Path | None:
+    """Where compiled functions are kept: beside torch's own code; None where nobody said where that is."""
+    own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
+    return Path(own) / FOLDER if own and hasattr(torch.compiler, "load_compiled_function") else None
+
+
+# -- names -------------------------------------------------------------------------------------------------------------
+
+
+PLAIN = (int, float, str, tuple, list, dict)
+"""Constants of modules that functions read."""
+
+
+def parts_of(value: Any, seen: set[int]) -> Iterator[object]:
+    """What a function's results depend on beside its arguments: byte code, constants, and those of all that it calls
+    in gsx; of classes their functions."""
+    value = inspect.unwrap(value) if callable(value) else value
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+    if isinstance(value, types.FunctionType):
+        yield from code_parts(value.__code__, value.__globals__, seen)
+        for default in value.__defaults__ or ():
+            yield repr(default)
+            yield from parts_of(type(default), seen)
+    elif isinstance(value, type) and value.__module__.startswith("gsx."):
+        for member in vars(value).values():
+            if isinstance(member, types.FunctionType):
+                yield from parts_of(member, seen)
+    elif isinstance(value, PLAIN) and " at 0x" not in repr(value):
+        yield repr(value)
+
+
+def code_parts(code: types.CodeType, known: dict[str, Any], seen: set[int]) -> Iterator[object]:
+    """`parts_of` of byte code, and of the functions within it."""
+    yield code.co_code
+    yield code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from code_parts(constant, known, seen)
+        else:
+            yield repr(constant)
+    for name in code.co_names:
+        value = known.get(name)
+        if getattr(value, "__module__", "gsx.").startswith("gsx."):
+            yield from parts_of(value, seen)
+
+
+def digest_of(function: Callable[..., Any]) -> str:
+    """By which what is compiled of a function is told from what is compiled of another."""
+    return content_key(*parts_of(function, set()))
+
+
+@functools.cache
+def machine() -> tuple[object, ...]:
+    """What compiled code depends on beside what it is made from; asked once, since torch changes the environment."""
+    settings = sorted(
+        (name, value)
+        for name, value in os.environ.items()
+        if name.startswith(("TORCHINDUCTOR_", "TORCH_COMPILE")) and name != "TORCHINDUCTOR_CACHE_DIR"
+    )
+    compiler = shutil.which(os.environ.get("CXX", "g++"))
+    return (
+        *(torch.__version__, platform.python_version(), platform.machine()),
+        torch.backends.cpu.get_cpu_capability(),
+        compiler and file_stamp(Path(compiler).resolve()),
+        settings,
+    )
+
+
+def form_of(value: Any, varying: set[tuple[int, int]]) -> object:
+    """An argument as far as compiled code depends on it; of sizes that vary, (which tensor, axis), not how large."""
+    if isinstance(value, list | tuple):
+        return [form_of(one, varying) for one in value]
+    if not isinstance(value, Tensor):
+        return repr(value)
+    sizes = [None if (id(value), axis) in varying else size for axis, size in enumerate(value.shape)]
+    return str(value.dtype), value.requires_grad, sizes, value.is_contiguous(), value._is_view()
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def load(file: Path, options: dict[str, Any]) -> Any:
+    """What was saved, as torch hands it out; None where there is nothing whole, or nothing that this torch can load.
+    `options`: by which it was compiled. By others torch would compile its C++ anew."""
+    from torch._inductor import config  # takes seconds to import
+
+    try:
+        content = file.read_bytes()
+        digest, data = content[:32], content[32:]
+        if hashlib.sha256(data).digest() != digest:
+            logger.info("compiled code in %s is damaged: it is made again", file)
+            return None
+        with config.patch(options):
+            return torch.compiler.load_compiled_function(io.BytesIO(data))
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # whatever unpickling says of another version's file
+        logger.info("compiled code in %s cannot be loaded (%s): it is made again", file, first_line(error))
+        return None
+
+
+def save(made: Any, file: Path) -> None:
+    """Keep what torch has made; where that cannot be, it is made again in the next process."""
+    try:
+        data = type(made).serialize(made).serialized_data
+        file.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(file, hashlib.sha256(data).digest() + data)
+    except Exception as error:  # a full disk, or something of this function that cannot be written
+        logger.info("compiled code is not kept in %s: %s", file, first_line(error))
+
+
+@contextmanager
+def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
+    """Whether nobody else makes this file; `wait`: until nobody does. Where nothing can be locked everybody may."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        stream = file.with_suffix(".lock").open("w")
+    except OSError:
+        yield True
+        return
+    with stream:
+        try:
+            alone = lock(stream, wait)
+        except (OSError, InputError):
+            alone = True
+        yield alone
+
+
+# -- functions ---------------------------------------------------------------------------------------------------------
+
+
+class KeptFunction:
+    """A function of tensors through torch.compile, whose code is kept in the folder `place()` between processes.
+
+    `varying`: which sizes (tensor, axis) of given arguments may be others the next time; `unchecked`: those of CHECKED
+    that need not be.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        varying: Callable[[tuple[Any, ...]], list[tuple[Tensor, int]]],
+        options: dict[str, Any],
+        unchecked: set[str],
+    ) -> None:
+        self.function, self.varying, self.options = function, varying, options
+        self.names = list(inspect.signature(function).parameters)
+        self.checked = [kind for kind in CHECKED if kind not in unchecked]
+        self.works = True
+        self.codes: dict[tuple[object, ...], list[Code]] = {}
+
+    def code_for(self, arguments: tuple[Any, ...]) -> Code | None:
+        """Code that holds for arguments; None where that is left to torch.compile."""
+        kind = (*modes(), *map(kind_of, arguments))
+        codes, named = self.codes.setdefault(kind, []), self.named(arguments)
+        for code in codes:
+            if code.holds(named):
+                return code
+        file = self.file(arguments)
+        if file is None or len(codes) == MOST:
+            return None
+        try:
+            with made_by_one(file, wait=True):
+                code = self.found(file, arguments) or self.make(file, arguments)
+        except Exception as error:  # of an interface that may change: torch.compile says what is really wrong
+            logger.info("%s is compiled without being kept (%s)", self.function.__name__, first_line(error))
+            self.works = False
+            return None
+        codes.append(code)
+        return code
+
+    def file(self, arguments: tuple[Any, ...]) -> Path | None:
+        """Where code for arguments such as these is kept; None where none is."""
+        folder = place()
+        return folder / f"{self.key(arguments)}.bin" if folder is not None and self.works else None
+
+    def found(self, file: Path, arguments: tuple[Any, ...]) -> Code | None:
+        """Code from the disk, if it holds."""
+        found = load(file, self.options)
+        code = None if found is None else code_of(found)
+        return code if code is not None and code.holds(self.named(arguments)) else None
+
+    def make(self, file: Path, arguments: tuple[Any, ...]) -> Code:
+        """Code from the compiler, which is kept.
+
+        Raises:
+            ValueError: it does not hold for these arguments.
+        """
+        made = self.compile(arguments)
+        code = code_of(made)
+        if not code.holds(self.named(arguments)):
+            raise ValueError("its code does not hold for what it was made for")
+        save(made, file)
+        return code
+
+    def named(self, arguments: tuple[Any, ...]) -> dict[str, Any]:
+        """Arguments by name, but for the last ones, which have values."""
+        return dict(zip(self.names, arguments, strict=False))
+
+    def key(self, arguments: tuple[Any, ...]) -> str:
+        """Name of the file of code for these arguments."""
+        varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
+        forms = [form_of(value, varying) for value in arguments]
+        about = self.function.__name__, digest_of(self.function), sorted(self.options.items()), self.checked
+        return f"{self.function.__name__}-{content_key(about, forms, *modes(), machine())}"
+
+    def compile(self, arguments: tuple[Any, ...]) -> Any:
+        """What torch makes of the function for arguments such as these."""
+        options = self.options | {"guard_filter_fn": lambda found: [self.checks(guard) for guard in found]}
+        for tensor, axis in self.varying(arguments):
+            torch._dynamo.maybe_mark_dynamic(tensor, axis)
+        compiled: Any = torch.compile(self.function, fullgraph=True, options=options)
+        # whatever was compiled before: torch would guess from it that more varies
+        with torch._dynamo.config.patch(automatic_dynamic_shapes=False):
+            return compiled.aot_compile((arguments, {}))
+
+    def checks(self, guard: Any) -> bool:
+        """Whether one of torch's conditions is checked at every call."""
+        return guard.guard_type in self.checked
+
+
+def modes() -> tuple[object, ...]:
+    """What code depends on beside arguments, as long as a process lasts."""
+    return torch.is_grad_enabled(), torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+
+
+def kind_of(value: Any) -> object:
+    """What of an argument is looked up; its code says itself which sizes and formats it is for."""
+    if isinstance(value, Tensor):
+        return value.requires_grad
+    return tuple(map(kind_of, value)) if isinstance(value, list | tuple) else value
+
+
+def code_of(made: Any) -> Code:
+    """Code and conditions of what torch has made or loaded."""
+    return Code(made._artifacts.guard_manager.check, made.fn)
+
+
+# -- ahead -------------------------------------------------------------------------------------------------------------
+
+Call: TypeAlias = tuple[KeptFunction, tuple[Any, ...], bool]
+"""A function, what it was called with, and whether gradients were wanted."""
+RECORDED: ContextVar[list[Call] | None] = ContextVar("RECORDED", default=None)
+"""Calls that are only to be known; functions run as they stand meanwhile."""
+
+
+@contextmanager
+def recorded() -> Iterator[list[Call]]:
+    """Calls of functions that would be compiled; they run as they stand meanwhile."""
+    calls = list[Call]()
+    token = RECORDED.set(calls)
+    try:
+        yield calls
+    finally:
+        RECORDED.reset(token)
+
+
+def record(function: KeptFunction, arguments: tuple[Any, ...]) -> bool:
+    """Whether calls are only to be known; this one is then."""
+    calls = RECORDED.get()
+    if calls is not None:
+        calls.append((function, tuple(map(without_gradient, arguments)), torch.is_grad_enabled()))
+    return calls is not None
+
+
+def without_gradient(value: Any) -> Any:
+    """An argument that has gathered no gradient, which code would be told of."""
+    if not isinstance(value, Tensor) or not value.requires_grad:
+        return value
+    alone = value.detach().clone(memory_format=torch.preserve_format).requires_grad_()
+    return alone.view_as(alone) if value._is_view() else alone
+
+
+def make_ahead(calls: Sequence[Call]) -> None:
+    """Have code for these calls made and kept, where it is not; what others are making is left to them."""
+    for function, arguments, gradients in calls:
+        with torch.set_grad_enabled(gradients):
+            file = function.file(arguments)
+            if file is None or file.exists():
+                continue
+            with made_by_one(file) as alone, suppress(Exception):  # whoever needs it hears of it
+                if alone and not file.exists():
+                    function.make(file, arguments)
+
+
+def lacking(calls: Sequence[Call]) -> bool:
+    """Whether code for one of these calls is not kept yet."""
+    for function, arguments, gradients in calls:
+        with torch.set_grad_enabled(gradients):
+            file = function.file(arguments)
+        if file is None or not file.exists():
+            return True
+    return False

@@ -1,0 +1,24 @@
+"""Whether anything is compiled, or fetched from the disk, while something is done."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
+import torch
+
+from gsx.core.kept_code import KeptFunction
+
+
+@contextmanager
+def new_code() -> Iterator[list[str]]:
+    """Names of the functions for which code is made or loaded from now on, by whichever way."""
+    names, found_before = list[str](), KeptFunction.found
+
+    def found(self: KeptFunction, *given: object) -> object:
+        names.append(self.function.__name__)
+        return found_before(self, *given)
+
+    graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    with patch.object(KeptFunction, "found", found):
+        yield names
+    names += ["of torch"] * (torch._dynamo.utils.counters["stats"]["unique_graphs"] - graphs)

@@ -1,0 +1,214 @@
+"""Compiled functions that are kept on disk: what another process finds there, and what it must not take for its own."""
+
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from compilations import new_code
+from torch import Tensor
+
+from gsx.core.compiling import available, compile_rows
+from gsx.core.kept_code import FOLDER, KeptFunction, digest_of, lacking, made_by_one, make_ahead, recorded
+
+pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
+
+SOURCE = """
+FACTOR = 3.0
+
+def inner(x):
+    return x * FACTOR
+
+def weighted(x, y, power):
+    return (inner(x) ** power + y[:, :1]).sum(1)
+"""
+
+
+def module_of(source: str) -> types.ModuleType:
+    """A module of gsx, as far as its functions know, of this source."""
+    module = types.ModuleType("gsx.of_a_test")
+    exec(compile(source, "of_a_test.py", "exec"), module.__dict__)
+    return module
+
+
+def weighted(x: Tensor, y: Tensor, power: int) -> Tensor:
+    """What is compiled here."""
+    return ((3.0 * x) ** power + y[:, :1]).sum(1)
+
+
+def rows(count: int, **options: object) -> tuple[Tensor, Tensor]:
+    """Arguments of so many rows."""
+    generator = torch.Generator().manual_seed(count)
+    return tuple(torch.rand(count, 2, generator=generator, dtype=torch.float64).to(**options) for _ in range(2))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where code is kept, empty at first; torch's own stays where it is, and is found."""
+    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / FOLDER)
+    return tmp_path / FOLDER
+
+
+@contextmanager
+def made(monkeypatch: pytest.MonkeyPatch):
+    """Names of the functions that are compiled meanwhile, not loaded."""
+    names, make = list[str](), KeptFunction.make
+
+    def noted(self: KeptFunction, *given: object) -> object:
+        names.append(self.function.__name__)
+        return make(self, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(KeptFunction, "make", noted)
+        yield names
+
+
+def agrees(function: Callable[..., Tensor], x: Tensor, y: Tensor) -> bool:
+    """Whether compiled code gives what the function gives, as a whole and in its gradient."""
+    wanted, found = weighted(x, y, 2), function(x, y)
+    torch.testing.assert_close(found, wanted)
+    return True
+
+
+def test_code_is_made_once_and_then_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with made(monkeypatch) as names:
+        first = compile_rows(weighted, 2)
+        assert all(agrees(first, *rows(count)) for count in (5, 9, 2, 400))
+        assert names == ["weighted"]
+        assert [file.suffix for file in sorted(folder.iterdir())] == [".bin", ".lock"]
+        assert all(agrees(compile_rows(weighted, 2), *rows(count)) for count in (7, 5))
+        assert names == ["weighted"]
+
+
+def test_other_arguments_get_other_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    function = compile_rows(weighted, 2)
+    x, y = rows(6)
+    with made(monkeypatch) as names:
+        for number, given in enumerate(
+            [(x, y), (x.float(), y.float()), (x, torch.cat([y, y], 1)), (x.mT.contiguous().mT, y), (x, x)], start=1
+        ):
+            assert agrees(function, *given)
+            assert len(names) == number
+            assert agrees(function, *given)
+            assert len(names) == number
+
+
+def test_gradients_are_those_of_the_function_when_code_is_found(folder: Path) -> None:
+    slopes = []
+    for function in (lambda x, y: weighted(x, y, 2), compile_rows(weighted, 2), compile_rows(weighted, 2)):
+        x, y = (values.requires_grad_() for values in rows(8))
+        function(x, y).square().sum().backward()
+        slopes.append((x.grad, y.grad))
+    for found in slopes[1:]:
+        torch.testing.assert_close(found, slopes[0])
+    assert len(list(folder.glob("*.bin"))) == 1
+
+
+def test_another_last_argument_is_another_function(folder: Path) -> None:
+    x, y = rows(6)
+    compile_rows(weighted, 2)(x, y)
+    torch.testing.assert_close(compile_rows(weighted, 3)(x, y), weighted(x, y, 3))
+    assert len(list(folder.glob("*.bin"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("FACTOR = 3.0", "FACTOR = 4.0", False),
+        ("x * FACTOR", "x / FACTOR", False),
+        ("** power", "** (power + 1)", False),
+        ("def inner", "# a remark\n\ndef inner", True),
+    ],
+)
+def test_code_is_that_of_all_that_a_function_calls(old: str, new: str, same: bool) -> None:
+    assert old in SOURCE
+    digests = [digest_of(module_of(source).weighted) for source in (SOURCE, SOURCE.replace(old, new))]
+    assert (digests[0] == digests[1]) is same
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-10], lambda content: b"", lambda content: b"x" + content])
+def test_damaged_code_is_made_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes]
+) -> None:
+    compile_rows(weighted, 2)(*rows(6))
+    (file,) = folder.glob("*.bin")
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    with made(monkeypatch) as names:
+        assert agrees(compile_rows(weighted, 2), *rows(6))
+    assert names == ["weighted"]
+    assert len(file.read_bytes()) > len(whole) / 2
+
+
+def test_what_cannot_be_kept_is_left_to_torch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: KeptFunction, arguments: object) -> None:
+        raise RuntimeError("another torch")
+
+    monkeypatch.setattr(KeptFunction, "compile", broken)
+    function = compile_rows(weighted, 2)
+    assert agrees(function, *rows(6))
+    assert agrees(function, *rows(11))
+    assert not list(folder.glob("*.bin"))
+
+
+def test_where_nothing_can_be_written_code_lasts_as_long_as_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "file" / FOLDER)
+    function = compile_rows(weighted, 2)
+    with made(monkeypatch) as names:
+        assert agrees(function, *rows(6))
+        assert agrees(function, *rows(7))
+    assert names == ["weighted"]
+
+
+def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    function = compile_rows(weighted, 2)
+    x, y = (values.requires_grad_() for values in rows(6))
+    with recorded() as calls, new_code() as names:
+        function(x, y).sum().backward()
+    assert (len(calls), names) == (1, [])
+    assert lacking(calls)
+    (file,) = [kept.file(arguments) for kept, arguments, _ in calls]
+    with made_by_one(file), file.with_suffix(".lock").open():  # whoever else makes it
+        make_ahead(calls)
+    assert lacking(calls)
+    make_ahead(calls)
+    assert not lacking(calls)
+    with made(monkeypatch) as compiled:
+        function(x, y).sum().backward()
+    assert compiled == []
+
+
+OTHER = """
+import os, sys
+from pathlib import Path
+import torch
+sys.path += [{tests!r}, {here!r}]
+from compilations import new_code
+from test_kept_code import rows, weighted
+from gsx.core.compiling import compile_rows
+with new_code() as names:
+    compile_rows(weighted, 2)(*rows(6))
+print(names)
+"""
+
+
+def test_another_process_traces_nothing_and_compiles_nothing(tmp_path: Path) -> None:
+    here = Path(__file__).parent
+    code = OTHER.format(tests=str(here.parent), here=str(here))
+    own = os.environ | {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    told, programs = [], []
+    for _ in range(2):
+        ended = subprocess.run([sys.executable, "-c", code], env=own, capture_output=True, text=True, check=True)
+        told.append(ended.stdout.strip().splitlines()[-1])
+        programs.append(sorted(tmp_path.rglob("*.so")))
+    assert "of torch" in told[0]
+    assert told[1] == "['weighted']"
+    assert programs[0] == programs[1] != []
