@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsx.core.quality.losses import WINDOW, ssim_map
+from gsx.core.quality.losses import ssim_map
+from gsx.core.quality.similarity import WINDOW
 from gsx.core.shapes import Bool, Float
 
 SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
@@ -37,27 +38,31 @@ def ssim(
     target: Float[Tensor, "C H W"],
     variant: str,
     counted: Bool[Tensor, "H W"] | None = None,
+    compiled: bool = False,
 ) -> float:
     """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all).
 
     They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
     `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
-    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim.
+    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim. `compiled`: by such loops.
     """
     if variant == "inria":
-        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted)
+        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted, compiled)
     if variant == "torchmetrics":
         half, mode = WINDOW // 2, "reflect" if min(image.shape[1:]) > WINDOW // 2 else "replicate"
         padded_image, padded_target = (pad(picture, (half,) * 4, mode=mode) for picture in (image, target))
-        return whole_windows(padded_image, padded_target, counted)
+        return whole_windows(padded_image, padded_target, counted, compiled)
     if variant == "valid":
         inner = slice(WINDOW // 2, -(WINDOW // 2))
-        return whole_windows(image, target, None if counted is None else counted[inner, inner])
+        return whole_windows(image, target, None if counted is None else counted[inner, inner], compiled)
     raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
 
 
 def whole_windows(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "h w"] | None = None
+    image: Float[Tensor, "C H W"],
+    target: Float[Tensor, "C H W"],
+    counted: Bool[Tensor, "h w"] | None,
+    compiled: bool,
 ) -> float:
     """Mean SSIM where the window fits, its middle counts; pictures smaller than a window are extended by their border
     first, and then count everywhere.
@@ -74,7 +79,8 @@ def whole_windows(
     weights, total = weights.to(image.device).double(), 0.0
     for top in range(0, count, rows):
         strip = slice(top, min(top + rows, count) + WINDOW - 1)
-        total += float((ssim_map(image[:, strip], target[:, strip], padding=0) * weights[top : top + rows]).sum())
+        found = ssim_map(image[:, strip], target[:, strip], padding=0, compiled=compiled)
+        total += float((found * weights[top : top + rows]).sum())
     return total / (len(image) * float(weights.sum()))
 
 

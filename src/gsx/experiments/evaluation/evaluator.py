@@ -254,11 +254,17 @@ class Evaluator:
             "name": view.name,
             "group": view.group,
             "psnr": psnr(image, truth, judged),
-            "ssim": ssim(image, truth, self.options.ssim, judged),
+            "ssim": self.ssim(image, truth, judged),
             "lpips": None if self.lpips is None else self.lpips.distance(self.seen(image), self.seen(truth)),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
+
+    def ssim(
+        self, image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+    ) -> float:
+        """By the protocol's variant, compiled if renders are."""
+        return ssim(image, truth, self.options.ssim, counted, path_of(self.run.raster, self.run.device) == "compiled")
 
     def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
         """The part of a picture that is judged, for metrics that know no mask."""
@@ -289,12 +295,12 @@ class Evaluator:
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
         """Figures of one view at a zoom, beside those of its competitors."""
-        kind, truth, counted = self.options.ssim, zoomed.truth, zoomed.counted
+        truth, counted = zoomed.truth, zoomed.counted
         return {
             "psnr": psnr(zoomed.render, truth, counted),
-            "ssim": ssim(zoomed.render, truth, kind, counted),
+            "ssim": self.ssim(zoomed.render, truth, counted),
             "enlarged_psnr": psnr(zoomed.enlarged, truth, counted),
-            "enlarged_ssim": ssim(zoomed.enlarged, truth, kind, counted),
+            "enlarged_ssim": self.ssim(zoomed.enlarged, truth, counted),
             "photograph_psnr": psnr(zoomed.photograph, truth, counted),
         }
 

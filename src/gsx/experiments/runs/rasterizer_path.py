@@ -25,7 +25,7 @@ from gsx.core.rasterizer.path import compiles
 
 logger = logging.getLogger(__name__)
 
-WARM_SPLATS, WARM_SIZE = 2000, 128
+WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
 """Of the picture that has everything compiled: lists of several chunks in several groups."""
 
 
@@ -67,7 +67,7 @@ def learn_little(settings: RasterSettings, device: torch.device) -> None:
     colours = colours_of(splats.colours[:, None], rest, splats.means, degree=3, compiled=True)
     as_training = replace(settings, training_focal=0.0)
     image = rasterize(replace(splats, colours=colours), warm_camera(), as_training).image
-    photometric(image, torch.zeros_like(image), 0.2, compiled=True).backward()
+    photometric(image, torch.zeros(image.shape, device=device), 0.2, compiled=True).backward()
 
 
 @contextmanager
@@ -121,7 +121,7 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
 
 def warm_camera() -> Camera:
     """What looks at them."""
-    return look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE, height=WARM_SIZE)
+    return look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE[0], height=WARM_SIZE[1])
 
 
 def warm_splats(device: torch.device) -> Splats:
