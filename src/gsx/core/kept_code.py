@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gsx.core.cache import content_key, file_stamp
 from gsx.core.errors import InputError, first_line
-from gsx.core.files import replace_file
+from gsx.core.files import replacing
 from gsx.core.locks import lock
 
 logger = logging.getLogger(__name__)
@@ -49,9 +49,21 @@ class Code:
 
 
 def place() -> Path | None:
-    """Where compiled functions are kept: beside torch's own code; None where nobody said where that is."""
+    """Where compiled functions are kept: beside torch's own code; None where nobody said where that is, or torch has
+    not what is needed."""
     own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
-    return Path(own) / FOLDER if own and hasattr(torch.compiler, "load_compiled_function") else None
+    return Path(own) / FOLDER if own and as_expected() else None
+
+
+@functools.cache
+def as_expected() -> bool:
+    """Whether torch has all that is used here of an interface that may change."""
+    try:
+        from torch._dynamo.aot_compile import AOTCompiledFunction, CompileArtifacts
+    except ImportError:
+        return False
+    kept = hasattr(torch.compiler, "load_compiled_function") and hasattr(AOTCompiledFunction, "save_compiled_function")
+    return kept and "guard_manager" in CompileArtifacts.__dataclass_fields__
 
 
 # -- names -------------------------------------------------------------------------------------------------------------
@@ -154,9 +166,11 @@ def load(file: Path, options: dict[str, Any]) -> Any:
 def save(made: Any, file: Path) -> None:
     """Keep what torch has made; where that cannot be, it is made again in the next process."""
     try:
-        data = type(made).serialize(made).serialized_data
         file.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(file, hashlib.sha256(data).digest() + data)
+        with replacing(file) as temporary:
+            made.save_compiled_function(str(temporary))
+            data = temporary.read_bytes()
+            temporary.write_bytes(hashlib.sha256(data).digest() + data)
     except Exception as error:  # a full disk, or something of this function that cannot be written
         logger.info("compiled code is not kept in %s: %s", file, first_line(error))
 

@@ -76,7 +76,7 @@ def helper(settings: RasterSettings) -> Iterator[None]:
     words = json.dumps({"settings": asdict(settings), "threads": torch.get_num_threads()})
     code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, words],
+        [sys.executable, "-P", "-c", code, words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
