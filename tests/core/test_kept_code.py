@@ -193,9 +193,9 @@ import torch
 sys.path += [{tests!r}, {here!r}]
 from compilations import new_code
 from test_kept_code import rows, weighted
-from gsx.core.compiling import compile_rows
+from gsx.core.compiling import WHOLE_LOOPS, compile_rows
 with new_code() as names:
-    compile_rows(weighted, 2)(*rows(6))
+    compile_rows(weighted, 2, options=WHOLE_LOOPS)(*rows(6))
 print(names)
 """
 

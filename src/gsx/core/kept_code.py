@@ -222,8 +222,8 @@ class KeptFunction:
         for code in codes:
             if code.holds(named):
                 return code
-        file = self.file(arguments)
-        if file is None or len(codes) == MOST:
+        file = self.file(arguments) if len(codes) < MOST else None
+        if file is None:
             return None
         try:
             with made_by_one(file, wait=True):
