@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.core.compiling import available, compile_rows
 from gsx.core.kept_code import FOLDER, KeptFunction, digest_of, lacking, made_by_one, make_ahead, recorded
+from gsx.core.quality.similarity import compiled_correlate, correlate
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
 
@@ -129,6 +130,19 @@ def test_code_is_that_of_all_that_a_function_calls(old: str, new: str, same: boo
     assert old in SOURCE
     digests = [digest_of(module_of(source).weighted) for source in (SOURCE, SOURCE.replace(old, new))]
     assert (digests[0] == digests[1]) is same
+
+
+def test_code_of_sizes_that_torch_takes_for_others_lies_beside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window of 11 leaves one row of 11: torch makes code for such."""
+    sizes = [(3, 40, 50), (3, 11, 50), (3, 30, 20), (3, 11, 11)]
+    with made(monkeypatch) as names:
+        for _ in range(2):
+            compiled_correlate.cache_clear()
+            for size in sizes:
+                maps = torch.rand(size)
+                torch.testing.assert_close(compiled_correlate(1)(maps), correlate(maps, 1))
+    assert names == ["correlate", "correlate"]
+    assert len(list(folder.glob("*.bin"))) == 2
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:-10], lambda content: b"", lambda content: b"x" + content])

@@ -227,7 +227,8 @@ class KeptFunction:
             return None
         try:
             with made_by_one(file, wait=True):
-                code = self.found(file, arguments) or self.make(file, arguments)
+                found, free = self.found(file, arguments)
+                code = found or self.make(free, arguments)
         except Exception as error:  # of an interface that may change: torch.compile says what is really wrong
             logger.info("%s is compiled without being kept (%s)", self.function.__name__, first_line(error))
             self.works = False
@@ -240,11 +241,16 @@ class KeptFunction:
         folder = place()
         return folder / f"{self.key(arguments)}.bin" if folder is not None and self.works else None
 
-    def found(self, file: Path, arguments: tuple[Any, ...]) -> Code | None:
-        """Code from the disk, if it holds."""
-        found = load(file, self.options)
-        code = None if found is None else code_of(found)
-        return code if code is not None and code.holds(self.named(arguments)) else None
+    def found(self, file: Path, arguments: tuple[Any, ...]) -> tuple[Code | None, Path]:
+        """(code from the disk, if one holds; else None, and where to keep what will). For a few sizes, above all those
+        of which one row is left, torch makes code of its own: it lies beside the first, by number."""
+        for slot in (file, *(file.with_name(f"{file.stem}-{number}.bin") for number in range(1, MOST))):
+            found = load(slot, self.options)
+            if found is None:
+                return None, slot
+            if code_of(found).holds(self.named(arguments)):
+                return code_of(found), slot
+        return None, file
 
     def make(self, file: Path, arguments: tuple[Any, ...]) -> Code:
         """Code from the compiler, which is kept.
