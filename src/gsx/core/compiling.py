@@ -89,19 +89,21 @@ def compiled_once(
     varying: Varying,
     options: dict[str, Any] | None = None,
     unchecked: Iterable[str] = (),
+    fullgraph: bool = False,
 ) -> Callable[..., Any]:
     """`function` of tensors through torch.compile, once whatever the sizes are that vary.
 
     On a CPU its code is kept on disk (kept_code.py), elsewhere torch traces it anew in each process. Parameters are
     handed on as tensors: whatever it is told, torch takes their own sizes for constants. `options`: of the compiler;
-    `unchecked`: conditions of torch's, by type, that need not be checked.
+    `unchecked`: conditions of torch's, by type, that need not be checked; `fullgraph`: torch raises what it would else
+    leave to Python.
     """
     left_out, given_options = set(unchecked), options or {}
     kept = KeptFunction(function, varying, given_options, left_out)
     if left_out:
         keep = {"guard_filter_fn": lambda guards: [guard.guard_type not in left_out for guard in guards]}
         given_options = given_options | keep
-    traced = sizes_free(torch.compile(function, fullgraph=bool(left_out), options=given_options or None), varying)
+    traced = sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
 
     def call(*given: Any) -> Any:
         arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)

@@ -215,6 +215,11 @@ class KeptFunction:
         self.works = True
         self.codes: dict[tuple[object, ...], list[Code]] = {}
 
+    @functools.cached_property
+    def digest(self) -> str:
+        """By which the function is known."""
+        return digest_of(self.function)
+
     def code_for(self, arguments: tuple[Any, ...]) -> Code | None:
         """Code that holds for arguments; None where that is left to torch.compile."""
         kind = (*modes(), *map(kind_of, arguments))
@@ -273,7 +278,7 @@ class KeptFunction:
         """Name of the file of code for these arguments."""
         varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
         forms = [form_of(value, varying) for value in arguments]
-        about = self.function.__name__, digest_of(self.function), sorted(self.options.items()), self.checked
+        about = self.function.__name__, self.digest, sorted(self.options.items()), self.checked
         return f"{self.function.__name__}-{content_key(about, forms, *modes(), machine())}"
 
     def compile(self, arguments: tuple[Any, ...]) -> Any:
@@ -343,23 +348,24 @@ def without_gradient(value: Any) -> Any:
     return alone.view_as(alone) if value._is_view() else alone
 
 
+def file_of(call: Call) -> Path | None:
+    """Where code for a call is kept; None where none is."""
+    function, arguments, gradients = call
+    with torch.set_grad_enabled(gradients):
+        return function.file(arguments)
+
+
 def make_ahead(calls: Sequence[Call]) -> None:
     """Have code for these calls made and kept, where it is not; what others are making is left to them."""
-    for function, arguments, gradients in calls:
-        with torch.set_grad_enabled(gradients):
-            file = function.file(arguments)
-            if file is None or file.exists():
-                continue
-            with made_by_one(file) as alone, suppress(Exception):  # whoever needs it hears of it
-                if alone and not file.exists():
-                    function.make(file, arguments)
+    for call in calls:
+        file, (function, arguments, gradients) = file_of(call), call
+        if file is None or file.exists():
+            continue
+        with made_by_one(file) as alone, torch.set_grad_enabled(gradients), suppress(Exception):  # its user hears of it
+            if alone and not file.exists():
+                function.make(file, arguments)
 
 
 def lacking(calls: Sequence[Call]) -> bool:
     """Whether code for one of these calls is not kept yet."""
-    for function, arguments, gradients in calls:
-        with torch.set_grad_enabled(gradients):
-            file = function.file(arguments)
-        if file is None or not file.exists():
-            return True
-    return False
+    return any(file is None or not file.exists() for file in map(file_of, calls))

@@ -11,7 +11,7 @@ import torch
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from gsx.core.kept_code import Call, KeptFunction, recorded
+from gsx.core.kept_code import Call, KeptFunction, file_of, recorded
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import rasterizer_path
@@ -65,11 +65,10 @@ def test_who_asks_for_the_eager_path_keeps_it(compiler):
 def files_of(calls: list[Call]) -> dict[str, Path]:
     """Where code for these calls is kept, by what it is called."""
     found = {}
-    for function, arguments, gradients in calls:
-        with torch.set_grad_enabled(gradients):
-            file = function.file(arguments)
+    for call in calls:
+        file = file_of(call)
         assert file is not None
-        found[f"{function.function.__name__} {file.stem}"] = file
+        found[f"{call[0].function.__name__} {file.stem}"] = file
     return found
 
 

@@ -366,4 +366,4 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
         given = [value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE]
         return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
 
-    return compiled_once(with_last(loop, rules), varying, options, unchecked)
+    return compiled_once(with_last(loop, rules), varying, options, unchecked, fullgraph=True)

@@ -53,8 +53,8 @@ def compile_now(settings: RasterSettings, device: torch.device, helped: bool = F
     begun = time.perf_counter()
     with recorded() as calls:
         learn_little(settings, device)
-    if not calls or lacking(calls):
-        with helper(settings) if calls and helped and torch.get_num_threads() > 1 else nullcontext():
+    if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
+        with helper(settings) if helped and torch.get_num_threads() > 1 else nullcontext():
             make_ahead(calls)
             learn_little(settings, device)
     return time.perf_counter() - begun
