@@ -57,6 +57,15 @@ def test_a_shaded_photograph_gets_brighter_towards_a_side_at_every_size_and_in_c
     assert (drawn.std(0) - 0.2).abs().max() < 0.01
 
 
+def test_what_photographs_have_in_common_of_their_light_is_taken_from_them() -> None:
+    scene = small_scene(spread(5))
+    worse = [view.source for view in disturbed(scene, {"shade": 0.2}).train]
+    drawn = torch.tensor([slopes_of(view.name, 0.2) for view in scene.train])
+    found = torch.tensor([source.slopes for source in worse])
+    assert found.mean(0).abs().max() < 1e-6
+    torch.testing.assert_close(found[1:] - found[0], drawn[1:] - drawn[0])
+
+
 def test_values_saturate_and_files_and_masks_stay_those_of_the_source() -> None:
     scene = small_scene(spread(5))
     one = View("bright", scene.train[0].camera, GreyFile())

@@ -33,7 +33,8 @@ def told() -> dict[tuple[str, ...], Any]:
     cases = [*MOST, RECORDED, BROKEN]
     words = [word for case in cases for word in ("/", *case)][1:]
     command = [sys.executable, str(TESTS / "stand_in_gpu.py"), *words]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))}
+    paths = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}  # as `make test` has it
     ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert ended.returncode == 0, ended.stderr
     return dict(zip(cases, json.loads(ended.stdout), strict=True))

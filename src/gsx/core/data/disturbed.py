@@ -1,9 +1,10 @@
 """Photographs made worse in a known way, so that the truth of what finds and mends them is known (research alone)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -137,6 +138,14 @@ def slopes_of(name: str, spread: float) -> tuple[float, float]:
     return right, down
 
 
+def common_slopes(names: Iterable[str], spread: float) -> tuple[float, float]:
+    """The mean of these photographs' slopes; zero of one alone. Light that all photographs share looks like the scene's
+    own, and no other photograph has it: it is nobody's to find, so that it is taken from what they suffer."""
+    drawn = [slopes_of(name, spread) for name in names]
+    right, down = (fmean(along) if len(drawn) > 1 else 0.0 for along in zip(*drawn, strict=True))
+    return right, down
+
+
 def turn_of(name: str, spread: float) -> tuple[float, float]:
     """Px to the right and down by which the middle of the picture of that photograph moves, of that standard
     deviation."""
@@ -177,15 +186,17 @@ def patch_of(name: str, share: float) -> Patch:
     return Patch(edges=(left, top, left + side, top + side), colour=colour)
 
 
-def worse(view: View, by: Mapping[str, float]) -> View:
-    """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken."""
+def worse(view: View, by: Mapping[str, float], common: tuple[float, float]) -> View:
+    """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken.
+    common: of the slopes of its light and those of the others."""
     kinds = ("exposure", "shade", "pose", "covered", "blur")
     exposure, shade, pose, covered, blur = (by.get(kind, 0.0) for kind in kinds)
+    (right, down), (right_of_all, down_of_all) = slopes_of(view.name, shade), common
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
-        slopes=slopes_of(view.name, shade) if shade else None,
+        slopes=(right - right_of_all, down - down_of_all) if shade else None,
         patch=patch_of(view.name, covered) if covered else None,
         movement=view.camera.frame.shares(*movement_of(view.name, blur)) if blur else None,
     )
@@ -205,7 +216,8 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     """The scene with training photographs made worse, and a note that says so; test photographs stay as they are.
 
     by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
-    `shade`: of how much log gains grow from the middle of a photograph to its sides, to the right and down.
+    `shade`: of how much log gains grow from the middle of a photograph to its sides, to the right and down, less what
+    photographs that suffer have in common.
     `pose`: of how far pictures move along each axis when cameras are turned, px. `blur`: of how far they move while
     they are exposed, px. `covered`: share of each photograph that something plain stands before. `some`: the share of
     photographs that suffer; 1 where it is not said.
@@ -223,10 +235,11 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     if not asked or not some:
         return scene
     names = chosen([view.name for view in scene.train], some)
+    common = common_slopes(sorted(names), by.get("shade", 0.0))
     told = ", ".join(f"{kind} {value:g}" for kind, value in asked.items())
     return replace(
         scene,
-        train=[worse(view, asked) if view.name in names else view for view in scene.train],
+        train=[worse(view, asked, common) if view.name in names else view for view in scene.train],
         notes=[
             *scene.notes,
             f"disturbed: {len(names)} of {len(scene.train)} training photographs (scene.disturb: {told})",
