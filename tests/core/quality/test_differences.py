@@ -11,11 +11,13 @@ from gsx.core.quality.distractors import (
     PLAIN,
     TIMES,
     Difference,
+    colour_bins,
     difference_of,
     distractors_in,
     plain_parts,
     whole_of,
     with_plain_parts,
+    with_their_colours,
 )
 from gsx.core.training.captures import at_exposure
 
@@ -220,3 +222,34 @@ def test_what_the_model_has_learnt_of_a_plain_thing_is_found_with_the_rest() -> 
     ])  # fmt: skip
     assert bool(found[2][5:15, 10:20].all())
     assert not any(bool(marked.any()) for n, marked in enumerate(found) if n != 2)
+
+
+def test_colours_that_are_mostly_those_of_distractors_are_theirs_in_every_photograph() -> None:
+    """Of five red blocks three are marked, of four green ones two: exactly half is not most."""
+    red, green, blue = (torch.eye(3)[n] * 0.9 for n in range(3))
+    one, other = (
+        torch.stack(row, 1)[:, None] for row in ([red, red, green, blue, green], [red, red, red, green, green])
+    )
+    marked = [torch.tensor([[1, 1, 1, 0, 0]]).bool(), torch.tensor([[1, 0, 0, 1, 0]]).bool()]
+    found = with_their_colours(marked, [colour_bins(one), colour_bins(other)])
+    assert found[0].tolist() == [[True, True, True, False, False]]
+    assert found[1].tolist() == [[True, True, True, True, False]]
+    assert len({int(colour_bins(colour[:, None, None])) for colour in (red, green, blue, 0 * red, red + 0.05)}) == 5
+    assert int(colour_bins(torch.ones(3, 1, 1))) == 32**3 - 1
+
+
+def test_who_walks_on_in_the_same_clothes_is_told_by_them() -> None:
+    """In three photographs they differ from the model; the fourth the model has learnt as it is."""
+    pictures, photographs = [shown(camera) for camera in cameras()], []
+    for number, (image, _) in enumerate(pictures):
+        photographs.append(image.clone())
+        if number < 4:
+            left = 6 + 9 * number
+            photographs[-1][:, 14:34, left : left + 8] = torch.tensor([0.8, 0.1, 0.1])[:, None, None]
+    found = distractors_in([
+        difference_of(camera, photograph if n == 3 else image, depth, torch.ones(48, 64), photograph)
+        for n, (camera, (image, depth), photograph) in enumerate(zip(cameras(), pictures, photographs, strict=True))
+    ])  # fmt: skip
+    assert bool(found[3][8:16, 17:20].all())
+    assert not bool(found[3][:, :15].any())
+    assert not any(bool(marked.any()) for marked in found[4:])

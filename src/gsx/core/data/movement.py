@@ -5,15 +5,19 @@ what is taken is the mean of the sharp picture over that line.
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
 from torch.nn.functional import pad
 
 from gsx.core.shapes import Float
 
 SAMPLES = 4
 """Places along a movement, for each px of it."""
+DAMPING = 0.1
+"""Of gradients that are sharpened: a frequency that blur leaves less than the root of this of is held back."""
 
 
 def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
@@ -44,3 +48,42 @@ def motion_blurred(image: Float[Tensor, "C H W"], across: float, down: float) ->
         weight = float(kernel[row, column])
         total = torch.add(total, around[:, row : row + height, column : column + width], alpha=weight)
     return total
+
+
+# -- gradients ---------------------------------------------------------------------------------------------------------
+
+
+class MotionBlur(Function):
+    """`motion_blurred`; what comes back through it is sharpened, not blurred once more."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
+        """The mean over the movement."""
+        ctx.movement = across, down
+        return motion_blurred(image, across, down)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Float[Tensor, "C H W"]) -> tuple[Float[Tensor, "C H W"], None, None]:
+        """To the sharp picture."""
+        return sharpened(gradient, *ctx.movement), None, None
+
+
+def blurred_to_learn(image: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
+    """The mean of a picture over a movement, px, whose gradient is a direction to go, not the slope.
+
+    With K the mean over the movement, the slope of a loss with gradient g is K^T g: what the photograph has little of
+    is weighted down by the blur twice, and learnt last. Here it is (1 + d) (K^T K + d)^-1 K^T g, the direction of Gauss
+    and Newton for the sharp picture, damped by d (Levenberg 1944). It goes down as well, and where nothing is blurred
+    away it is the slope.
+    """
+    return MotionBlur.apply(image, across, down)
+
+
+def sharpened(gradient: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
+    """(1 + d) (K^T K + d)^-1 K^T of a gradient, by its spectrum; beyond its edges it is zero."""
+    kernel, (height, width) = line_kernel(across, down).to(gradient), gradient.shape[1:]
+    size, side = (height + len(kernel), width + len(kernel)), len(kernel) // 2
+    around = pad(kernel, (0, size[1] - len(kernel), 0, size[0] - len(kernel))).roll((-side, -side), (0, 1))
+    share = torch.fft.rfft2(around).real  # of a frequency that is left; real, since movements go both ways alike
+    factor = (1 + DAMPING) * share / (share.square() + DAMPING)
+    return torch.fft.irfft2(factor * torch.fft.rfft2(gradient, s=size), s=size)[:, :height, :width].contiguous()

@@ -4,7 +4,8 @@ A model of a static scene shows what photographs agree on. Where one of them dif
 and the photographs that see the same place do not, something was in the way (distractors: RobustNeRF, Sabour et al.
 2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here by the places that depth
 tells). Where others differ there as well it is the model that is wrong. What is plain, a coat for example, goes as a
-whole (as clusters of features do there): a model that has learnt a piece of it differs little there.
+whole (as clusters of features do there): a model that has learnt a piece of it differs little there. So do colours that
+photographs show mostly where something was in the way: somebody wears the same in all of them.
 """
 
 from collections.abc import Sequence
@@ -40,6 +41,9 @@ PLAIN = 0.02
 """Blocks side by side whose colours differ by less, display values, are of one thing."""
 SHARE = 0.3
 """Of a thing that is marked, from which on all of it is."""
+COLOURS, MOSTLY = 32, 0.5
+"""Bins of each channel; share of all blocks of a bin, over photographs, from which on, where so many are marked, all of
+them are."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,7 +105,7 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
         marked = whole_of(alone(own, others, least), own.size > least / 2)
         found.append(with_plain_parts(marked, plain_parts(own.colours)))
-    return found
+    return with_their_colours(found, [colour_bins(one.colours) for one in differences])
 
 
 def alone(own: Difference, others: Sequence[Difference], least: float) -> Bool[Tensor, "h w"]:
@@ -179,3 +183,24 @@ def with_plain_parts(marked: Bool[Tensor, "h w"], parts: Int[Tensor, "h w"]) -> 
     count = numbers.bincount(minlength=len(numbers))
     hits = numbers.bincount(marked.flatten().double(), minlength=len(numbers))
     return marked | (hits > SHARE * count)[parts]
+
+
+# -- colours that distractors have -------------------------------------------------------------------------------------
+
+
+def colour_bins(colours: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
+    """The bin of each colour."""
+    red, green, blue = (colours * COLOURS).long().clamp(0, COLOURS - 1)
+    return (red * COLOURS + green) * COLOURS + blue
+
+
+def with_their_colours(
+    marked: Sequence[Bool[Tensor, "h w"]], colours: Sequence[Int[Tensor, "h w"]]
+) -> list[Bool[Tensor, "h w"]]:
+    """Marked blocks, and those of colours that, over all photographs, are mostly those of marked blocks: who walks
+    through several photographs wears the same in all, and a model that has learnt them in one tells them in others."""
+    everywhere, there = COLOURS**3, list(zip(marked, colours, strict=True))
+    count = sum((own.flatten().bincount(minlength=everywhere) for own in colours), torch.zeros(everywhere))
+    hits = sum((own[mark].bincount(minlength=everywhere) for mark, own in there), torch.zeros(everywhere))
+    theirs = hits > MOSTLY * count
+    return [mark | theirs[own] for mark, own in there]

@@ -13,7 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from gsx.core.data.movement import motion_blurred
+from gsx.core.data.movement import blurred_to_learn
 from gsx.core.data.scene import View
 from gsx.core.quality.motion_blur import Movement
 from gsx.core.quality.sharpness import against_neighbours, fineness
@@ -90,7 +90,7 @@ class Blur:
         if view.name not in self.movements:
             return image
         (across, down), frame = self.movements[view.name], view.camera.frame
-        return motion_blurred(image, across * frame.width, down * frame.height)
+        return blurred_to_learn(image, across * frame.width, down * frame.height)
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where there are none."""
