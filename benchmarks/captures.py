@@ -1,7 +1,7 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/photographs.md.
 
     python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,adjust,covered,passed,blur,sky]
-                                  [--only demo,fox] [--seeds 0,1] [--share 0.4]
+                                  [--only demo,fox] [--seeds 0,1] [--share 0.4] [--label NAME]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
@@ -111,6 +111,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser = shared_arguments(__doc__, USUAL, "outputs/captures")
     parser.add_argument("--what", default="exposure,poses,faults", help="tables, by commas")
     parser.add_argument("--share", type=float, default=1.0, help="of the steps")
+    parser.add_argument("--label", default="", help="of tables over other scenes or steps: added to their names")
     return parser.parse_args(words)
 
 
@@ -498,7 +499,8 @@ WHAT: dict[str, Measure] = {
 
 def main(words: Sequence[str]) -> None:
     """Train and look, and write the tables."""
-    write_tables(words, arguments(words), "captures", WHAT)
+    given = arguments(words)
+    write_tables(words, given, "captures", WHAT, given.label)
 
 
 if __name__ == "__main__":

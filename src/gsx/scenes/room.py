@@ -16,13 +16,13 @@ from torch import Tensor
 from gsx.core.cache import content_key
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Float
 from gsx.scenes.demo import textures
 from gsx.scenes.demo.noise import blend
 from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
 from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
 from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, plain, rgb, smoothstep
-from gsx.scenes.demo.tracing import rays_through, shade, trace
+from gsx.scenes.demo.tracing import HitPoints, colours_of, hit_points, joined, rays_through, trace
 from gsx.scenes.demo.views import DemoOptions, check, photographed, scene_version
 
 HALF = (2.5, 2.0)  # of the floor, scene units: about metres
@@ -117,31 +117,26 @@ def walking_camera(place: float, width: int, height: int) -> Camera:
     return look_at(eye, target, fov_x=FIELD_OF_VIEW, width=width, height=height)
 
 
-def patterned(
-    room: StillLife, camera: Camera, u: Float[Tensor, "P"], v: Float[Tensor, "P"]
-) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"], Bool[Tensor, "P"]]:
-    """(positions, colours, whether there is pattern) of what rays through raster positions meet."""
-    rays = rays_through(camera, u, v)
-    hits = trace(room, rays)
-    colours = shade(room, rays, hits)
-    beside = [rays_through(camera, u + right, v + down) for right, down in ((1.0, 0.0), (0.0, 1.0))]
-    apart = [(shade(room, other, trace(room, other)) - colours).abs().amax(0) for other in beside]
-    positions = rays.origin.float()[:, None] + rays.directions * hits.depth
-    return positions, colours, torch.maximum(*apart) > CONTRAST
-
-
 def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Points where pictures have pattern, at most so many: as structure from motion would leave them."""
-    positions, colours = [], []
     share = math.ceil(TRIES * count / len(cameras))
-    for camera in cameras:
-        u, v = torch.rand(2, share, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
-        where, what, pattern = patterned(room, camera, u, v)
-        positions.append(where[:, pattern])
-        colours.append(what[:, pattern])
-    where, what = torch.cat(positions, 1).T, torch.cat(colours, 1).T
+    tried = [torch.rand(2, share, generator=generator, dtype=torch.float64) for _ in cameras]
+    places = [place * torch.tensor([camera.size]).T for camera, place in zip(cameras, tried, strict=True)]
+    seen, *beside = (seen_at(room, cameras, places, shift) for shift in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    colours, *near = (colours_of(room, one) for one in (seen, *beside))
+    pattern = torch.maximum(*((other - colours).abs().amax(0) for other in near)) > CONTRAST
+    where, what = seen.points[:, pattern].T, colours[:, pattern].T
     chosen = torch.randperm(len(where), generator=generator)[:count]
     return PointCloud(where[chosen].contiguous(), (what[chosen] * 255.0 + 0.5).to(torch.uint8))
+
+
+def seen_at(
+    room: StillLife, cameras: Sequence[Camera], places: Sequence[Float[Tensor, "2 P"]], shift: tuple[float, float]
+) -> HitPoints:
+    """What cameras see at places of their pictures, px, moved to the right and down."""
+    right, down = shift
+    bundles = [rays_through(camera, u + right, v + down) for camera, (u, v) in zip(cameras, places, strict=True)]
+    return joined([hit_points(rays, trace(room, rays)) for rays in bundles])
 
 
 def room_version() -> str:

@@ -1,6 +1,7 @@
 """Rays, what they hit, and pictures made of them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +34,18 @@ class Hits:
     depth: Float[Tensor, "*rays"]
     """Distance along the ray, scene units."""
     owner: Int[Tensor, "*rays"]
+    """Number of the solid, GROUND or SKY."""
+
+
+@dataclass(frozen=True, eq=False)
+class HitPoints:
+    """Points that rays meet."""
+
+    points: Float[Tensor, "3 points"]
+    """World, scene units."""
+    directions: Float[Tensor, "3 points"]
+    """Of the rays."""
+    owner: Int[Tensor, "points"]
     """Number of the solid, GROUND or SKY."""
 
 
@@ -90,16 +103,32 @@ def trace(life: StillLife, rays: Rays, camera: Camera | None = None) -> Hits:
     return hits
 
 
+def hit_points(rays: Rays, hits: Hits) -> HitPoints:
+    """What rays meet, as a list."""
+    directions = rays.directions.flatten(1)
+    points = column(rays.origin, directions) + directions * hits.depth.flatten()
+    return HitPoints(points, directions, hits.owner.flatten())
+
+
+def joined(parts: Sequence[HitPoints]) -> HitPoints:
+    """What several bundles of rays meet, one after another."""
+    points, directions, owners = zip(*((part.points, part.directions, part.owner) for part in parts), strict=True)
+    return HitPoints(torch.cat(points, 1), torch.cat(directions, 1), torch.cat(owners))
+
+
+def colours_of(life: StillLife, seen: HitPoints) -> Float[Tensor, "3 points"]:
+    """Display colours, in [0, 1]."""
+    colour = torch.empty_like(seen.points)
+    for number in seen.owner.unique().tolist():
+        for chosen in (seen.owner == number).nonzero()[:, 0].split(BAND_RAYS):
+            points, directions = (all_of.index_select(1, chosen) for all_of in (seen.points, seen.directions))
+            colour.index_copy_(1, chosen, owner_colour(life, number, points, directions))
+    return colour.clamp(0.0, 1.0)
+
+
 def shade(life: StillLife, rays: Rays, hits: Hits) -> Float[Tensor, "3 *rays"]:
     """Display colours of what the rays meet, in [0, 1]."""
-    directions, owner = rays.directions.flatten(1), hits.owner.flatten()
-    points = column(rays.origin, directions) + directions * hits.depth.flatten()
-    colour = torch.empty_like(points)
-    for number in owner.unique().tolist():
-        chosen = (owner == number).nonzero()[:, 0]
-        seen = owner_colour(life, number, points.index_select(1, chosen), directions.index_select(1, chosen))
-        colour.index_copy_(1, chosen, seen)
-    return colour.clamp(0.0, 1.0).reshape(rays.directions.shape)
+    return colours_of(life, hit_points(rays, hits)).reshape(rays.directions.shape)
 
 
 def owner_colour(life: StillLife, number: int, points: Tensor, directions: Tensor) -> Float[Tensor, "3 points"]:

@@ -19,10 +19,10 @@ from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError
 from gsx.core.ranges import Points, Range, Seed
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import UInt8
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
-from gsx.scenes.demo.tracing import rays_through, render, shade, trace
+from gsx.scenes.demo.tracing import Rays, colours_of, hit_points, joined, rays_through, render, trace
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.splits import check_rule
 
@@ -121,19 +121,15 @@ def spiral_camera(place: float, width: int, height: int) -> Camera:
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Surface and sky points with their colours: what random rays of the cameras meet, equally many from each."""
     shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
-    found = [view_points(life, camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
-    positions, colours = (torch.cat(parts, dim=1).T.contiguous() for parts in zip(*found, strict=True))
-    return PointCloud(positions, (colours * 255.0 + 0.5).to(torch.uint8))
+    bundles = [random_rays(camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
+    seen = joined([hit_points(rays, trace(life, rays)) for rays in bundles])
+    return PointCloud(seen.points.T.contiguous(), (colours_of(life, seen).T.contiguous() * 255.0 + 0.5).to(torch.uint8))
 
 
-def view_points(
-    life: StillLife, camera: Camera, count: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"]]:
-    """What random rays of one camera meet: positions and colours."""
+def random_rays(camera: Camera, count: int, generator: torch.Generator) -> Rays:
+    """Rays of one camera through random places of its picture."""
     u, v = torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
-    rays = rays_through(camera, u, v)
-    hits = trace(life, rays)
-    return rays.origin.float()[:, None] + rays.directions * hits.depth, shade(life, rays, hits)
+    return rays_through(camera, u, v)
 
 
 def check(options: DemoOptions) -> None:
