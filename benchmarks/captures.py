@@ -53,6 +53,8 @@ FITTED = ("eval.colours=fitted",)
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
+MENDED = ", auto"
+"""Ends the name of a row that mends the one of the same name without it."""
 SHADED, EVENED = ("scene.disturb.shade=0.2",), (*JUDGED, "training.exposure.grid=auto")
 LIGHT_ARMS = {"as it is, auto": EVENED, "shaded": SHADED, "shaded, auto": (*SHADED, *EVENED)}
 """The same of light within photographs."""
@@ -151,24 +153,31 @@ def row_of(
     scene: str, arm: str, by_arm: Mapping[str, Found], spread: str = "spread", learnt: str = "learnt"
 ) -> dict[str, Any]:
     """Figures of one arm over seeds; spread, learnt: keys of what was found, and of how many photographs learn it."""
-    found, (best, worst, mended) = by_arm[arm], by_arm
+    found = by_arm[arm]
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     spreads = [100 * one["exposures"][spread] for one in found if one["exposures"]]
     row["spread"] = told(spreads, ".1f") if spreads else ""
     row["learnt"] = f"{sum(one['exposures'].get(learnt, 0) > 0 for one in found)} of {len(found)}"
     asking = [100 * one["exposures"].get("seconds", 0.0) / one["seconds"] for one in found]
     row["asking"] = f"{statistics.mean(asking):.1f}" if spreads else ""
-    for zoom in ZOOMS:
-        row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
-        if arm == mended:
-            arms = [by_arm[name] for name in (best, worst, mended)]
-            row[f"back{zoom}"] = told(shares_won(arms, "fitted", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+    return row | at_zooms(arm, by_arm, "fitted")
 
 
 def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
     """PSNR by a protocol with each seed."""
     return [one[protocol][zoom]["psnr"] for one in found]
+
+
+def at_zooms(arm: str, by_arm: Mapping[str, Found], protocol: str) -> dict[str, str]:
+    """PSNR of an arm at each zoom by a protocol and as it was evaluated; of one that mends another, what that wins back
+    of what there is in the first."""
+    found, best, wrong = by_arm[arm], next(iter(by_arm)), arm.removesuffix(MENDED)
+    row = {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+    row |= {f"{protocol}{zoom}": told(psnr_of(found, protocol, zoom), ".2f") for zoom in ZOOMS if protocol != "own"}
+    if wrong == arm or wrong not in by_arm:
+        return row
+    arms = [by_arm[name] for name in (best, wrong, arm)]
+    return row | {f"back{zoom}": told(shares_won(arms, protocol, zoom), ".2f") for zoom in ZOOMS}
 
 
 def cost_of(found: Found, kind: str, form: str) -> str:
@@ -298,12 +307,7 @@ def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
     row["spread"] = told([one["spread"] for one in asked], ".2f") if asked else ""
     row["corrected"] = f"{sum(one['corrected'] > 0 for one in asked)} of {len(found)}" if asked else ""
     row["cost"] = cost_of(found, "poses", ".0f")
-    for zoom in ZOOMS:
-        row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
-        if arm.endswith("px, auto"):
-            arms = [by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm)]
-            row[f"back{zoom}"] = told(shares_won(arms, "aligned", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+    return row | at_zooms(arm, by_arm, "aligned")
 
 
 def poses(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
@@ -330,8 +334,8 @@ def adjust_arms() -> list[str]:
 
 def of_model(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run from a model as it is or made wrong, by both protocols of poses, and what was done about it."""
-    auto, wish = arm.endswith("auto"), ["scene.max_reprojection_px=1000"]
-    wrong = dict(WRONG.get(arm.removesuffix(", auto"), {}))
+    auto, wish = arm.endswith(MENDED), ["scene.max_reprojection_px=1000"]
+    wrong = dict(WRONG.get(arm.removesuffix(MENDED), {}))
     if wrong:
         downscale = next(int(word.partition("=")[2]) for word in SUBJECTS[scene] if "downscale" in word)
         wrong |= {"turn": downscale * wrong["turn"]} if "turn" in wrong else {}
@@ -346,17 +350,12 @@ def of_model(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict
 
 def adjust_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     """Figures of one arm over seeds."""
-    found, wrong = by_arm[arm], arm.removesuffix(", auto")
+    found = by_arm[arm]
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     shifts = re.findall(r"([0-9.]+) px beside", found[0]["note"])
     row["before"], row["after"] = [*shifts, "", ""][:2]
     row["focal"] = "".join(re.findall(r"focal lengths times ([0-9.]+[0-9])", found[0]["note"]))
-    for zoom in ZOOMS:
-        row[f"aligned{zoom}"] = told(psnr_of(found, "aligned", zoom), ".2f")
-        if arm.endswith("auto") and wrong in WRONG:
-            arms = [by_arm[name] for name in ("as it is, auto", wrong, arm)]
-            row[f"back{zoom}"] = told(shares_won(arms, "aligned", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+    return row | at_zooms(arm, by_arm, "aligned")
 
 
 def adjust(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
@@ -386,18 +385,13 @@ def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Names
 
 def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
     """Figures of one arm over seeds."""
-    found, (best, worst, mended) = by_arm[arm], by_arm
+    found = by_arm[arm]
     row: dict[str, Any] = {"scene": scene, "name": arm, "seeds": len(found)}
     asked = [one["distractors"] for one in found if one["distractors"]]
     row["share"] = told([100 * one["share"] for one in asked], ".1f") if asked else ""
     row["marked"] = told([100 * (one["marked"] or [0])[-1] for one in asked], ".1f") if asked else ""
     row["cost"] = cost_of(found, "distractors", ".1f")
-    for zoom in ZOOMS:
-        row[f"fitted{zoom}"] = told(psnr_of(found, "fitted", zoom), ".2f")
-        if arm == mended:
-            arms = [by_arm[name] for name in (best, worst, mended)]
-            row[f"back{zoom}"] = told(shares_won(arms, "fitted", zoom), ".2f")
-    return row | {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
+    return row | at_zooms(arm, by_arm, "fitted")
 
 
 PAST_COLUMNS = [
@@ -453,12 +447,7 @@ def blur_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any
     asked = [one["blur"] for one in found if one["blur"]]
     row["blurred"] = told([one["blurred"] for one in asked], ".1f", ".1f") if asked else ""
     row["cost"] = cost_of(found, "blur", ".1f")
-    for zoom in ZOOMS:
-        row[f"x{zoom}"] = told(psnr_of(found, "own", zoom), ".2f")
-        if arm.endswith("blurred, auto"):
-            arms = [by_arm[name] for name in ("as it is, auto", arm.removesuffix(", auto"), arm)]
-            row[f"back{zoom}"] = told(shares_won(arms, "own", zoom), ".2f")
-    return row
+    return row | at_zooms(arm, by_arm, "own")
 
 
 def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
