@@ -72,7 +72,7 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
     found = Exposures(options(), names, 1000, CPU)
     assert found.due(201)
     assert not found.due(200)
-    spread, inside = found.judge(pairs)
+    spread, inside = found.judge(pairs.__getitem__)
     assert spread == pytest.approx(float(gains.log().std()), rel=1e-4)
     assert math.isnan(inside)
     assert found.grids is None
@@ -84,14 +84,36 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
 def test_equal_photographs_have_none_unless_asked_for() -> None:
     image, pairs = photographs_at(torch.tensor([1.01, 1.0, 0.99, 1.0]))
     found = Exposures(options(), list("abcd"), 1000, CPU)
-    assert found.judge(pairs)[0] < found.options.spread
+    assert found.judge(pairs.__getitem__)[0] < found.options.spread
     assert found.matrices is None
     assert found.tensors() == {}
     assert found.applied(image, "a") is image
     asked = Exposures(options(when="always"), list("abcd"), 1000, CPU)
-    asked.judge(pairs)
+    asked.judge(pairs.__getitem__)
     assert asked.matrices is not None
     assert not Exposures(options(when="never"), list("abcd"), 1000, CPU).due(201)
+
+
+def test_some_photographs_are_judged_by_and_the_others_looked_at_where_all_have_exposures() -> None:
+    _, pairs = photographs_at(torch.linspace(0.7, 1.3, 9))
+    names, seen = [str(number) for number in range(9)], list[int]()
+
+    def look(number: int) -> tuple[Tensor, Tensor, None]:
+        seen.append(number)
+        return pairs[number]
+
+    few = Exposures(options(views=4, spread=1.0), names, 1000, CPU)
+    few.judge(look)
+    assert len(set(seen)) == len(seen) == 4
+    asked = seen.copy()
+    found = Exposures(options(views=4), names, 1000, CPU)
+    spread, _ = found.judge(look)
+    assert seen[4:8] == asked
+    assert sorted(seen[4:]) == list(range(9))
+    assert spread == pytest.approx(float(torch.linspace(0.7, 1.3, 9)[asked].log().std()), rel=1e-4)
+    everyone = Exposures(options(views=9), names, 1000, CPU)
+    everyone.judge(pairs.__getitem__)
+    assert torch.equal(found.matrices.detach(), everyone.matrices.detach())
 
 
 def test_looking_at_a_photograph_teaches_nothing() -> None:

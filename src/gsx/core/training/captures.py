@@ -44,9 +44,14 @@ def judge_photographs(run: Run) -> dict[str, float]:
 def judge_exposures(run: Run) -> dict[str, float]:
     """Whether training photographs have exposures of their own, from what the model shows in their places; for the
     line of the step."""
-    pairs = ((render(run, view.camera).image, view.image(), view.counted()) for view in run.photographed)
-    begun = time.perf_counter()
-    spread, inside = run.exposures.judge(pairs)
+    begun, views = time.perf_counter(), run.photographed
+
+    def look(number: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        run.refuse_if_stopping()
+        view = views[number]
+        return render(run, view.camera).image, view.image(), view.counted()
+
+    spread, inside = run.exposures.judge(look)
     learnt = run.exposures.matrices is not None
     verdict = "each has its own from here on" if learnt else "they are taken for equal"
     verdict += ", since light differs within them" if run.exposures.grids is not None else ""

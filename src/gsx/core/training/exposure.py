@@ -9,9 +9,9 @@ comes a bilateral grid, where light is found to differ within photographs (`core
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from torch import Tensor
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.bilateral_grid import WHOLE, first_matrices, slopes_of_light, through_grid, without_common
-from gsx.core.training.occasions import WHEN
+from gsx.core.training.occasions import WHEN, some_photographs
 from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
@@ -47,6 +47,8 @@ class ExposureOptions:
     grid_spread: Annotated[float, Range(0, 1)] = 0.08
     """`auto`: of slopes of log gains, from the middle of a photograph to its sides (standard deviation), from which on
     there are grids."""
+    views: Annotated[int, Range(3, 10**6)] = 24
+    """Photographs that are judged by, at most."""
     rate: PositiveRate = 0.01
     rate_final: PositiveRate = 0.001
     """Of Adam at the first and at the last step; their logarithm is interpolated."""
@@ -65,6 +67,35 @@ class ExposureOptions:
 
 
 # -- what photographs and renders say ----------------------------------------------------------------------------------
+
+
+Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
+"""Render, photograph, which pixels count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What a render and a photograph say of that one's light."""
+
+    gains: Float[Tensor, "3 3"]
+    """Log gains of the whole picture, of its left and of its right half; nan where nothing is told."""
+    slopes: Float[Tensor, "3 2 3"] | None
+    """Of log gains (`slopes_of_light`); None: not asked."""
+
+
+def light_of(pair: Pair, slopes: bool) -> Light:
+    """Of a photograph; slopes: whether light may differ within it."""
+    if not slopes:
+        return Light(of_halves(*pair), None)
+    return Light(of_halves(*pair), slopes_of_light(pair[0], pair[1], telling(*pair), FEWEST_OF_BLOCK))
+
+
+def spreads_of(found: Sequence[Light]) -> tuple[float, float]:
+    """Of gains over photographs, and of slopes; nan where these were not asked."""
+    gains = torch.stack([one.gains for one in found])
+    slopes = [one.slopes for one in found if one.slopes is not None]
+    within = shared_spread(*torch.stack(slopes)[:, 1:].flatten(2).unbind(1)) if slopes else math.nan
+    return shared_spread(gains[:, 1], gains[:, 2]), within
 
 
 def telling(
@@ -138,25 +169,31 @@ class Exposures:
         """Whether they are judged before this step."""
         return self.options.when != "never" and self.matrices is None and number == self.first
 
-    def judge(self, pairs: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> tuple[float, float]:
-        """Begin with the gains of (render, photograph, which pixels count) of each photograph in order, if they are
-        spread enough, or have to be, and with grids likewise; returns both spreads, nan for what was not asked."""
-        found, within, own = list[Tensor](), list[Tensor](), self.options
-        for image, photograph, counted in pairs:
-            found.append(of_halves(image, photograph, counted))
-            if own.grid != "never":
-                told = telling(image, photograph, counted)
-                within.append(slopes_of_light(image, photograph, told, FEWEST_OF_BLOCK))
-        gains = torch.stack(found)
-        spread = shared_spread(gains[:, 1], gains[:, 2])
-        slopes = torch.stack(within) if within else torch.zeros(0, 3, 2, 3)
-        light_spread = shared_spread(*slopes[:, 1:].flatten(2).unbind(1)) if within else math.nan
-        with_grids = own.grid == "always" or light_spread > own.grid_spread
+    def judge(self, look: Callable[[int], Pair]) -> tuple[float, float]:
+        """Judge by some photographs, and begin with the gains of all, if these are spread enough, or have to be, and
+        with grids likewise; returns both spreads, nan for what was not asked.
+
+        look: (render, photograph, which pixels count) of the photograph of that number; each is looked at once at most.
+        """
+        own, everyone = self.options, range(len(self.names))
+        found = {number: self.told(look(number)) for number in some_photographs(everyone, own.views, "exposures")}
+        spread, within = spreads_of(list(found.values()))
+        with_grids = own.grid == "always" or within > own.grid_spread
         if own.when == "always" or spread > own.spread or with_grids:
-            first = gains[:, 0].nan_to_num(0.0).exp()
-            matrices = torch.cat([torch.diag_embed(first), torch.zeros(len(first), 3, 1)], dim=2)
-            self.begin(centred_on_identity(matrices), first_matrices(slopes[:, 0]) if with_grids else None)
-        return spread, light_spread
+            found |= {number: self.told(look(number)) for number in everyone if number not in found}
+            self.begin_at([found[number] for number in everyone], with_grids)
+        return spread, within
+
+    def told(self, pair: Pair) -> Light:
+        """Of a photograph's light."""
+        return light_of(pair, slopes=self.options.grid != "never")
+
+    def begin_at(self, found: Sequence[Light], with_grids: bool) -> None:
+        """Learn from what was found of each photograph on."""
+        first = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0).exp()
+        matrices = torch.cat([torch.diag_embed(first), torch.zeros(len(first), 3, 1)], dim=2)
+        slopes = [one.slopes[0] for one in found if with_grids and one.slopes is not None]
+        self.begin(centred_on_identity(matrices), first_matrices(torch.stack(slopes)) if slopes else None)
 
     def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
         """Learn from these on."""

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 
 from gsx.core.data.scene import View
 from gsx.core.seeds import derived_seed
 
+Photograph = TypeVar("Photograph")
+"""Its view, or its number."""
 WHEN = ("never", "auto", "always")
 """Whether it does: auto mends what is found, always mends without asking."""
 
@@ -69,7 +71,7 @@ class MadeOf:
         return self.made[-1][1]
 
 
-def some_photographs(views: Sequence[View], count: int, purpose: str) -> list[View]:
+def some_photographs(views: Sequence[Photograph], count: int, purpose: str) -> list[Photograph]:
     """At most so many: the same in every run."""
     generator = torch.Generator().manual_seed(derived_seed(purpose))
     order = torch.randperm(len(views), generator=generator)[:count]
