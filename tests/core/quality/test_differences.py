@@ -225,16 +225,23 @@ def test_what_the_model_has_learnt_of_a_plain_thing_is_found_with_the_rest() -> 
 
 
 def test_colours_that_are_mostly_those_of_distractors_are_theirs_in_every_photograph() -> None:
-    """Of five red blocks three are marked, of four green ones two: exactly half is not most."""
-    red, green, blue = (torch.eye(3)[n] * 0.9 for n in range(3))
-    one, other = (
-        torch.stack(row, 1)[:, None] for row in ([red, red, green, blue, green], [red, red, red, green, green])
-    )
-    marked = [torch.tensor([[1, 1, 1, 0, 0]]).bool(), torch.tensor([[1, 0, 0, 1, 0]]).bool()]
-    found = with_their_colours(marked, [colour_bins(one), colour_bins(other)])
-    assert found[0].tolist() == [[True, True, True, False, False]]
-    assert found[1].tolist() == [[True, True, True, True, False]]
-    assert len({int(colour_bins(colour[:, None, None])) for colour in (red, green, blue, 0 * red, red + 0.05)}) == 5
+    """Red is marked in the first; in the second it goes where most around it does, not where it stands alone. Half of
+    the green is marked, which is not most."""
+    blue, red, green = range(3)
+    colours = [torch.full((6, 9), blue) for _ in range(2)]
+    colours[0][1:5, :5] = colours[1][2:5, 1:4] = colours[1][1, 7] = red
+    colours[0][1:4, 6:] = colours[1][3:, 6:] = green
+    marked = [colours[0] != blue, torch.zeros(6, 9, dtype=torch.bool)]
+    found = with_their_colours(marked, colours)
+    assert torch.equal(found[0], marked[0])
+    expected = torch.zeros(6, 9, dtype=torch.bool)
+    expected[2:5, 2] = expected[3, 1:4] = True
+    assert torch.equal(found[1], expected)
+
+
+def test_bins_of_colours_are_their_own() -> None:
+    colours = [*torch.eye(3), torch.zeros(3), torch.tensor([0.0, 0.0, 0.05])]
+    assert len({int(colour_bins(colour[:, None, None])) for colour in colours}) == 5
     assert int(colour_bins(torch.ones(3, 1, 1))) == 32**3 - 1
 
 

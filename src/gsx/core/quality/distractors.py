@@ -145,11 +145,15 @@ def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Ten
 
 def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """Marked blocks that have company, with the weak ones that they touch."""
-    around = 9 * avg_pool2d(marked[None].float(), 3, 1, 1)[0]
-    kept = marked & (around > FEWEST - 0.5)
+    kept = with_company(marked, FEWEST - 0.5)
     for _ in range(GROWTH):
         kept = kept | ((spread(kept.float()) > 0) & weak)
     return kept
+
+
+def with_company(marked: Bool[Tensor, "h w"], fewest: float) -> Bool[Tensor, "h w"]:
+    """Marked blocks of which more than so many of the nine around are marked."""
+    return marked & (9 * avg_pool2d(marked[None].float(), 3, 1, 1)[0] > fewest)
 
 
 def spread(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -197,10 +201,11 @@ def colour_bins(colours: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
 def with_their_colours(
     marked: Sequence[Bool[Tensor, "h w"]], colours: Sequence[Int[Tensor, "h w"]]
 ) -> list[Bool[Tensor, "h w"]]:
-    """Marked blocks, and those of colours that, over all photographs, are mostly those of marked blocks: who walks
-    through several photographs wears the same in all, and a model that has learnt them in one tells them in others."""
+    """Marked blocks, and those of colours that, over all photographs, are mostly those of marked blocks, if most around
+    them are marked as well: who walks through several photographs wears the same in all, and a model that has learnt
+    them in one tells them in others."""
     everywhere, there = COLOURS**3, list(zip(marked, colours, strict=True))
     count = sum((own.flatten().bincount(minlength=everywhere) for own in colours), torch.zeros(everywhere))
     hits = sum((own[mark].bincount(minlength=everywhere) for mark, own in there), torch.zeros(everywhere))
     theirs = hits > MOSTLY * count
-    return [mark | theirs[own] for mark, own in there]
+    return [mark | with_company(mark | theirs[own], 9 * MOSTLY) for mark, own in there]
