@@ -16,7 +16,7 @@ from gsx.core.shapes import Float
 
 SAMPLES = 4
 """Places along a movement, for each px of it."""
-DAMPING = 0.1
+DAMPING = 0.05
 """Of gradients that are sharpened: a frequency that blur leaves less than the root of this of is held back."""
 
 
