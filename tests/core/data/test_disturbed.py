@@ -64,6 +64,7 @@ def test_what_photographs_have_in_common_of_their_light_is_taken_from_them() -> 
     found = torch.tensor([source.slopes for source in worse])
     assert found.mean(0).abs().max() < 1e-6
     torch.testing.assert_close(found[1:] - found[0], drawn[1:] - drawn[0])
+    assert disturbed(replace(scene, train=[]), {"exposure": 0.2}).train == []
 
 
 def test_values_saturate_and_files_and_masks_stay_those_of_the_source() -> None:

@@ -64,6 +64,14 @@ def test_sharpened_gradients_solve_their_equations(movement: tuple[float, float]
     assert float(found.flatten() @ slope) > 0
 
 
+def test_what_is_beyond_an_edge_pulls_at_nothing() -> None:
+    """A gradient in the last column moves the first ones as it does far from every edge: not at all."""
+    gradient = torch.zeros(1, 24, 32, dtype=torch.float64)
+    gradient[:, :, -1] = torch.randn(24, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found, alone = sharpened(gradient, 2.0, 0.0), sharpened(pad(gradient, (300, 300, 300, 300)), 2.0, 0.0)
+    assert (found - alone[:, 300:-300, 300:-300]).abs().max() < 1e-3 * found.abs().max()
+
+
 def error_after(steps: int, blur: Callable[[Tensor, float, float], Tensor]) -> float:
     """Of a picture that is learnt from a blurred one by going down the gradient, from grey on."""
     truth = torch.rand(1, 24, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -240,9 +240,23 @@ def test_colours_that_are_mostly_those_of_distractors_are_theirs_in_every_photog
 
 
 def test_bins_of_colours_are_their_own() -> None:
-    colours = [*torch.eye(3), torch.zeros(3), torch.tensor([0.0, 0.0, 0.05])]
-    assert len({int(colour_bins(colour[:, None, None])) for colour in colours}) == 5
-    assert int(colour_bins(torch.ones(3, 1, 1))) == 32**3 - 1
+    colours = torch.stack([*torch.eye(3), torch.zeros(3), torch.tensor([0.0, 0.0, 0.05]), torch.ones(3)], 1)[:, None]
+    counted = torch.ones(1, 6, dtype=torch.bool)
+    assert len(set(colour_bins(colours, counted)[0].tolist())) == 6
+    assert colour_bins(colours, counted)[0, -1] == 32**3 - 1
+    assert colour_bins(colours, ~counted)[0].tolist() == [32**3] * 6
+
+
+def test_blocks_that_do_not_count_tell_nothing_of_their_colour() -> None:
+    """Photographs upright and across; what masks leave out is black, as is all that is marked."""
+    black = [torch.zeros(3, 6, 4), torch.zeros(3, 4, 6)]
+    counted = [torch.zeros(6, 4, dtype=torch.bool), torch.zeros(4, 6, dtype=torch.bool)]
+    counted[0][:, :2], marked = True, [torch.zeros_like(one) for one in counted]
+    marked[0][:4, :2] = True
+    found = with_their_colours(marked, [colour_bins(*pair) for pair in zip(black, counted, strict=True)])
+    assert bool(found[0][4, :2].any()), "most of the black that counts is marked"
+    assert not bool(found[0][:, 2:].any())
+    assert not bool(found[1].any())
 
 
 def test_who_walks_on_in_the_same_clothes_is_told_by_them() -> None:

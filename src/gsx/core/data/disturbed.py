@@ -1,7 +1,7 @@
 """Photographs made worse in a known way, so that the truth of what finds and mends them is known (research alone)."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -138,12 +138,13 @@ def slopes_of(name: str, spread: float) -> tuple[float, float]:
     return right, down
 
 
-def common_slopes(names: Iterable[str], spread: float) -> tuple[float, float]:
+def common_slopes(names: Sequence[str], spread: float) -> tuple[float, float]:
     """The mean of these photographs' slopes; zero of one alone. Light that all photographs share looks like the scene's
     own, and no other photograph has it: it is nobody's to find, so that it is taken from what they suffer."""
-    drawn = [slopes_of(name, spread) for name in names]
-    right, down = (fmean(along) if len(drawn) > 1 else 0.0 for along in zip(*drawn, strict=True))
-    return right, down
+    if len(names) < 2:
+        return 0.0, 0.0
+    right, down = zip(*(slopes_of(name, spread) for name in names), strict=True)
+    return fmean(right), fmean(down)
 
 
 def turn_of(name: str, spread: float) -> tuple[float, float]:
@@ -235,7 +236,7 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     if not asked or not some:
         return scene
     names = chosen([view.name for view in scene.train], some)
-    common = common_slopes(sorted(names), by.get("shade", 0.0))
+    common = common_slopes([view.name for view in scene.train if view.name in names], by.get("shade", 0.0))
     told = ", ".join(f"{kind} {value:g}" for kind, value in asked.items())
     return replace(
         scene,

@@ -18,6 +18,8 @@ SAMPLES = 4
 """Places along a movement, for each px of it."""
 DAMPING = 0.05
 """Of gradients that are sharpened: a frequency that blur leaves less than the root of this of is held back."""
+REACH = 4
+"""Lengths of a movement's kernel that sharpening reaches."""
 
 
 def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
@@ -73,8 +75,8 @@ def blurred_to_learn(image: Float[Tensor, "C H W"], across: float, down: float) 
 
     With K the mean over the movement, the slope of a loss with gradient g is K^T g: what the photograph has little of
     is weighted down by the blur twice, and learnt last. Here it is (1 + d) (K^T K + d)^-1 K^T g, the direction of Gauss
-    and Newton for the sharp picture, damped by d (Levenberg 1944). It goes down as well, and where nothing is blurred
-    away it is the slope.
+    and Newton for the sharp picture, damped by d (Levenberg 1944). Away from the edges it goes down as well, and where
+    nothing is blurred away it is the slope; it is up to (1 + d) / (2 sqrt d) times as large as g.
     """
     return MotionBlur.apply(image, across, down)
 
@@ -82,7 +84,8 @@ def blurred_to_learn(image: Float[Tensor, "C H W"], across: float, down: float) 
 def sharpened(gradient: Float[Tensor, "C H W"], across: float, down: float) -> Float[Tensor, "C H W"]:
     """(1 + d) (K^T K + d)^-1 K^T of a gradient, by its spectrum; beyond its edges it is zero."""
     kernel, (height, width) = line_kernel(across, down).to(gradient), gradient.shape[1:]
-    size, side = (height + len(kernel), width + len(kernel)), len(kernel) // 2
+    side, beyond = len(kernel) // 2, REACH * len(kernel)
+    size = height + beyond, width + beyond
     around = pad(kernel, (0, size[1] - len(kernel), 0, size[0] - len(kernel))).roll((-side, -side), (0, 1))
     share = torch.fft.rfft2(around).real  # of a frequency that is left; real, since movements go both ways alike
     factor = (1 + DAMPING) * share / (share.square() + DAMPING)

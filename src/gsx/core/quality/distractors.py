@@ -105,7 +105,7 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
         marked = whole_of(alone(own, others, least), own.size > least / 2)
         found.append(with_plain_parts(marked, plain_parts(own.colours)))
-    return with_their_colours(found, [colour_bins(one.colours) for one in differences])
+    return with_their_colours(found, [colour_bins(one.colours, one.counted) for one in differences])
 
 
 def alone(own: Difference, others: Sequence[Difference], least: float) -> Bool[Tensor, "h w"]:
@@ -192,19 +192,19 @@ def with_plain_parts(marked: Bool[Tensor, "h w"], parts: Int[Tensor, "h w"]) -> 
 # -- colours that distractors have -------------------------------------------------------------------------------------
 
 
-def colour_bins(colours: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
-    """The bin of each colour."""
+def colour_bins(colours: Float[Tensor, "3 h w"], counted: Bool[Tensor, "h w"]) -> Int[Tensor, "h w"]:
+    """The bin of each colour; one of its own for all blocks that do not count."""
     red, green, blue = (colours * COLOURS).long().clamp(0, COLOURS - 1)
-    return (red * COLOURS + green) * COLOURS + blue
+    return torch.where(counted, (red * COLOURS + green) * COLOURS + blue, COLOURS**3)
 
 
 def with_their_colours(
-    marked: Sequence[Bool[Tensor, "h w"]], colours: Sequence[Int[Tensor, "h w"]]
-) -> list[Bool[Tensor, "h w"]]:
+    marked: Sequence[Bool[Tensor, "_ _"]], colours: Sequence[Int[Tensor, "_ _"]]
+) -> list[Bool[Tensor, "_ _"]]:
     """Marked blocks, and those of colours that, over all photographs, are mostly those of marked blocks, if most around
     them are marked as well: who walks through several photographs wears the same in all, and a model that has learnt
     them in one tells them in others."""
-    everywhere, there = COLOURS**3, list(zip(marked, colours, strict=True))
+    everywhere, there = COLOURS**3 + 1, list(zip(marked, colours, strict=True))
     count = sum((own.flatten().bincount(minlength=everywhere) for own in colours), torch.zeros(everywhere))
     hits = sum((own[mark].bincount(minlength=everywhere) for mark, own in there), torch.zeros(everywhere))
     theirs = hits > MOSTLY * count

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
 
-from gsx.core.data.movement import line_kernel
+from gsx.core.data.movement import line_kernel, motion_blurred
 from gsx.core.shapes import Bool, Float, Int
 
 DIRECTIONS, LENGTHS = 8, (2.0, 5.0, 12.0)
@@ -27,6 +28,11 @@ RINGS = 64
 """Of frequencies by their size, a cycle per px."""
 EDGE = 6
 """Pictures fade out towards their edges, over one in so many of their pixels."""
+MARGIN, ROUNDS = 8, 2
+"""Px around what does not count that say nothing at first; how often it is filled in after that, by the sharp picture
+after the movement that was found so far."""
+SMALLEST = 32
+"""Px of a side; smaller pictures have too few frequencies to tell anything by."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,8 @@ class Movement:
     down: float
     """Px; both with the other sign are the same movement."""
     explained: float
-    """Share of the squared difference between photograph and sharp picture that is gone after it; 0 where none is."""
+    """Share of the squared difference between photograph and sharp picture at its best gains that is gone after it; 0
+    where none is."""
 
     @property
     def length(self) -> float:
@@ -72,12 +79,17 @@ def movement_between(
     sharp: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None = None
 ) -> Movement:
     """The movement by which a sharp picture comes nearest to a photograph of the same exposure, over pixels that count;
-    its gains by the size of the frequency are free."""
-    spectra = spectra_of(sharp.mean(0), photograph.mean(0), counted)
-    start = nearest([(0.0, 0.0), *fan()], spectra)
-    found = descended(start, (max(FIRST, math.hypot(*start) / 4), FINEST), spectra)
-    still = error_after((0.0, 0.0), spectra)
-    explained = 1 - error_after(found, spectra) / still if still > 0 else 0.0
+    its gains by the size of the frequency are free. None where pictures are small."""
+    if min(sharp.shape[1:]) < SMALLEST:
+        return Movement(0.0, 0.0, explained=0.0)
+    shown, taken = sharp.mean(0), photograph.mean(0)
+    telling = spectra_of(shown, taken, None if counted is None else well_within(counted))
+    found = descended(nearest([(0.0, 0.0), *fan()], telling), telling)
+    for mask in [counted] * ROUNDS if counted is not None else []:
+        filled = torch.where(mask, taken, motion_blurred(shown[None], *found)[0])
+        found = descended(found, spectra_of(shown, filled, None))
+    still = error_after((0.0, 0.0), telling)
+    explained = 1 - error_after(found, telling) / still if still > 0 else 0.0
     return Movement(*found, explained=max(0.0, explained))
 
 
@@ -85,12 +97,12 @@ def movement_between(
 
 
 def spectra_of(
-    sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], counted: Bool[Tensor, "H W"] | None
+    sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], weight: Float[Tensor, "H W"] | None
 ) -> Spectra:
-    """Of what counts of two pictures, less its mean; float64."""
+    """Of two pictures less their means, by a weight of their pixels; float64."""
     height, width = sharp.shape
     window = fading(height)[:, None] * fading(width)
-    window = window if counted is None else window * counted
+    window = window if weight is None else window * weight
     r, p = (spectrum(values.double(), window) for values in (sharp, photograph))
     across, down = torch.fft.rfftfreq(width, dtype=torch.float64), torch.fft.fftfreq(height, dtype=torch.float64)
     size = torch.hypot(across, down[:, None])
@@ -103,6 +115,16 @@ def spectra_of(
         shared=times * (p * r.conj()).real,
         photograph=float((times * (p * p.conj()).real).sum()),
     )
+
+
+def well_within(counted: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Weights of pixels that fade out a margin before what does not count: an edge there would look as sharp in both
+    pictures, and speak against every movement."""
+    weight, side = counted[None].double(), MARGIN + 1
+    weight = -max_pool2d(-weight, 2 * MARGIN + 1, 1, MARGIN)
+    for _ in range(2):
+        weight = avg_pool2d(weight, side, 1, side // 2)
+    return weight[0]
 
 
 def fading(count: int) -> Float[Tensor, "count"]:
@@ -144,10 +166,10 @@ def nearest(movements: Sequence[tuple[float, float]], spectra: Spectra) -> tuple
     return min(movements, key=lambda movement: error_after(movement, spectra))
 
 
-def descended(start: tuple[float, float], steps: tuple[float, float], spectra: Spectra) -> tuple[float, float]:
-    """From one movement to ever better ones beside it, by ever smaller steps, from the first to the last."""
-    where, (step, last) = start, steps
-    while step >= last:
+def descended(start: tuple[float, float], spectra: Spectra) -> tuple[float, float]:
+    """From one movement to ever better ones beside it, by ever smaller steps."""
+    where, step = start, max(FIRST, math.hypot(*start) / 4)
+    while step >= FINEST:
         better = nearest([where, *around(where, step)], spectra)
         step = step / 2 if better == where else step
         where = better
