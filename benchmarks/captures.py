@@ -53,6 +53,8 @@ FITTED = ("eval.colours=fitted",)
 JUDGED, DISTURBED = ("training.exposure.when=auto",), ("scene.disturb.exposure=0.2",)
 ARMS = {"as it is, auto": JUDGED, "disturbed": DISTURBED, "disturbed, auto": (*DISTURBED, *JUDGED)}
 """Overrides by the name of a row; the first is what there is to win back."""
+LEAST_COST = 0.1
+"""dB; of what costs less with any seed no share is told that is won back."""
 MENDED = ", auto"
 """Ends the name of a row that mends the one of the same name without it."""
 SHADED, EVENED = ("scene.disturb.shade=0.2",), (*JUDGED, "training.exposure.grid=auto")
@@ -170,20 +172,28 @@ def psnr_of(found: Found, protocol: str, zoom: str) -> list[float]:
 
 def at_zooms(arm: str, by_arm: Mapping[str, Found], protocol: str) -> dict[str, str]:
     """PSNR of an arm at each zoom by a protocol and as it was evaluated; of one that mends another, what that wins back
-    of what there is in the first."""
+    of what there is in the first, if there is anything to win with every seed."""
     found, best, wrong = by_arm[arm], next(iter(by_arm)), arm.removesuffix(MENDED)
     row = {f"x{zoom}": told(psnr_of(found, "own", zoom), ".2f") for zoom in ZOOMS}
     row |= {f"{protocol}{zoom}": told(psnr_of(found, protocol, zoom), ".2f") for zoom in ZOOMS if protocol != "own"}
     if wrong == arm or wrong not in by_arm:
         return row
     arms = [by_arm[name] for name in (best, wrong, arm)]
-    return row | {f"back{zoom}": told(shares_won(arms, protocol, zoom), ".2f") for zoom in ZOOMS}
+    lost = {zoom: costs(arms[0], arms[1], protocol, zoom) for zoom in ZOOMS}
+    known = [zoom for zoom in ZOOMS if min(lost[zoom]) > LEAST_COST]
+    return row | {f"back{zoom}": told(shares_won(arms, protocol, zoom), ".2f") for zoom in known}
 
 
 def cost_of(found: Found, kind: str, form: str) -> str:
     """Mean share of the training that went into what was asked of that kind, %; empty where nothing was."""
     cost = [100 * one[kind]["seconds"] / one["seconds"] for one in found if one[kind]]
     return f"{statistics.mean(cost):{form}}" if cost else ""
+
+
+def costs(best: Found, worst: Found, protocol: str, zoom: str) -> list[float]:
+    """What a disturbance costs with each seed, dB."""
+    pairs = zip(psnr_of(best, protocol, zoom), psnr_of(worst, protocol, zoom), strict=True)
+    return [without - with_it for without, with_it in pairs]
 
 
 def shares_won(arms: Sequence[Found], protocol: str, zoom: str) -> list[float]:
@@ -458,7 +468,7 @@ def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     note = (
         f"{given.share:g} of the steps; cameras move by so many px along each axis (standard deviation 3) while they "
         "take training photographs, all or three tenths of them; PSNR on held-out views, which are sharp; means over "
-        "seeds ± half their range."
+        f"seeds ± half their range; nothing is told to be won back where less than {LEAST_COST:g} dB is lost with any seed."
     )
     return "Photographs by cameras that moved", columns, rows, note
 
