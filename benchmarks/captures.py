@@ -468,7 +468,8 @@ def blur(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     note = (
         f"{given.share:g} of the steps; cameras move by so many px along each axis (standard deviation 3) while they "
         "take training photographs, all or three tenths of them; PSNR on held-out views, which are sharp; means over "
-        f"seeds ± half their range; nothing is told to be won back where less than {LEAST_COST:g} dB is lost with any seed."
+        f"seeds ± half their range; nothing is told to be won back where less than {LEAST_COST:g} dB is lost with any "
+        "seed."
     )
     return "Photographs by cameras that moved", columns, rows, note
 
