@@ -179,8 +179,7 @@ def at_zooms(arm: str, by_arm: Mapping[str, Found], protocol: str) -> dict[str, 
     if wrong == arm or wrong not in by_arm:
         return row
     arms = [by_arm[name] for name in (best, wrong, arm)]
-    lost = {zoom: costs(arms[0], arms[1], protocol, zoom) for zoom in ZOOMS}
-    known = [zoom for zoom in ZOOMS if min(lost[zoom]) > LEAST_COST]
+    known = [zoom for zoom in ZOOMS if min(costs(arms[0], arms[1], protocol, zoom)) > LEAST_COST]
     return row | {f"back{zoom}": told(shares_won(arms, protocol, zoom), ".2f") for zoom in known}
 
 

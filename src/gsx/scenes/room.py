@@ -22,8 +22,8 @@ from gsx.scenes.demo.noise import blend
 from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
 from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
 from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, plain, rgb, smoothstep
-from gsx.scenes.demo.tracing import HitPoints, colours_of, hit_points, joined, rays_through, trace
-from gsx.scenes.demo.views import DemoOptions, check, photographed, scene_version
+from gsx.scenes.demo.tracing import colours_of, seen_at
+from gsx.scenes.demo.views import DemoOptions, check, photographed, random_places, scene_version
 
 HALF = (2.5, 2.0)  # of the floor, scene units: about metres
 HEIGHT, THICK = 2.4, 0.1  # of the walls
@@ -120,23 +120,13 @@ def walking_camera(place: float, width: int, height: int) -> Camera:
 def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Points where pictures have pattern, at most so many: as structure from motion would leave them."""
     share = math.ceil(TRIES * count / len(cameras))
-    tried = [torch.rand(2, share, generator=generator, dtype=torch.float64) for _ in cameras]
-    places = [place * torch.tensor([camera.size]).T for camera, place in zip(cameras, tried, strict=True)]
+    places = [random_places(camera, share, generator) for camera in cameras]
     seen, *beside = (seen_at(room, cameras, places, shift) for shift in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
     colours, *near = (colours_of(room, one) for one in (seen, *beside))
     pattern = torch.maximum(*((other - colours).abs().amax(0) for other in near)) > CONTRAST
     where, what = seen.points[:, pattern].T, colours[:, pattern].T
     chosen = torch.randperm(len(where), generator=generator)[:count]
     return PointCloud(where[chosen].contiguous(), (what[chosen] * 255.0 + 0.5).to(torch.uint8))
-
-
-def seen_at(
-    room: StillLife, cameras: Sequence[Camera], places: Sequence[Float[Tensor, "2 P"]], shift: tuple[float, float]
-) -> HitPoints:
-    """What cameras see at places of their pictures, px, moved to the right and down."""
-    right, down = shift
-    bundles = [rays_through(camera, u + right, v + down) for camera, (u, v) in zip(cameras, places, strict=True)]
-    return joined([hit_points(rays, trace(room, rays)) for rays in bundles])
 
 
 def room_version() -> str:

@@ -28,13 +28,16 @@ def noise(size: float) -> Tensor:
     return size * torch.randn(3, 120, 160, generator=torch.Generator().manual_seed(1))
 
 
-@pytest.mark.parametrize("movement", [(5.0, 2.0), (-3.0, 7.5), (2.0, 0.0), (0.0, 12.0)])
-def test_a_known_movement_is_found(movement: tuple[float, float]) -> None:
+@pytest.mark.parametrize(
+    ("movement", "least"), [((5.0, 2.0), 0.95), ((-3.0, 7.5), 0.95), ((2.0, 0.0), 0.95), ((0.0, 12.0), 0.9)]
+)
+def test_a_known_movement_is_found(movement: tuple[float, float], least: float) -> None:
+    """The longest is a tenth of the picture, whose edges explain nothing."""
     found = movement_between(picture(), motion_blurred(picture(), *movement))
     sign = math.copysign(1, found.across * movement[0] + found.down * movement[1])
     assert sign * found.across == pytest.approx(movement[0], abs=0.5)
     assert sign * found.down == pytest.approx(movement[1], abs=0.5)
-    assert found.explained > 0.9
+    assert found.explained > least
 
 
 @pytest.mark.parametrize("movement", [(2.0, 0.0), (3.0, 1.0), (-2.0, 6.0)])

@@ -138,13 +138,14 @@ def slopes_of(name: str, spread: float) -> tuple[float, float]:
     return right, down
 
 
-def common_slopes(names: Sequence[str], spread: float) -> tuple[float, float]:
-    """The mean of these photographs' slopes; zero of one alone. Light that all photographs share looks like the scene's
-    own, and no other photograph has it: it is nobody's to find, so that it is taken from what they suffer."""
+def slopes_among(names: Sequence[str], spread: float) -> dict[str, tuple[float, float]]:
+    """Slopes of these photographs less their mean, if they are several. Light that all photographs share looks like the
+    scene's own, and no other photograph has it: it is nobody's to find."""
+    drawn = {name: slopes_of(name, spread) for name in names}
     if len(names) < 2:
-        return 0.0, 0.0
-    right, down = zip(*(slopes_of(name, spread) for name in names), strict=True)
-    return fmean(right), fmean(down)
+        return drawn
+    right, down = (fmean(along) for along in zip(*(drawn[name] for name in names), strict=True))
+    return {name: (across - right, along - down) for name, (across, along) in drawn.items()}
 
 
 def turn_of(name: str, spread: float) -> tuple[float, float]:
@@ -187,17 +188,15 @@ def patch_of(name: str, share: float) -> Patch:
     return Patch(edges=(left, top, left + side, top + side), colour=colour)
 
 
-def worse(view: View, by: Mapping[str, float], common: tuple[float, float]) -> View:
+def worse(view: View, by: Mapping[str, float], slopes: tuple[float, float] | None) -> View:
     """A view of a photograph that suffers all of it; a wrong pose is the view's, the photograph is as it was taken.
-    common: of the slopes of its light and those of the others."""
-    kinds = ("exposure", "shade", "pose", "covered", "blur")
-    exposure, shade, pose, covered, blur = (by.get(kind, 0.0) for kind in kinds)
-    (right, down), (right_of_all, down_of_all) = slopes_of(view.name, shade), common
+    slopes: of its light."""
+    exposure, pose, covered, blur = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
     kind = WorseFile if isinstance(view.source, FromFile) else Worse
     source = kind(
         source=as_taken(view),
         gains=gains_of(view.name, exposure) if exposure else None,
-        slopes=(right - right_of_all, down - down_of_all) if shade else None,
+        slopes=slopes,
         patch=patch_of(view.name, covered) if covered else None,
         movement=view.camera.frame.shares(*movement_of(view.name, blur)) if blur else None,
     )
@@ -236,11 +235,12 @@ def disturbed(scene: Scene, by: Mapping[str, float]) -> Scene:
     if not asked or not some:
         return scene
     names = chosen([view.name for view in scene.train], some)
-    common = common_slopes([view.name for view in scene.train if view.name in names], by.get("shade", 0.0))
+    suffering = [view.name for view in scene.train if view.name in names]
+    slopes = slopes_among(suffering, asked["shade"]) if "shade" in asked else {}
     told = ", ".join(f"{kind} {value:g}" for kind, value in asked.items())
     return replace(
         scene,
-        train=[worse(view, asked, common) if view.name in names else view for view in scene.train],
+        train=[worse(view, asked, slopes.get(view.name)) if view.name in names else view for view in scene.train],
         notes=[
             *scene.notes,
             f"disturbed: {len(names)} of {len(scene.train)} training photographs (scene.disturb: {told})",

@@ -85,9 +85,10 @@ def movement_between(
     shown, taken = sharp.mean(0), photograph.mean(0)
     telling = spectra_of(shown, taken, None if counted is None else well_within(counted))
     found = descended(nearest([(0.0, 0.0), *fan()], telling), telling)
-    for mask in [counted] * ROUNDS if counted is not None else []:
-        filled = torch.where(mask, taken, motion_blurred(shown[None], *found)[0])
-        found = descended(found, spectra_of(shown, filled, None))
+    if counted is not None:
+        for _ in range(ROUNDS):
+            filled = torch.where(counted, taken, motion_blurred(shown[None], *found)[0])
+            found = descended(found, spectra_of(shown, filled, None))
     still = error_after((0.0, 0.0), telling)
     explained = 1 - error_after(found, telling) / still if still > 0 else 0.0
     return Movement(*found, explained=max(0.0, explained))

@@ -17,7 +17,7 @@ from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.distractors import share_of
 from gsx.core.training.evidence import looked_at, shown_weights
-from gsx.core.training.exposure import log_gains
+from gsx.core.training.exposure import Pair, log_gains
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.poses import spread_of_shifts
 from gsx.core.training.render import render
@@ -46,7 +46,7 @@ def judge_exposures(run: Run) -> dict[str, float]:
     line of the step."""
     begun, views = time.perf_counter(), run.photographed
 
-    def look(number: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    def look(number: int) -> Pair:
         run.refuse_if_stopping()
         view = views[number]
         return render(run, view.camera).image, view.image(), view.counted()

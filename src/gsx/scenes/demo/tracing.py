@@ -116,6 +116,18 @@ def joined(parts: Sequence[HitPoints]) -> HitPoints:
     return HitPoints(torch.cat(points, 1), torch.cat(directions, 1), torch.cat(owners))
 
 
+def seen_at(
+    life: StillLife,
+    cameras: Sequence[Camera],
+    places: Sequence[Float[Tensor, "2 _"]],
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> HitPoints:
+    """What cameras see at places of their pictures, px, float64, moved to the right and down."""
+    right, down = shift
+    bundles = [rays_through(camera, u + right, v + down) for camera, (u, v) in zip(cameras, places, strict=True)]
+    return joined([hit_points(rays, trace(life, rays)) for rays in bundles])
+
+
 def colours_of(life: StillLife, seen: HitPoints) -> Float[Tensor, "3 points"]:
     """Display colours, in [0, 1]."""
     colour = torch.empty_like(seen.points)

@@ -19,10 +19,10 @@ from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError
 from gsx.core.ranges import Points, Range, Seed
-from gsx.core.shapes import UInt8
+from gsx.core.shapes import Float, UInt8
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
-from gsx.scenes.demo.tracing import Rays, colours_of, hit_points, joined, rays_through, render, trace
+from gsx.scenes.demo.tracing import colours_of, render, seen_at
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.splits import check_rule
 
@@ -121,15 +121,14 @@ def spiral_camera(place: float, width: int, height: int) -> Camera:
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Surface and sky points with their colours: what random rays of the cameras meet, equally many from each."""
     shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
-    bundles = [random_rays(camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
-    seen = joined([hit_points(rays, trace(life, rays)) for rays in bundles])
+    places = [random_places(camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
+    seen = seen_at(life, cameras, places)
     return PointCloud(seen.points.T.contiguous(), (colours_of(life, seen).T.contiguous() * 255.0 + 0.5).to(torch.uint8))
 
 
-def random_rays(camera: Camera, count: int, generator: torch.Generator) -> Rays:
-    """Rays of one camera through random places of its picture."""
-    u, v = torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
-    return rays_through(camera, u, v)
+def random_places(camera: Camera, count: int, generator: torch.Generator) -> Float[Tensor, "2 count"]:
+    """Places in the picture of a camera, px, float64."""
+    return torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
 
 
 def check(options: DemoOptions) -> None:
