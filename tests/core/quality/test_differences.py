@@ -11,6 +11,7 @@ from gsx.core.quality.distractors import (
     PLAIN,
     TIMES,
     Difference,
+    Witnesses,
     colour_bins,
     difference_of,
     distractors_in,
@@ -18,8 +19,9 @@ from gsx.core.quality.distractors import (
     whole_of,
     with_plain_parts,
     with_their_colours,
+    witnesses,
 )
-from gsx.core.training.captures import at_exposure
+from gsx.core.training.captures import at_exposure, gains_between
 
 SIZE = 64, 48
 
@@ -84,6 +86,70 @@ def test_what_all_photographs_show_is_an_error_of_the_model() -> None:
     assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)))
 
 
+def test_what_the_model_has_learnt_of_it_in_other_views_does_not_hide_it() -> None:
+    """A model that shows something of one photograph to all cameras is wrong everywhere there; the others agree."""
+    photographs, pictures = noisy(), []
+    photographs[2][:, 12:24, 20:40] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+    for camera, photograph in zip(cameras(), photographs, strict=True):
+        image, depth = shown(camera)
+        image[:, on_plane(camera)[0][..., :2].norm(dim=-1) < 0.9] = torch.tensor([0.7, 0.3, 0.45])[:, None]
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), photograph))
+    assert all(float((one.size > LEAST).float().mean()) > 0.1 for one in pictures), "wrong in every view"
+    found = distractors_in(pictures)
+    assert bool(found[2][blocks(slice(12, 24), slice(20, 40))].all())
+    assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
+
+
+def test_what_looks_different_from_everywhere_is_no_distractor() -> None:
+    """A disc that shines: each photograph shows it in a grey of its own, the model in the mean of them."""
+    pictures, inside, greys = [], [], (0.2, 0.8, 0.35, 0.65, 0.05, 0.95)
+    for camera, photograph, grey in zip(cameras(), noisy(), greys, strict=True):
+        away, (image, depth) = on_plane(camera)[0][..., :2].norm(dim=-1), shown(camera)
+        photograph[:, away < 0.4], image[:, away < 0.4] = grey, 0.5
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), photograph))
+        inside.append((away < 0.2)[::BLOCK, ::BLOCK])
+    for number, (own, middle) in enumerate(zip(pictures, inside, strict=True)):
+        others = pictures[:number] + pictures[number + 1 :]
+        assert bool((own.size[middle] > 2 * LEAST).all())
+        assert not bool(witnesses(own, others).alone(own.size)[middle].any())
+
+
+def test_what_others_tell_of_a_place() -> None:
+    """Five blocks that differ by 0.3: where two of four show the same they are not alone; nor where others differ from
+    each other; nor where a single one sees them. All four or two of four confirm what they show alike."""
+    sees = torch.ones(4, 1, 5, dtype=torch.bool)
+    sees[1:, 0, 4] = False
+    apart = torch.tensor([[0.4, 0.4, 0.01, 0.01, 0.4], [0.4, 0.01, 0.01, 0.4, 0.4]])[[0, 0, 1, 1], None]
+    told = Witnesses(sees=sees, apart=apart, spread=torch.tensor([[0.1, 0.1, 0.1, 0.2, 0.1]]))
+    assert told.alone(torch.full((1, 5), 0.3)).tolist() == [[True, False, False, False, False]]
+    assert told.confirmed.tolist() == [[False, True, True, True, False]]
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.7])
+def test_what_others_show_as_well_stays_beside_a_distractor(gain: float) -> None:
+    """Around what stands in one photograph, taken at another exposure, the model is wrong for that camera alone, by
+    three quarters of what stands out; the plane is there in all photographs."""
+    pictures = []
+    around = torch.zeros(48, 64, dtype=torch.bool)
+    around[8:28, 16:44], around[12:24, 20:40] = True, False
+    for number, (camera, photograph) in enumerate(zip(cameras(), noisy(), strict=True)):
+        (image, depth), taken = shown(camera), photograph
+        if number == 2:
+            taken = photograph * gain
+            taken[:, 12:24, 20:40] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+            image[:, around] += 0.75 * LEAST / gain
+        gains = gains_between(image, taken, None)
+        image = at_exposure(image, taken, None)
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
+    assert torch.equal(distractors_in(pictures)[2], blocks(slice(12, 24), slice(20, 40)))
+
+
+def test_two_photographs_tell_nothing_of_each_other() -> None:
+    photographs = noisy()
+    photographs[1][:, 12:24, 20:40] = 0.95
+    assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)[:2]))
+
+
 def test_what_nobody_else_sees_is_not_judged() -> None:
     photographs = noisy()
     photographs[2][:, 12:24, 20:40] = 0.95
@@ -121,8 +187,9 @@ def test_another_exposure_is_no_distractor_and_hides_none(gain: float) -> None:
         if number == 2:
             taken[:, 12:24, 20:40] = 0.05
         image, depth = shown(camera)
+        gains = gains_between(image, taken, None)
         image = at_exposure(image, taken, None)
-        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken))
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
     found = distractors_in(pictures)
     assert torch.equal(found[2], blocks(slice(12, 24), slice(20, 40)))
     assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
@@ -146,7 +213,7 @@ def test_how_much_stands_out(noise: float, step: float, found: bool) -> None:
     """Of the least difference where there is no noise; with noise it has to be so many times the usual."""
     assert TIMES * 0.3 * 0.67 / BLOCK > 1.2 * LEAST
     photographs = noisy(noise=noise)
-    photographs[2][:, 12:24, 20:40] += step * LEAST
+    photographs[2][:, 12:24, 20:40] += step * LEAST * torch.tensor([1, 0, -1])[:, None, None]  # no grey beside is that
     marked = distractors_in(seen(photographs))
     assert bool(marked[2][blocks(slice(12, 24), slice(20, 40))].float().mean() > 0.5) == found
 

@@ -1,11 +1,12 @@
 """What stands before the scene in one photograph alone: who passes by, what moves.
 
 A model of a static scene shows what photographs agree on. Where one of them differs from it by more than fine detail,
-and the photographs that see the same place do not, something was in the way (distractors: RobustNeRF, Sabour et al.
-2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here by the places that depth
-tells). Where others differ there as well it is the model that is wrong. What is plain, a coat for example, goes as a
-whole (as clusters of features do there): a model that has learnt a piece of it differs little there. So do colours that
-photographs show mostly where something was in the way: somebody wears the same in all of them.
+and the photographs that see the same place agree on another colour there, something was in the way (distractors:
+RobustNeRF, Sabour et al. 2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here
+by the places that depth tells). Where others show the same colour there it is the model that is wrong, and where they
+show many, what is there shines, or its place is. What is plain, a coat for example, goes as a whole (as clusters of
+features do there): a model that has learnt a piece of it differs little there. So do colours that photographs show
+mostly where something was in the way: somebody wears the same in all of them.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ BLOCK = 2
 """Px of a picture that are looked at as one: finer differences are detail that the model has yet to learn."""
 LEAST, TIMES = 0.06, 6.0
 """A difference, display values, that stands out: at least so much, and so many times the usual."""
+ALIKE = 0.03
+"""Colours that differ by less, display values at one exposure, are the same."""
 COVERED = 0.5
 """Alpha of a block that has a depth."""
 WITNESSES = 2
@@ -60,11 +63,13 @@ class Difference:
     """Blocks of which all pixels count."""
     colours: Float[Tensor, "3 h w"]
     """Means of the photograph."""
+    gains: Float[Tensor, "3"]
+    """How many times as bright as the model the photograph is."""
 
     @cached_property
-    def size_around(self) -> Float[Tensor, "h w"]:
-        """The largest of each block and those beside it."""
-        return spread(self.size)
+    def evened(self) -> Float[Tensor, "3 h w"]:
+        """Colours as bright as the model's."""
+        return self.colours / self.gains[:, None, None]
 
 
 def difference_of(
@@ -74,9 +79,10 @@ def difference_of(
     alpha: Float[Tensor, "H W"],
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None = None,
+    gains: Float[Tensor, "3"] | None = None,
 ) -> Difference:
     """A photograph against a render that is as bright; depth: blending-weighted sum of camera z, scene units, as the
-    rasterizer has it."""
+    rasterizer has it; gains: how many times as bright as the model the photograph is (None: as bright)."""
     width, height = (max(1, side // BLOCK) for side in camera.size)
 
     def by_block(values: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
@@ -91,11 +97,14 @@ def difference_of(
         depth=torch.where(weight > COVERED, z / weight.clamp_min(COVERED), torch.inf),
         counted=whole,
         colours=by_block(photograph),
+        gains=torch.ones(3) if gains is None else gains,
     )
 
 
 def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"]]:
-    """Which blocks of each photograph show a distractor."""
+    """Which blocks of each photograph show a distractor; none where there are too few others to tell by."""
+    if len(differences) <= WITNESSES:
+        return [torch.zeros_like(one.counted) for one in differences]
     counted = torch.cat([one.size[one.counted] for one in differences])
     least = max(LEAST, TIMES * float(counted.median())) if len(counted) else LEAST
     centres = torch.stack([one.camera.centre.double() for one in differences])
@@ -103,44 +112,77 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
     for number, own in enumerate(differences):
         order = (centres - centres[number]).norm(dim=1).argsort(stable=True)
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
-        marked = whole_of(alone(own, others, least), own.size > least / 2)
-        found.append(with_plain_parts(marked, plain_parts(own.colours)))
+        witnessed = witnesses(own, others)
+        marked = whole_of(witnessed.alone(own.size) & (own.size > least), own.size > least / 2)
+        found.append(with_plain_parts(marked, plain_parts(own.colours)) & ~witnessed.confirmed)
     return with_their_colours(found, [colour_bins(one.colours, one.counted) for one in differences])
 
 
-def alone(own: Difference, others: Sequence[Difference], least: float) -> Bool[Tensor, "h w"]:
-    """Blocks that differ by at least so much while few of the others that see the same place differ by half of that."""
-    strong = own.size > least
-    points, sizes = places(own, strong), own.size[strong]
-    seen, wrong = torch.zeros_like(sizes), torch.zeros_like(sizes)
-    for other in others:
-        sees, size = looked_up(other, points)
-        seen += sees
-        wrong += sees & (size > sizes / 2)
-    marked = torch.zeros_like(strong)
-    marked[strong] = (seen >= WITNESSES) & (wrong < seen / 2)
-    return marked
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Witnesses:
+    """What up to K other photographs show in the places that the blocks of one show."""
+
+    sees: Bool[Tensor, "K h w"]
+    """Whether a place is in their sight."""
+    apart: Float[Tensor, "K h w"]
+    """By how much the one's colour differs from the most alike of theirs there or in a block beside; display values,
+    the largest over channels."""
+    spread: Float[Tensor, "h w"]
+    """By how much theirs differ from their median there, in the middle of them; nan where none sees the place."""
+
+    @cached_property
+    def confirmed(self) -> Bool[Tensor, "h w"]:
+        """Where at least half of those that see it, and WITNESSES, show the same."""
+        return self.known & ~self.few(self.apart < ALIKE)
+
+    @cached_property
+    def known(self) -> Bool[Tensor, "h w"]:
+        """Where enough of them see the place."""
+        return self.sees.sum(0) >= WITNESSES
+
+    def few(self, of: Bool[Tensor, "K h w"]) -> Bool[Tensor, "h w"]:
+        """Where fewer than half of those that see it are of these."""
+        return (self.sees & of).sum(0) < self.sees.sum(0) / 2
+
+    def alone(self, size: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        """Where they agree to half of that size, and few show the one's colour to half of it."""
+        return self.known & self.few(self.apart < size / 2) & (self.spread < size / 2)
 
 
-def places(own: Difference, chosen: Bool[Tensor, "h w"]) -> Float[Tensor, "P 3"]:
+def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
+    """What other photographs show in the places of one."""
+    points, colours, shape = places(own), own.evened.flatten(1), own.size.shape
+    looks = [looked_up(other, points) for other in others]
+    sees = torch.stack([seen for seen, _ in looks])
+    apart = torch.stack([(colours[:, None] - around).abs().amax(0).amin(0) for _, around in looks])
+    there = torch.stack([torch.where(seen, around[:, 4], torch.nan) for seen, around in looks])
+    spread = (there - there.nanmedian(0).values).abs().amax(1).nanmedian(0).values
+    return Witnesses(sees=sees.unflatten(1, shape), apart=apart.unflatten(1, shape), spread=spread.reshape(shape))
+
+
+def places(own: Difference) -> Float[Tensor, "P 3"]:
     """World points that blocks show; far away where nothing is."""
-    camera, (y, x) = own.camera, chosen.nonzero(as_tuple=True)
+    camera, (height, width) = own.camera, own.size.shape
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     across, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
     known = own.depth[own.depth.isfinite()]
     far = FAR * (float(known.max()) if len(known) else camera.near)
-    depth = torch.where(own.depth.isfinite(), own.depth, far)[chosen]
-    points = (torch.stack([across, down, torch.ones_like(across)]) * depth).double()
+    depth = torch.where(own.depth.isfinite(), own.depth, far)
+    points = (torch.stack([across, down, torch.ones_like(across)]) * depth).flatten(1).double()
     return (camera.rotation.double().T @ (points - camera.translation.double()[:, None])).T.float()
 
 
-def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "P"]]:
-    """(which points a photograph sees, in front of or on what the model shows it, and how much it differs there or in
-    a block beside)."""
+def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "3 9 P"]]:
+    """(which points a photograph sees, in front of or on what the model shows it; its colours there, the fifth, and in
+    the blocks around)."""
     pixels, depths = other.camera.project(points)
     inside = other.camera.shows(pixels, depths)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(1)
     sees = inside & other.counted[y, x] & (depths < HIDDEN * other.depth[y, x])
-    return sees, other.size_around[y, x]
+    height, width = other.size.shape
+    rows = (y + torch.arange(-1, 2).repeat_interleave(3)[:, None]).clamp(0, height - 1)
+    columns = (x + torch.arange(-1, 2).repeat(3)[:, None]).clamp(0, width - 1)
+    return sees, other.evened[:, rows, columns]
 
 
 def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

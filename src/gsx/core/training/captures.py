@@ -194,8 +194,9 @@ def differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         photograph, counted = small.image(), small.counted()
+        gains = gains_between(shown.image.detach().cpu(), photograph, counted)
         image = at_exposure(run.as_photographed(shown.image, small).detach().cpu(), photograph, counted)
-        found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted)
+        found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted, gains)
     return found
 
 
@@ -203,8 +204,14 @@ def at_exposure(
     image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "3 H W"]:
     """A render, as bright in each channel as its photograph; saturated as that is."""
-    gains = log_gains(image, photograph, counted).nan_to_num(0.0).exp()
-    return (gains[:, None, None] * image).clamp(0, 1)
+    return (gains_between(image, photograph, counted)[:, None, None] * image).clamp(0, 1)
+
+
+def gains_between(
+    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
+) -> Float[Tensor, "3"]:
+    """How many times as bright as a render its photograph is, by channel; 1 where that cannot be told."""
+    return log_gains(image, photograph, counted).nan_to_num(0.0).exp()
 
 
 def seen_smaller(run: Run, view: View) -> tuple[View, TiledRendering]:

@@ -154,11 +154,11 @@ def shown_weights(
     drawn: Drawn, seen: Look, counted: Bool[Tensor, "H W"] | None, count: int
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """Blending weights of each row summed over pixels of a picture: (those that do not count, all)."""
-    everywhere = torch.ones_like(seen.image).detach()
-    all_over = by_row(drawn, error_sums(seen, everywhere), count) / 3
-    if counted is None:
-        return torch.zeros_like(all_over), all_over
-    return by_row(drawn, error_sums(seen, blacked(everywhere, ~counted)), count) / 3, all_over
+    hidden = torch.zeros_like(seen.image[0]) if counted is None else (~counted).to(seen.image)
+    upstream = torch.stack([hidden, torch.ones_like(hidden), torch.zeros_like(hidden)])
+    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], upstream, retain_graph=True)
+    own, all_over = by_row(drawn, gradient[:, :2].T, count)
+    return own, all_over
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
