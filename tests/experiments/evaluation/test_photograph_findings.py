@@ -9,6 +9,7 @@ import pytest
 import torch
 from tiny import tiny_run
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
@@ -59,6 +60,20 @@ def test_a_shift_is_told_by_what_counts_and_hardly_by_what_stands_before_it() ->
     photograph[:, :, :40] = waves(-2.0, -2.0)[:, :, :40]
     counted[:, :45] = False
     assert shift_of(waves(), photograph, counted) == pytest.approx((1.0, 0.5), abs=0.03)
+
+
+def test_what_is_plain_around_a_thing_does_not_hold_it() -> None:
+    """A thing before white, most of the picture, which a blurred and noisy model shows as well as a photograph does."""
+
+    def thing(across: float = 0.0, down: float = 0.0) -> Tensor:
+        x, y = torch.arange(80.0)[None] - 40 - across, torch.arange(60.0)[:, None] - 30 - down
+        near = torch.sigmoid(14 - (x.square() + y.square()).sqrt())
+        return near * waves(across, down) + 1 - near
+
+    generator = torch.Generator().manual_seed(0)
+    learnt = avg_pool2d(thing()[None], 5, 1, 2, count_include_pad=False)[0]
+    noise = 0.04 * torch.randn(learnt.shape, generator=generator) * (learnt.amin(0) < 0.95)
+    assert shift_of(learnt + noise, thing(0.6, -0.4), None) == pytest.approx((0.6, -0.4), abs=0.1)
 
 
 def test_a_plain_picture_a_stripe_and_a_small_one_tell_no_shift() -> None:

@@ -16,6 +16,8 @@ ALIKE = 1e-3
 """Differences of display values below it, a quarter of what eight bits tell, are none."""
 LEAST = 64
 """Pixels that tell it."""
+SLOPED = 1 / 255
+"""Display values from px to px, from which on a pixel tells something: what is plain lies nowhere in particular."""
 TELLING = 1e-5
 """Least eigenvalue of the normal equations, of columns of length 1, from which on they tell a shift."""
 
@@ -27,8 +29,9 @@ def shift_of(
     explains no more than no shift does.
 
     The translation that explains their difference best, beside a gain and an offset: by least squares on slopes of the
-    render, moved there again and again (Lucas and Kanade 1981), in which pixels that differ by more than the usual
-    count little; in pictures of a half and of a quarter of the size first, where those are large enough.
+    render, moved there again and again (Lucas and Kanade 1981), in which pixels that differ by more than the usual of
+    those that have slopes count little; in pictures of a half and of a quarter of the size first, where those are large
+    enough.
     """
     still, shown = grey(render), grey(photograph)
     inside = torch.ones_like(still, dtype=torch.bool) if counted is None else counted.to(still.device)
@@ -58,7 +61,7 @@ def refined(
         moved, told = translated(still, shift), inside & interior(still, float(shift.abs().max()))
         columns = torch.stack([central(moved, 1), central(moved, 0), moved, torch.ones_like(moved)])[:, told]
         residual = by_medians(moved, shown, told) if residual is None else residual
-        fit = least_squares(columns, shown[told], robust(residual[told]))
+        fit = least_squares(columns, shown[told], robust(residual[told], sloped(columns)))
         if fit is None:
             return None
         residual = shown - fit[2] * moved - fit[3]
@@ -71,11 +74,12 @@ def refined(
 def mismatch(
     still: Float[Tensor, "H W"], shown: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"], shift: Float[Tensor, "2"]
 ) -> float:
-    """Median of what a shift leaves, beside a gain and an offset; infinite where nothing tells."""
+    """Median of what a shift leaves where there are slopes, beside a gain and an offset; inf where nothing tells."""
     moved, told = translated(still, shift), inside & interior(still, float(shift.abs().max()))
-    weights = robust(by_medians(moved, shown, told)[told])
+    telling = sloped(torch.stack([central(moved, 1), central(moved, 0)])[:, told])
+    weights = robust(by_medians(moved, shown, told)[told], telling)
     fit = least_squares(torch.stack([moved, torch.ones_like(moved)])[:, told], shown[told], weights)
-    return math.inf if fit is None else float((shown - fit[0] * moved - fit[1])[told].abs().median())
+    return math.inf if fit is None else usual((shown - fit[0] * moved - fit[1])[told], telling)
 
 
 def by_medians(
@@ -87,9 +91,21 @@ def by_medians(
     return wanted - image * (wanted[told].median() / image[told].median().clamp_min(1e-6))
 
 
-def robust(residual: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
-    """Weights of pixels: less than half for a residual beyond the median of all (Cauchy)."""
-    return 1 / (1 + (residual / (residual.abs().median() + 1e-4)).square())
+def robust(residual: Float[Tensor, "P"], telling: Bool[Tensor, "P"] | None = None) -> Float[Tensor, "P"]:
+    """Weights of pixels: less than half for a residual beyond the median of those that tell something, if there are
+    any, or of all (Cauchy)."""
+    return 1 / (1 + (residual / (usual(residual, telling) + 1e-4)).square())
+
+
+def usual(residual: Float[Tensor, "P"], telling: Bool[Tensor, "P"] | None) -> float:
+    """Median size of residuals of pixels that tell something, if there are any, or of all."""
+    some = residual if telling is None or not telling.any() else residual[telling]
+    return float(some.abs().median())
+
+
+def sloped(slopes: Float[Tensor, "C P"]) -> Bool[Tensor, "P"]:
+    """Pixels whose first two values, slopes along the axes, say that they are not plain."""
+    return slopes[:2].abs().amax(0) > SLOPED
 
 
 def grey(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
