@@ -26,6 +26,8 @@ LEAST, TIMES = 0.06, 6.0
 """A difference, display values, that stands out: at least so much, and so many times the usual."""
 ALIKE = 0.03
 """Colours that differ by less, display values at one exposure, are the same."""
+MIDDLE = 4
+"""Of a block and the eight around it, by rows."""
 COVERED = 0.5
 """Alpha of a block that has a depth."""
 WITNESSES = 2
@@ -152,12 +154,18 @@ class Witnesses:
 def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
     """What other photographs show in the places of one."""
     points, colours, shape = places(own), own.evened.flatten(1), own.size.shape
-    looks = [looked_up(other, points) for other in others]
-    sees = torch.stack([seen for seen, _ in looks])
-    apart = torch.stack([(colours[:, None] - around).abs().amax(0).amin(0) for _, around in looks])
-    there = torch.stack([torch.where(seen, around[:, 4], torch.nan) for seen, around in looks])
-    spread = (there - there.nanmedian(0).values).abs().amax(1).nanmedian(0).values
-    return Witnesses(sees=sees.unflatten(1, shape), apart=apart.unflatten(1, shape), spread=spread.reshape(shape))
+    sees, apart, there = list[Tensor](), list[Tensor](), list[Tensor]()
+    for other in others:
+        seen, around = looked_up(other, points)
+        sees.append(seen)
+        apart.append((colours[:, None] - around).abs().amax(0).amin(0))
+        there.append(torch.where(seen, around[:, MIDDLE], torch.nan))
+    shown = torch.stack(there)
+    spread = (shown - shown.nanmedian(0).values).abs().amax(1).nanmedian(0).values
+    asked = torch.stack(sees), torch.stack(apart)
+    return Witnesses(
+        sees=asked[0].unflatten(1, shape), apart=asked[1].unflatten(1, shape), spread=spread.reshape(shape)
+    )
 
 
 def places(own: Difference) -> Float[Tensor, "P 3"]:
@@ -173,8 +181,8 @@ def places(own: Difference) -> Float[Tensor, "P 3"]:
 
 
 def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "3 9 P"]]:
-    """(which points a photograph sees, in front of or on what the model shows it; its colours there, the fifth, and in
-    the blocks around)."""
+    """(which points a photograph sees, in front of or on what the model shows it; its colours there (MIDDLE) and in the
+    blocks around)."""
     pixels, depths = other.camera.project(points)
     inside = other.camera.shows(pixels, depths)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(1)
