@@ -6,6 +6,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.quality.distractors import (
+    ALIKE,
     BLOCK,
     LEAST,
     PLAIN,
@@ -100,29 +101,75 @@ def test_what_the_model_has_learnt_of_it_in_other_views_does_not_hide_it() -> No
     assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
 
 
-def test_what_looks_different_from_everywhere_is_no_distractor() -> None:
-    """A disc that shines: each photograph shows it in a grey of its own, the model in the mean of them."""
-    pictures, inside, greys = [], [], (0.2, 0.8, 0.35, 0.65, 0.05, 0.95)
-    for camera, photograph, grey in zip(cameras(), noisy(), greys, strict=True):
+@pytest.mark.parametrize("greys", [(0.2, 0.8, 0.35, 0.65, 0.05, 0.95), (0.95, 0.2, 0.6), (0.2, 0.5, 0.8)])
+def test_what_looks_different_from_everywhere_is_not_alone(greys: tuple[float, ...]) -> None:
+    """In the middle of a disc that shines: each photograph shows it in a grey of its own, the model in half of white.
+    Its rim lies beside the plane, on which others agree."""
+    pictures, inside = [], []
+    for camera, photograph, grey in zip(cameras(), noisy(), greys, strict=False):
         away, (image, depth) = on_plane(camera)[0][..., :2].norm(dim=-1), shown(camera)
-        photograph[:, away < 0.4], image[:, away < 0.4] = grey, 0.5
+        photograph[:, away < 0.4], image[:, away < 0.4] = grey, 0.5 + 1e-3
         pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), photograph))
         inside.append((away < 0.2)[::BLOCK, ::BLOCK])
     for number, (own, middle) in enumerate(zip(pictures, inside, strict=True)):
         others = pictures[:number] + pictures[number + 1 :]
-        assert bool((own.size[middle] > 2 * LEAST).all())
-        assert not bool(witnesses(own, others).alone(own.size)[middle].any())
+        assert not bool(witnesses(own, others).alone(own.evened_size)[middle].any())
 
 
-def test_what_others_tell_of_a_place() -> None:
-    """Five blocks that differ by 0.3: where two of four show the same they are not alone; nor where others differ from
-    each other; nor where a single one sees them. All four or two of four confirm what they show alike."""
-    sees = torch.ones(4, 1, 5, dtype=torch.bool)
-    sees[1:, 0, 4] = False
-    apart = torch.tensor([[0.4, 0.4, 0.01, 0.01, 0.4], [0.4, 0.01, 0.01, 0.4, 0.4]])[[0, 0, 1, 1], None]
-    told = Witnesses(sees=sees, apart=apart, spread=torch.tensor([[0.1, 0.1, 0.1, 0.2, 0.1]]))
-    assert told.alone(torch.full((1, 5), 0.3)).tolist() == [[True, False, False, False, False]]
-    assert told.confirmed.tolist() == [[False, True, True, True, False]]
+def told_of(apart: list[list[float]], off_middle: list[list[float]], unseen: list[tuple[int, int]]) -> Witnesses:
+    """Of blocks in a row: a list for each block, of values for each witness; (block, witness) that do not see it."""
+    sees = torch.ones(len(apart[0]), 1, len(apart), dtype=torch.bool)
+    for block, witness in unseen:
+        sees[witness, 0, block] = False
+    return Witnesses(sees=sees, apart=torch.tensor(apart).T[:, None], off_middle=torch.tensor(off_middle).T[:, None])
+
+
+def test_who_is_alone_by_what_others_tell_of_a_place() -> None:
+    """Blocks that differ by 0.3, of four witnesses: alone; two show the same; two disagree with the middle; one of
+    these is not asked, since it sees nothing; one alone sees it."""
+    agreed, parted = [0.1, 0.0, 0.1, 0.1], [0.1, 0.0, 0.2, 0.2]
+    apart = [[0.4, 0.4, 0.4, 0.1], [0.4, 0.4, 0.1, 0.1], [0.4] * 4, [0.4, 0.4, 0.1, 0.1], [0.4] * 4]
+    unseen = [(3, 3), (4, 1), (4, 2), (4, 3)]
+    told = told_of(apart, [agreed, agreed, parted, [0.1, 0.0, 0.1, 0.9], agreed], unseen)
+    assert told.alone(torch.full((1, 5), 0.3)).tolist() == [[True, False, False, True, False]]
+
+
+def test_what_half_of_those_show_who_see_it_is_confirmed() -> None:
+    """By two of four; by one of four; by one of two who see it; by the only one who sees it; by nobody."""
+    same, other = ALIKE - 0.005, ALIKE + 0.005
+    apart = [[same, same, other, other], [same, other, other, other], [same, other, same, same], [same] * 4, [same] * 4]
+    unseen = [(2, 2), (2, 3), (3, 1), (3, 2), (3, 3), *((4, witness) for witness in range(4))]
+    told = told_of(apart, [[0.0] * 4] * 5, unseen)
+    assert told.confirmed.tolist() == [[True, False, True, False, False]]
+
+
+@pytest.mark.parametrize(("light", "gain"), [(1.0, 0.4), (0.3, 1.9), (0.3, 2.5)])
+def test_what_others_agree_on_is_compared_at_one_exposure(light: float, gain: float) -> None:
+    """A scene, and a photograph of it at another exposure in which something stands."""
+    pictures = []
+    for number, (camera, photograph) in enumerate(zip(cameras(), noisy(noise=0.0), strict=True)):
+        (image, depth), taken = shown(camera), light * photograph
+        if number == 2:
+            taken[:, 12:24, 20:40] = light * torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+            taken = gain * taken
+        gains = gains_between(light * image, taken, None)
+        image = at_exposure(light * image, taken, None)
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
+    found = distractors_in(pictures)
+    assert bool(found[2][blocks(slice(12, 24), slice(20, 40))].all())
+    assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
+
+
+def test_who_stands_behind_something_does_not_see_a_place() -> None:
+    """Four of five others look at a wall before the plane: what they show of it says nothing of the plane."""
+    photographs, pictures = noisy(), []
+    photographs[2][:, 12:24, 20:40] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+    for number, (camera, photograph) in enumerate(zip(cameras(), photographs, strict=True)):
+        (image, depth), behind = shown(camera), number in (0, 1, 3, 4)
+        picture = torch.full_like(image, 0.2) if behind else image
+        taken = torch.full_like(image, 0.2) if behind else photograph
+        pictures.append(difference_of(camera, picture, depth / 2 if behind else depth, torch.ones(48, 64), taken))
+    assert not any(bool(marked.any()) for marked in distractors_in(pictures))
 
 
 @pytest.mark.parametrize("gain", [1.0, 0.7])
@@ -144,10 +191,12 @@ def test_what_others_show_as_well_stays_beside_a_distractor(gain: float) -> None
     assert torch.equal(distractors_in(pictures)[2], blocks(slice(12, 24), slice(20, 40)))
 
 
-def test_two_photographs_tell_nothing_of_each_other() -> None:
+def test_one_photograph_or_two_tell_nothing() -> None:
     photographs = noisy()
     photographs[1][:, 12:24, 20:40] = 0.95
-    assert not any(bool(marked.any()) for marked in distractors_in(seen(photographs)[:2]))
+    for some in (seen(photographs)[1:2], seen(photographs)[:2]):
+        assert [int(marked.sum()) for marked in distractors_in(some)] == [0] * len(some)
+    assert distractors_in([]) == []
 
 
 def test_what_nobody_else_sees_is_not_judged() -> None:

@@ -57,8 +57,8 @@ class Difference:
 
     camera: Camera
     """Whose pixels are the blocks."""
-    size: Float[Tensor, "h w"]
-    """Of the mean difference, largest over channels; display values."""
+    off: Float[Tensor, "3 h w"]
+    """Sizes of mean differences; display values; 0 in blocks that do not count."""
     depth: Float[Tensor, "h w"]
     """Camera z, scene units; inf where nothing is."""
     counted: Bool[Tensor, "h w"]
@@ -69,8 +69,18 @@ class Difference:
     """How many times as bright as the model the photograph is."""
 
     @cached_property
+    def size(self) -> Float[Tensor, "h w"]:
+        """Of the difference, largest over channels."""
+        return self.off.amax(0)
+
+    @cached_property
+    def evened_size(self) -> Float[Tensor, "h w"]:
+        """The same at the model's exposure."""
+        return (self.off / self.gains[:, None, None]).amax(0)
+
+    @cached_property
     def evened(self) -> Float[Tensor, "3 h w"]:
-        """Colours as bright as the model's."""
+        """Colours at the model's exposure."""
         return self.colours / self.gains[:, None, None]
 
 
@@ -95,7 +105,7 @@ def difference_of(
     whole = everything if counted is None else by_block(counted[None].float())[0] == 1
     return Difference(
         camera=camera.resize(width, height),
-        size=off.abs().amax(0) * whole,
+        off=off.abs() * whole,
         depth=torch.where(weight > COVERED, z / weight.clamp_min(COVERED), torch.inf),
         counted=whole,
         colours=by_block(photograph),
@@ -114,9 +124,9 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
     for number, own in enumerate(differences):
         order = (centres - centres[number]).norm(dim=1).argsort(stable=True)
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
-        witnessed = witnesses(own, others)
-        marked = whole_of(witnessed.alone(own.size) & (own.size > least), own.size > least / 2)
-        found.append(with_plain_parts(marked, plain_parts(own.colours)) & ~witnessed.confirmed)
+        told = witnesses(own, others)
+        marked = whole_of(told.alone(own.evened_size) & (own.size > least), own.size > least / 2)
+        found.append(with_plain_parts(marked, plain_parts(own.colours)) & ~told.confirmed)
     return with_their_colours(found, [colour_bins(one.colours, one.counted) for one in differences])
 
 
@@ -129,30 +139,31 @@ class Witnesses:
     apart: Float[Tensor, "K h w"]
     """By how much the one's colour differs from the most alike of theirs there or in a block beside; display values,
     the largest over channels."""
-    spread: Float[Tensor, "h w"]
-    """By how much theirs differ from their median there, in the middle of them; nan where none sees the place."""
-
-    @cached_property
-    def confirmed(self) -> Bool[Tensor, "h w"]:
-        """Where at least half of those that see it, and WITNESSES, show the same."""
-        return self.known & ~self.few(self.apart < ALIKE)
+    off_middle: Float[Tensor, "K h w"]
+    """By how much each of theirs differs from the median of those that see the place, likewise; nan for others."""
 
     @cached_property
     def known(self) -> Bool[Tensor, "h w"]:
-        """Where enough of them see the place."""
+        """Where at least WITNESSES of them see the place."""
         return self.sees.sum(0) >= WITNESSES
+
+    @cached_property
+    def confirmed(self) -> Bool[Tensor, "h w"]:
+        """Where enough see the place, and at least half of those show the same."""
+        return self.known & ~self.few(self.apart < ALIKE)
 
     def few(self, of: Bool[Tensor, "K h w"]) -> Bool[Tensor, "h w"]:
         """Where fewer than half of those that see it are of these."""
         return (self.sees & of).sum(0) < self.sees.sum(0) / 2
 
     def alone(self, size: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-        """Where they agree to half of that size, and few show the one's colour to half of it."""
-        return self.known & self.few(self.apart < size / 2) & (self.spread < size / 2)
+        """Where most of them agree to half of that size, and few show the one's colour to half of it; display values
+        at the model's exposure."""
+        return self.known & self.few(self.apart < size / 2) & self.few(self.off_middle >= size / 2)
 
 
 def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
-    """What other photographs show in the places of one."""
+    """What other photographs, at least one, show in the places of one."""
     points, colours, shape = places(own), own.evened.flatten(1), own.size.shape
     sees, apart, there = list[Tensor](), list[Tensor](), list[Tensor]()
     for other in others:
@@ -161,11 +172,9 @@ def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
         apart.append((colours[:, None] - around).abs().amax(0).amin(0))
         there.append(torch.where(seen, around[:, MIDDLE], torch.nan))
     shown = torch.stack(there)
-    spread = (shown - shown.nanmedian(0).values).abs().amax(1).nanmedian(0).values
-    asked = torch.stack(sees), torch.stack(apart)
-    return Witnesses(
-        sees=asked[0].unflatten(1, shape), apart=asked[1].unflatten(1, shape), spread=spread.reshape(shape)
-    )
+    values = torch.stack(sees), torch.stack(apart), (shown - shown.nanmedian(0).values).abs().amax(1)
+    seen, differing, off_middle = (each.unflatten(1, shape) for each in values)
+    return Witnesses(sees=seen, apart=differing, off_middle=off_middle)
 
 
 def places(own: Difference) -> Float[Tensor, "P 3"]:
@@ -182,7 +191,7 @@ def places(own: Difference) -> Float[Tensor, "P 3"]:
 
 def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "3 9 P"]]:
     """(which points a photograph sees, in front of or on what the model shows it; its colours there (MIDDLE) and in the
-    blocks around)."""
+    blocks around, inf where these do not count)."""
     pixels, depths = other.camera.project(points)
     inside = other.camera.shows(pixels, depths)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(1)
@@ -190,7 +199,7 @@ def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Ten
     height, width = other.size.shape
     rows = (y + torch.arange(-1, 2).repeat_interleave(3)[:, None]).clamp(0, height - 1)
     columns = (x + torch.arange(-1, 2).repeat(3)[:, None]).clamp(0, width - 1)
-    return sees, other.evened[:, rows, columns]
+    return sees, torch.where(other.counted[rows, columns], other.evened[:, rows, columns], torch.inf)
 
 
 def whole_of(marked: Bool[Tensor, "h w"], weak: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

@@ -16,8 +16,9 @@ ALIKE = 1e-3
 """Differences of display values below it, a quarter of what eight bits tell, are none."""
 LEAST = 64
 """Pixels that tell it."""
-SLOPED = 1 / 255
-"""Display values from px to px, from which on a pixel tells something: what is plain lies nowhere in particular."""
+SLOPED, FEW = 1 / 255, 0.05
+"""Display values from px to px, from which on a pixel tells something: what is plain lies nowhere in particular. Fewer
+than this share of all pixels do not stand for the others."""
 TELLING = 1e-5
 """Least eigenvalue of the normal equations, of columns of length 1, from which on they tell a shift."""
 
@@ -74,12 +75,11 @@ def refined(
 def mismatch(
     still: Float[Tensor, "H W"], shown: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"], shift: Float[Tensor, "2"]
 ) -> float:
-    """Median of what a shift leaves where there are slopes, beside a gain and an offset; inf where nothing tells."""
+    """Median of what a shift leaves, beside a gain and an offset; infinite where nothing tells."""
     moved, told = translated(still, shift), inside & interior(still, float(shift.abs().max()))
-    telling = sloped(torch.stack([central(moved, 1), central(moved, 0)])[:, told])
-    weights = robust(by_medians(moved, shown, told)[told], telling)
+    weights = robust(by_medians(moved, shown, told)[told])
     fit = least_squares(torch.stack([moved, torch.ones_like(moved)])[:, told], shown[told], weights)
-    return math.inf if fit is None else usual((shown - fit[0] * moved - fit[1])[told], telling)
+    return math.inf if fit is None else float((shown - fit[0] * moved - fit[1])[told].abs().median())
 
 
 def by_medians(
@@ -92,15 +92,11 @@ def by_medians(
 
 
 def robust(residual: Float[Tensor, "P"], telling: Bool[Tensor, "P"] | None = None) -> Float[Tensor, "P"]:
-    """Weights of pixels: less than half for a residual beyond the median of those that tell something, if there are
-    any, or of all (Cauchy)."""
-    return 1 / (1 + (residual / (usual(residual, telling) + 1e-4)).square())
-
-
-def usual(residual: Float[Tensor, "P"], telling: Bool[Tensor, "P"] | None) -> float:
-    """Median size of residuals of pixels that tell something, if there are any, or of all."""
-    some = residual if telling is None or not telling.any() else residual[telling]
-    return float(some.abs().median())
+    """Weights of pixels: less than half for a residual beyond the median of those that tell something, or of all where
+    these are few (Cauchy)."""
+    few = telling is None or int(telling.sum()) < max(LEAST, FEW * len(residual))
+    usual = (residual if few else residual[telling]).abs().median()
+    return 1 / (1 + (residual / (usual + 1e-4)).square())
 
 
 def sloped(slopes: Float[Tensor, "C P"]) -> Bool[Tensor, "P"]:

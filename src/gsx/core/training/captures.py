@@ -194,7 +194,7 @@ def differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         photograph, counted = small.image(), small.counted()
-        gains = gains_between(shown.image.detach().cpu(), photograph, counted)
+        gains = gains_between(shown.image, photograph, counted)
         image = at_exposure(run.as_photographed(shown.image, small).detach().cpu(), photograph, counted)
         found[view] = difference_of(small.camera, image, shown.depth, shown.alpha, photograph, counted, gains)
     return found
