@@ -76,6 +76,13 @@ def test_what_is_plain_around_a_thing_does_not_hold_it() -> None:
     assert shift_of(learnt + noise, thing(0.6, -0.4), None) == pytest.approx((0.6, -0.4), abs=0.1)
 
 
+def test_a_spot_in_a_faint_picture_does_not_stand_for_all_of_it() -> None:
+    """It alone has slopes to speak of, and stands still."""
+    faint, moved = (0.5 + 0.05 * (picture - 0.5) for picture in (waves(), waves(1.3, -0.7)))
+    faint[:, 30:33, 40:43] = moved[:, 30:33, 40:43] = 0.9
+    assert shift_of(faint, moved, None) == pytest.approx((1.3, -0.7), abs=0.1)
+
+
 def test_a_plain_picture_a_stripe_and_a_small_one_tell_no_shift() -> None:
     stripes = (0.4 * torch.arange(80.0)).sin().expand(3, 60, 80) / 2 + 0.5
     for picture in (torch.full((3, 60, 80), 0.5), stripes, waves()[:, :9, :9]):
