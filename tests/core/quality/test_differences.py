@@ -132,6 +132,22 @@ def test_who_is_alone_by_what_others_tell_of_a_place() -> None:
     unseen = [(3, 3), (4, 1), (4, 2), (4, 3)]
     told = told_of(apart, [agreed, agreed, parted, [0.1, 0.0, 0.1, 0.9], agreed], unseen)
     assert told.alone(torch.full((1, 5), 0.3)).tolist() == [[True, False, False, True, False]]
+    assert told.disputed(torch.full((1, 5), 0.15)).tolist() == [[False, False, True, False, False]]
+
+
+def test_what_others_dispute_stays_beside_a_distractor() -> None:
+    """To the right of it, each photograph shows a grey of its own, and the model is wrong for that camera alone."""
+    pictures, greys, edge = [], (0.2, 0.8, 0.5, 0.65, 0.05, 0.95), on_plane(cameras()[2])[0][24, 32, 0]
+    for number, (camera, photograph, grey) in enumerate(zip(cameras(), noisy(), greys, strict=True)):
+        (image, depth), shines = shown(camera), on_plane(camera)[0][..., 0] > edge
+        photograph[:, shines] = image[:, shines] = grey
+        if number == 2:
+            image[:, shines] += 0.75 * LEAST
+            photograph[:, 16:32, 16:32] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
+        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), photograph))
+    found = distractors_in(pictures)[2]
+    assert float(found[blocks(slice(16, 32), slice(16, 30))].float().mean()) > 0.9
+    assert not bool(found[:, 18:].any())
 
 
 def test_what_half_of_those_show_who_see_it_is_confirmed() -> None:

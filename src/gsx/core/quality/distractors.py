@@ -3,8 +3,8 @@
 A model of a static scene shows what photographs agree on. Where one of them differs from it by more than fine detail,
 and the photographs that see the same place agree on another colour there, something was in the way (distractors:
 RobustNeRF, Sabour et al. 2023; SpotLessSplats, Sabour et al. 2024, which tell them by features of a large network; here
-by the places that depth tells). Where others show the same colour there it is the model that is wrong, and where they
-show many, what is there shines, or its place is. What is plain, a coat for example, goes as a whole (as clusters of
+by the places that depth tells). Where others show the same colour there it is the model that is wrong; where they show
+many, what is there shines, or its depth is wrong. What is plain, a coat for example, goes as a whole (as clusters of
 features do there): a model that has learnt a piece of it differs little there. So do colours that photographs show
 mostly where something was in the way: somebody wears the same in all of them.
 """
@@ -125,8 +125,10 @@ def distractors_in(differences: Sequence[Difference]) -> list[Bool[Tensor, "h w"
         order = (centres - centres[number]).norm(dim=1).argsort(stable=True)
         others = [differences[other] for other in order[order != number][:NEAREST].tolist()]
         told = witnesses(own, others)
-        marked = whole_of(told.alone(own.evened_size) & (own.size > least), own.size > least / 2)
-        found.append(with_plain_parts(marked, plain_parts(own.colours)) & ~told.confirmed)
+        least_evened = own.evened_size.clamp_min(least / float(own.gains.mean()))
+        unsettled = ~(told.confirmed | told.disputed(least_evened))
+        marked = whole_of(told.alone(own.evened_size) & (own.size > least), (own.size > least / 2) & unsettled)
+        found.append(with_plain_parts(marked, plain_parts(own.colours)) & unsettled)
     return with_their_colours(found, [colour_bins(one.colours, one.counted) for one in differences])
 
 
@@ -151,6 +153,10 @@ class Witnesses:
     def confirmed(self) -> Bool[Tensor, "h w"]:
         """Where enough see the place, and at least half of those show the same."""
         return self.known & ~self.few(self.apart < ALIKE)
+
+    def disputed(self, size: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        """Where enough see the place, and half of those differ by that size from the middle of them, or more."""
+        return self.known & ~self.few(self.off_middle >= size)
 
     def few(self, of: Bool[Tensor, "K h w"]) -> Bool[Tensor, "h w"]:
         """Where fewer than half of those that see it are of these."""
