@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.data import filling
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.filling import filled, gaps_of, in_front, in_view, unprojected
+from gsx.core.data.filling import filled, gaps_of, in_front, in_view
 from gsx.core.data.scene import PointCloud, Scene, View
 
 EYES = [(x, -6.0, z) for x in (-1.0, 0.0, 1.0) for z in (-0.5, 0.5)]
@@ -78,11 +78,11 @@ def test_they_lie_on_the_wall_in_the_gap_with_the_colours_of_the_picture() -> No
 def test_a_camera_sees_its_unprojected_pixels_where_they_were() -> None:
     camera = replace(look_at([1, -5, 2], [0, 0, 0], fov_x=0.8, width=120, height=90), cx=50.0, cy=41.0)
     pixels, depths = torch.tensor([[3.0, 80.0], [119.0, 2.0], [50.0, 41.0]]), torch.tensor([1.0, 4.0, 9.0])
-    back, deep = camera.project(unprojected(camera, pixels, depths))
+    back, deep = camera.project(camera.unproject(pixels, depths))
     assert torch.allclose(back, pixels, atol=1e-3)
     assert torch.allclose(deep, depths, atol=1e-4)
     assert torch.allclose(
-        unprojected(camera, pixels[2:], depths[2:])[0], (camera.centre + 9 * camera.rotation[2]).float(), atol=1e-5
+        camera.unproject(pixels[2:], depths[2:])[0], (camera.centre + 9 * camera.rotation[2]).float(), atol=1e-5
     )
 
 

@@ -57,6 +57,12 @@ def seen(photographs: list[Tensor], counted: Tensor | None = None) -> list[Diffe
     ]
 
 
+def at_its_exposure(camera: Camera, image: Tensor, depth: Tensor, taken: Tensor) -> Difference:
+    """A photograph against a render that is made as bright, and by how much that is."""
+    bright, gains = at_exposure(image, taken, None), gains_between(image, taken, None)
+    return difference_of(camera, bright, depth, torch.ones(48, 64), taken, gains=gains)
+
+
 def noisy(seed: int = 0, noise: float = 0.01) -> list[Tensor]:
     """What cameras photograph of the plane."""
     generator = torch.Generator().manual_seed(seed)
@@ -168,9 +174,7 @@ def test_what_others_agree_on_is_compared_at_one_exposure(light: float, gain: fl
         if number == 2:
             taken[:, 12:24, 20:40] = light * torch.tensor([0.9, 0.1, 0.4])[:, None, None]
             taken = gain * taken
-        gains = gains_between(light * image, taken, None)
-        image = at_exposure(light * image, taken, None)
-        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
+        pictures.append(at_its_exposure(camera, light * image, depth, taken))
     found = distractors_in(pictures)
     assert bool(found[2][blocks(slice(12, 24), slice(20, 40))].all())
     assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))
@@ -201,9 +205,7 @@ def test_what_others_show_as_well_stays_beside_a_distractor(gain: float) -> None
             taken = photograph * gain
             taken[:, 12:24, 20:40] = torch.tensor([0.9, 0.1, 0.4])[:, None, None]
             image[:, around] += 0.75 * LEAST / gain
-        gains = gains_between(image, taken, None)
-        image = at_exposure(image, taken, None)
-        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
+        pictures.append(at_its_exposure(camera, image, depth, taken))
     assert torch.equal(distractors_in(pictures)[2], blocks(slice(12, 24), slice(20, 40)))
 
 
@@ -252,9 +254,7 @@ def test_another_exposure_is_no_distractor_and_hides_none(gain: float) -> None:
         if number == 2:
             taken[:, 12:24, 20:40] = 0.05
         image, depth = shown(camera)
-        gains = gains_between(image, taken, None)
-        image = at_exposure(image, taken, None)
-        pictures.append(difference_of(camera, image, depth, torch.ones(48, 64), taken, gains=gains))
+        pictures.append(at_its_exposure(camera, image, depth, taken))
     found = distractors_in(pictures)
     assert torch.equal(found[2], blocks(slice(12, 24), slice(20, 40)))
     assert not any(bool(found[other].any()) for other in (0, 1, 3, 4, 5))

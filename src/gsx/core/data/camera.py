@@ -149,6 +149,13 @@ class Camera:
         focal, centre = depth.new_tensor([self.fx, self.fy]), depth.new_tensor([self.cx, self.cy])
         return (camera_points[:, :2] / depth[:, None] * focal + centre).to(points), depth.to(points)
 
+    def unproject(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+        """World points at pixel positions and depths."""
+        x = (pixels[:, 0] - self.cx) / self.fx * depths
+        y = (pixels[:, 1] - self.cy) / self.fy * depths
+        points = torch.stack([x, y, depths], 1).double()
+        return ((points - self.translation.double()) @ self.rotation.double()).float()
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlacedCamera(Camera):

@@ -64,7 +64,7 @@ def gaps_of(
     weights = 1 / apart.clamp_min(1)
     log_depth = (weights * depths.log()[nearest]).sum(1) / weights.sum(1)
     colours = (view.image()[:, row, column].T * 255).round().byte()
-    return unprojected(camera, asked, log_depth.exp())[gaps], colours[gaps]
+    return camera.unproject(asked, log_depth.exp())[gaps], colours[gaps]
 
 
 def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M"]]:
@@ -80,12 +80,3 @@ def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[T
     count = min(COVERED, len(pixels))
     nearest = torch.cat([torch.cdist(part, pixels).topk(count, largest=False)[1] for part in pixels.split(rows)])
     return depths <= BEHIND * depths[nearest].amin(1)
-
-
-def unprojected(camera: Camera, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
-    """World points at pixel positions and depths."""
-    x = (pixels[:, 0] - camera.cx) / camera.fx * depths
-    y = (pixels[:, 1] - camera.cy) / camera.fy * depths
-    points = torch.stack([x, y, depths], 1).double()
-    rotation, translation = camera.rotation.double(), camera.translation.double()
-    return ((points - translation) @ rotation).float()

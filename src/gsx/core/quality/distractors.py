@@ -170,7 +170,7 @@ class Witnesses:
 
 def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
     """What other photographs, at least one, show in the places of one."""
-    points, colours, shape = places(own), own.evened.flatten(1), own.size.shape
+    points, colours = places(own), own.evened.flatten(1)
     sees, apart, there = list[Tensor](), list[Tensor](), list[Tensor]()
     for other in others:
         seen, around = looked_up(other, points)
@@ -178,21 +178,18 @@ def witnesses(own: Difference, others: Sequence[Difference]) -> Witnesses:
         apart.append((colours[:, None] - around).abs().amax(0).amin(0))
         there.append(torch.where(seen, around[:, MIDDLE], torch.nan))
     shown = torch.stack(there)
-    values = torch.stack(sees), torch.stack(apart), (shown - shown.nanmedian(0).values).abs().amax(1)
-    seen, differing, off_middle = (each.unflatten(1, shape) for each in values)
-    return Witnesses(sees=seen, apart=differing, off_middle=off_middle)
+    told = {"sees": torch.stack(sees), "apart": torch.stack(apart)}
+    told["off_middle"] = (shown - shown.nanmedian(0).values).abs().amax(1)
+    return Witnesses(**{name: values.unflatten(1, own.size.shape) for name, values in told.items()})
 
 
 def places(own: Difference) -> Float[Tensor, "P 3"]:
     """World points that blocks show; far away where nothing is."""
-    camera, (height, width) = own.camera, own.size.shape
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    across, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
+    y, x = torch.meshgrid(*(torch.arange(side) + 0.5 for side in own.depth.shape), indexing="ij")
     known = own.depth[own.depth.isfinite()]
-    far = FAR * (float(known.max()) if len(known) else camera.near)
+    far = FAR * (float(known.max()) if len(known) else own.camera.near)
     depth = torch.where(own.depth.isfinite(), own.depth, far)
-    points = (torch.stack([across, down, torch.ones_like(across)]) * depth).flatten(1).double()
-    return (camera.rotation.double().T @ (points - camera.translation.double()[:, None])).T.float()
+    return own.camera.unproject(torch.stack([x, y], -1).flatten(0, 1), depth.flatten())
 
 
 def looked_up(other: Difference, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, "P"], Float[Tensor, "3 9 P"]]:
