@@ -88,7 +88,7 @@ def test_grids_begin_where_light_differs_less_what_all_have_in_common() -> None:
     slopes = [0.3, -0.1, 0.2, -0.2]
     image, pairs = pairs_of(slopes)
     found = Exposures(options(), list("abcd"), 1000, CPU)
-    _, inside = found.judge(pairs.__getitem__)
+    _, inside = found.judge(pairs.__getitem__, 201)
     across = torch.tensor(slopes).var() * torch.tensor([0.25, 1, 1])  # red half as much; none of them down
     assert inside == pytest.approx(math.sqrt(float(across.sum()) / 6), rel=0.05)
     assert found.grids is not None
@@ -96,6 +96,26 @@ def test_grids_begin_where_light_differs_less_what_all_have_in_common() -> None:
     for name, slope in zip("abcd", slopes, strict=True):
         wanted = shaded(image, slope - 0.05, 0)
         assert (found.applied(image, name).detach() - wanted).abs().mean() < 0.2 * (image - wanted).abs().mean()
+
+
+def test_slopes_are_told_again_from_what_grids_leave() -> None:
+    slopes = [0.3, -0.1, 0.0, -0.2]
+    image, pairs = pairs_of(slopes)
+    found = Exposures(options(grid="always"), list("abcd"), 1000, CPU)
+    found.judge(pairs_of([slope / 2 for slope in slopes])[1].__getitem__, 201)
+
+    def off() -> float:
+        """Of all pictures."""
+        pictures = zip("abcd", pairs, strict=True)
+        return float(
+            sum((found.applied(image, name).detach() - other).abs().mean() for name, (_, other, _) in pictures)
+        )
+
+    before = off()
+    found.tell(lambda index: (found.applied(image, "abcd"[index]).detach(), pairs[index][1], None), 279)
+    assert off() < 0.3 * before
+    assert found.grids is not None
+    torch.testing.assert_close(found.grids.detach().mean(0), torch.zeros(RANK, 3, 4), atol=1e-6, rtol=0)
 
 
 def test_a_photograph_of_which_nothing_is_told_begins_with_the_mean_light() -> None:
@@ -108,14 +128,14 @@ def test_a_photograph_of_which_nothing_is_told_begins_with_the_mean_light() -> N
 def test_even_light_has_no_grids_unless_asked_for() -> None:
     _, pairs = pairs_of([0.03, -0.02, 0.01, 0.0])
     found = Exposures(options(), list("abcd"), 1000, CPU)
-    assert 0 < found.judge(pairs.__getitem__)[1] < found.options.grid_spread
+    assert 0 < found.judge(pairs.__getitem__, 201)[1] < found.options.grid_spread
     assert found.grids is found.matrices is None
     assert "grids" not in found.tensors()
     asked = Exposures(options(grid="always"), list("abcd"), 1000, CPU)
-    asked.judge(pairs.__getitem__)
+    asked.judge(pairs.__getitem__, 201)
     assert asked.grids is not None
     never = Exposures(options(grid="never"), list("abcd"), 1000, CPU)
-    assert math.isnan(never.judge(pairs_of([0.3, -0.3, 0.2, -0.2])[1].__getitem__)[1])
+    assert math.isnan(never.judge(pairs_of([0.3, -0.3, 0.2, -0.2])[1].__getitem__, 201)[1])
     assert never.grids is None
 
 

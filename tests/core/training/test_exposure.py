@@ -72,11 +72,11 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
     found = Exposures(options(), names, 1000, CPU)
     assert found.due(201)
     assert not found.due(200)
-    spread, inside = found.judge(pairs.__getitem__)
+    spread, inside = found.judge(pairs.__getitem__, 201)
     assert spread == pytest.approx(float(gains.log().std()), rel=1e-4)
     assert math.isnan(inside)
     assert found.grids is None
-    assert not found.due(201)
+    assert [number for number in range(1, 1001) if found.due(number)] == [279, 388, 540, 751]  # not 201, taken anew
     for name, gain in zip(names, gains - gains.mean() + 1, strict=True):
         torch.testing.assert_close(found.applied(image, name).detach(), image * gain)
 
@@ -84,14 +84,45 @@ def test_they_begin_where_photographs_differ_and_with_the_mean_at_the_identity()
 def test_equal_photographs_have_none_unless_asked_for() -> None:
     image, pairs = photographs_at(torch.tensor([1.01, 1.0, 0.99, 1.0]))
     found = Exposures(options(), list("abcd"), 1000, CPU)
-    assert found.judge(pairs.__getitem__)[0] < found.options.spread
+    assert found.judge(pairs.__getitem__, 201)[0] < found.options.spread
     assert found.matrices is None
     assert found.tensors() == {}
     assert found.applied(image, "a") is image
     asked = Exposures(options(when="always"), list("abcd"), 1000, CPU)
-    asked.judge(pairs.__getitem__)
+    asked.judge(pairs.__getitem__, 201)
     assert asked.matrices is not None
+    assert not any(found.due(number) for number in range(1, 1001) if number != 201)
     assert not Exposures(options(when="never"), list("abcd"), 1000, CPU).due(201)
+
+
+def test_they_are_told_again_from_what_a_better_model_shows() -> None:
+    names, true = list("abcd"), torch.tensor([0.8, 1.3, 1.0, 0.9])
+    image, pairs = photographs_at(true)
+    early = [(other / gain, other, None) for (_, other, _), gain in zip(pairs, true.sqrt(), strict=True)]
+    found = Exposures(options(), names, 1000, CPU)
+    found.judge(early.__getitem__, 201)  # the model has half of every exposure still
+    found.visits += 3
+    off = found.tell(lambda index: (found.applied(image, names[index]).detach(), pairs[index][1], None), 279)
+    assert off == pytest.approx(float((true.log() / 2).std(unbiased=False)), rel=0.05)  # of the other half
+    for name, gain in zip(names, true, strict=True):
+        shown = found.applied(image, name).detach() / image
+        torch.testing.assert_close(shown, torch.full_like(shown, float(gain)), atol=0.02, rtol=0)
+    assert found.visits.sum() == 0
+    assert found.moments.abs().max() == 0
+    assert not found.due(279)
+    assert found.due(388)
+
+
+def test_what_is_learnt_stays_where_nothing_more_is_told() -> None:
+    names, truth = ["a", "b"], torch.eye(3, 4).repeat(2, 1, 1)
+    truth[0, 0, 1], truth[1, 0, 1] = 0.05, -0.05  # no gain: a channel that takes from another
+    image, found = 0.2 + 0.3 * noise(3, 16, 24), Exposures(options(), ["a", "b"], 1000, CPU)
+    found.begin(truth.clone())
+    dark = torch.zeros_like(image)
+    shown = [(found.applied(image, "a").detach(),) * 2, (found.applied(image, "b").detach(), dark)]
+    assert found.tell(lambda index: (*shown[index], None), 279) == 0
+    assert found.matrices is not None
+    torch.testing.assert_close(found.matrices.detach(), truth)
 
 
 def test_some_photographs_are_judged_by_and_the_others_looked_at_where_all_have_exposures() -> None:
@@ -103,16 +134,16 @@ def test_some_photographs_are_judged_by_and_the_others_looked_at_where_all_have_
         return pairs[number]
 
     few = Exposures(options(views=4, spread=1.0), names, 1000, CPU)
-    few.judge(look)
+    few.judge(look, 201)
     assert len(set(seen)) == len(seen) == 4
     asked = seen.copy()
     found = Exposures(options(views=4), names, 1000, CPU)
-    spread, _ = found.judge(look)
+    spread, _ = found.judge(look, 201)
     assert seen[4:8] == asked
     assert sorted(seen[4:]) == list(range(9))
     assert spread == pytest.approx(float(torch.linspace(0.7, 1.3, 9)[asked].log().std()), rel=1e-4)
     everyone = Exposures(options(views=9), names, 1000, CPU)
-    everyone.judge(pairs.__getitem__)
+    everyone.judge(pairs.__getitem__, 201)
     assert torch.equal(found.matrices.detach(), everyone.matrices.detach())
 
 
@@ -204,7 +235,7 @@ DISTURBED = (
     *("scene.disturb.exposure=0.3", "training.exposure.when=auto", "iterations=30"),
     *("backbone.capacity=adaptive", "backbone.sh_judged=0.8"),
 )
-"""Growth looks at photographs at steps 6 and 12, bands at step 24."""
+"""Growth looks at photographs at steps 6 and 12, bands at step 24; exposures are told before 7, 9, 13, 17 and 23."""
 
 
 def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
@@ -215,7 +246,8 @@ def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> Non
     assert a.keys() == b.keys()
     assert "exposure.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
-    assert a["exposure.visits"].sum() == 24, "the steps after they were judged, and no look at a photograph beside"
+    assert a["exposure.told_last"] == 23
+    assert a["exposure.visits"].sum() == 8, "the steps after they were told last, and no look at a photograph beside"
 
 
 def test_without_need_training_is_bit_for_bit_that_without_exposures(tmp_path: Path) -> None:

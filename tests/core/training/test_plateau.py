@@ -132,7 +132,7 @@ def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> Non
         (("backbone.density.stop=6000",), 10),
         (("backbone.density.stop=6000", "backbone.sh_judged=0.7"), 28),
         (("backbone.density.stop=6000", "backbone.sh_judged=0.8"), 10),  # done with the first step that is taken again
-        (("backbone.density.stop=6000", "training.exposure.when=always", "training.exposure.start=0.5"), 21),
+        (("backbone.density.stop=6000", "training.exposure.when=always", "training.exposure.until=0.5"), 21),
         (("backbone.density.stop=6000", "training.supersample=2", "training.supersample_from=0.6"), 24),
         (("backbone.density.stop=6000", "training.coarse=2", "training.coarse_until=0.3"), 12),
     ],

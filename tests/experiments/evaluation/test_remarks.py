@@ -17,7 +17,7 @@ LINES = [
     {"step": 9, "pose_spread": 0.72, "poses": 40, "pose_motion": 0.61, "pose_seconds": 1.5},
     {"step": 30, "poses": 40, "pose_motion": 0.2, "pose_seconds": 1.0},
     {"step": 25, "exposure_spread": 0.1854, "exposures": 40, "exposure_seconds": 0.5},
-    {"step": 30, "withheld": 5},
+    {"step": 30, "withheld": 5, "exposures": 40, "exposure_motion": 0.04, "exposure_seconds": 1.25},
     {"step": 41, "pseudo": {
         "up": {"event": 40, "asked": {"1": 4, "2": 4}, "dropped": {"2": 1}, "warned": {"agreement": {"2": 2}}},
         "boot": {"event": 40, "asked": {"1": 8}, "dropped": {}, "warned": {}},
@@ -34,7 +34,8 @@ def test_a_whole_run_is_summed_up_by_hand() -> None:
         "warned": {"agreement": {"1": 0.0, "2": 0.25}},
     }
     assert found["pseudo"]["boot"] == {"asked": {"1": 8}, "dropped": {"1": 0.0}, "warned": {}}
-    assert found["exposures"] == {"step": 25, "spread": 0.1854, "learnt": 40, "seconds": 0.5}
+    exposures = {"step": 25, "spread": 0.1854, "learnt": 40, "motions": [0.04], "seconds": 1.75}
+    assert found["exposures"] == exposures
     assert found["poses"] == {"step": 9, "spread": 0.72, "corrected": 40, "motions": [0.61, 0.2], "seconds": 2.5}
     assert gathered(LINES[:1]) == {}
 

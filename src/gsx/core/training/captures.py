@@ -42,23 +42,33 @@ def judge_photographs(run: Run) -> dict[str, float]:
 
 
 def judge_exposures(run: Run) -> dict[str, float]:
-    """Whether training photographs have exposures of their own, from what the model shows in their places; for the
-    line of the step."""
-    begun, views = time.perf_counter(), run.photographed
+    """Whether training photographs have exposures of their own, where that is asked first, and which, from what the
+    model shows in their places; for the line of the step."""
+    begun, number, exposures = time.perf_counter(), run.step + 1, run.exposures
+    views = [coarser(view, run.scene.reduction, SMALLER) for view in run.photographed]
 
-    def look(number: int) -> Pair:
+    def look(index: int) -> Pair:
         run.refuse_if_stopping()
-        view = views[number]
-        return render(run, view.camera).image, view.image(), view.counted()
+        view = views[index]
+        shown = run.as_photographed(render(run, view.camera, supersample=1).image, view)
+        return shown.detach(), view.image(), view.counted()
 
-    spread, inside = run.exposures.judge(look)
-    learnt = run.exposures.matrices is not None
+    if number == exposures.first:
+        found = told_of_light(run, *exposures.judge(look, number))
+    else:
+        found = {"exposures": len(views), "exposure_motion": exposures.tell(look, number)}
+        logger.info("step %d: exposures are told again: %.1f %% off", number, 100 * found["exposure_motion"])
+    return found | {"exposure_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def told_of_light(run: Run, spread: float, within: float) -> dict[str, float]:
+    """Log by how much exposures and light within photographs differ, and what follows; for the line of the step."""
+    learnt, grids = run.exposures.matrices is not None, run.exposures.grids is not None
     verdict = "each has its own from here on" if learnt else "they are taken for equal"
-    verdict += ", since light differs within them" if run.exposures.grids is not None else ""
+    verdict += ", since light differs within them" if grids else ""
     logger.info("step %d: exposures of photographs are spread by %.1f %%: %s", run.step + 1, 100 * spread, verdict)
-    seconds, count = round(time.perf_counter() - begun, 3), len(run.scene.train) if learnt else 0
-    found = {"exposure_spread": spread, "exposures": count, "exposure_seconds": seconds}
-    return found | ({} if math.isnan(inside) else told_within(run, inside))
+    found = {"exposure_spread": spread, "exposures": len(run.scene.train) if learnt else 0}
+    return found | ({} if math.isnan(within) else told_within(run, within))
 
 
 def told_within(run: Run, spread: float) -> dict[str, float]:

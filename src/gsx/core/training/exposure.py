@@ -2,8 +2,9 @@
 
 A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers per training photograph, learnt by Adam
 (3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
-photographs and renders say instead of at the identity; their mean stays the identity, so that the model has the
-exposure of the mean photograph; and Adam keeps the steps of each photograph apart. One Adam over all of them, as
+photographs and renders say instead of at the identity, and are set right by these a few times, since renders say little
+at first; their mean stays the identity, so that the model has the exposure of the mean photograph; and Adam keeps the
+steps of each photograph apart. One Adam over all of them, as
 published, goes on moving a photograph while others are shown: by several rates a visit, where one is meant. Behind A
 comes a bilateral grid, where light is found to differ within photographs (`core.training.bilateral_grid`).
 """
@@ -19,7 +20,7 @@ from torch import Tensor
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.bilateral_grid import WHOLE, first_matrices, slopes_of_light, through_grid, without_common
-from gsx.core.training.occasions import WHEN, some_photographs
+from gsx.core.training.occasions import WHEN, due_at, occasions, refuse_wrong, some_photographs
 from gsx.core.training.schedule import log_linear
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
@@ -38,7 +39,11 @@ class ExposureOptions:
     when: str = "never"
     """auto: where photographs differ."""
     start: Share = 0.2
-    """Share of the steps after which it is judged, and the first guess made."""
+    """Share of the steps after which it is judged, and exposures are told first."""
+    until: Share = 0.75
+    """Share of the steps after which they are told last."""
+    times: Annotated[int, Range(1, 1000)] = 5
+    """How often they are, at shares that grow by the same factor; between that they are learnt."""
     spread: Annotated[float, Range(0, 1)] = 0.06
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own; as they have
     where they have grids."""
@@ -54,16 +59,14 @@ class ExposureOptions:
     """Of Adam at the first and at the last step; their logarithm is interpolated."""
 
     def __post_init__(self) -> None:
-        for name, value in (("when", self.when), ("grid", self.grid)):
-            if value not in WHEN:
-                raise ValueError(f"training.exposure.{name} is '{value}'; choose from {', '.join(WHEN)}")
+        refuse_wrong("exposure", self)
+        if self.grid not in WHEN:
+            raise ValueError(f"training.exposure.grid is '{self.grid}'; choose from {', '.join(WHEN)}")
         if self.when == "never" != self.grid:
             raise ValueError(
                 f"training.exposure.grid is '{self.grid}', but training.exposure.when is 'never': a grid comes behind "
                 "an exposure; set training.exposure.when=auto"
             )
-        if not 0 < self.start < 1:
-            raise ValueError(f"training.exposure.start is {self.start}; give a share of the steps between 0 and 1")
 
 
 # -- what photographs and renders say ----------------------------------------------------------------------------------
@@ -157,43 +160,63 @@ class Exposures:
     grid_moments: Float[Tensor, "2 N rank 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 0, 3, 4))
     visits: Float[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0))
     """Steps of each photograph."""
+    told_last: int = 0
+    """The last step before which they were told: not again where that step is taken anew."""
     shown: set[int] = field(default_factory=set)
     """Photographs of the step under way."""
 
+    def steps(self) -> list[int]:
+        """The steps before which exposures are told, if they are, the first of them after photographs are judged; none
+        where nobody asks."""
+        return occasions(self.options, self.iterations)
+
     @property
     def first(self) -> int:
-        """The step before which they are judged."""
-        return max(1, round(self.options.start * self.iterations)) + 1
+        """The step before which photographs are judged."""
+        return self.steps()[0]
 
     def due(self, number: int) -> bool:
-        """Whether they are judged before this step."""
-        return self.options.when != "never" and self.matrices is None and number == self.first
+        """Whether photographs are judged, or exposures told, before this step."""
+        return due_at(number, self.steps(), self.told_last, self.matrices is not None)
 
-    def judge(self, look: Callable[[int], Pair]) -> tuple[float, float]:
-        """Judge by some photographs, and begin with the gains of all, if these are spread enough, or have to be, and
-        with grids likewise; returns both spreads, nan for what was not asked.
+    def judge(self, look: Callable[[int], Pair], number: int) -> tuple[float, float]:
+        """Judge by some photographs before a step, and begin with the gains of all, if these are spread enough, or have
+        to be, and with grids likewise; returns both spreads, nan for what was not asked.
 
         look: (render, photograph, which pixels count) of the photograph of that number; each is looked at once at most.
         """
         own, everyone = self.options, range(len(self.names))
-        found = {number: self.told(look(number)) for number in some_photographs(everyone, own.views, "exposures")}
+        found = {index: self.told(look(index)) for index in some_photographs(everyone, own.views, "exposures")}
         spread, within = spreads_of(list(found.values()))
         with_grids = own.grid == "always" or within > own.grid_spread
         if own.when == "always" or spread > own.spread or with_grids:
-            found |= {number: self.told(look(number)) for number in everyone if number not in found}
-            self.begin_at([found[number] for number in everyone], with_grids)
+            found |= {index: self.told(look(index)) for index in everyone if index not in found}
+            self.correct([found[index] for index in everyone], with_grids, number)
         return spread, within
+
+    def tell(self, look: Callable[[int], Pair], number: int) -> float:
+        """Set right before a step what is learnt; returns by how much log gains of photographs change (root of the mean
+        square). look: as above, renders at the exposures of their photographs."""
+        found = [self.told(look(index)) for index in range(len(self.names))]
+        self.correct(found, self.grids is not None, number)
+        gains = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0)
+        return float((gains - gains.mean(0)).square().mean().sqrt())
 
     def told(self, pair: Pair) -> Light:
         """Of a photograph's light."""
         return light_of(pair, slopes=self.options.grid != "never")
 
-    def begin_at(self, found: Sequence[Light], with_grids: bool) -> None:
-        """Learn from what was found of each photograph on."""
-        first = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0).exp()
-        matrices = torch.cat([torch.diag_embed(first), torch.zeros(len(first), 3, 1)], dim=2)
+    @torch.no_grad()
+    def correct(self, found: Sequence[Light], with_grids: bool, number: int) -> None:
+        """Learn on from what there is, made brighter by what was found of each photograph before a step."""
+        gains = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0).exp()
+        now = torch.eye(3, 4).expand(len(found), -1, -1) if self.matrices is None else self.matrices.cpu()
         slopes = [one.slopes[0] for one in found if with_grids and one.slopes is not None]
-        self.begin(centred_on_identity(matrices), first_matrices(torch.stack(slopes)) if slopes else None)
+        grids = first_matrices(torch.stack(slopes)) if slopes else None
+        if grids is not None and self.grids is not None:
+            grids += self.grids.cpu()
+        self.begin(centred_on_identity(gains[:, :, None] * now), grids)
+        self.told_last = number
 
     def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
         """Learn from these on."""
@@ -256,12 +279,14 @@ class Exposures:
         if self.matrices is None:
             return {}
         own = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
+        own["told_last"] = torch.tensor(self.told_last)
         return own if self.grids is None else own | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: there are no exposures."""
-        self.matrices = self.grids = None
+        self.matrices, self.grids, self.told_last = None, None, 0
         if tensors:
+            self.told_last = int(tensors.get("told_last", 0))  # not in checkpoints of earlier versions
             grids = tensors.get("grids")
             self.begin(tensors["matrices"].clone(), None if grids is None else grids.clone())
             self.moments, self.visits = tensors["moments"].to(self.device).clone(), tensors["visits"].clone()

@@ -298,7 +298,7 @@ def settled_after(run: Run) -> int:
     the resolution that it renders at, of its backbone."""
     own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
     steps = [
-        run.exposures.first,
+        *run.exposures.steps(),
         *run.poses.steps(),
         *run.blur.steps(),
         *run.distractors.steps(),

@@ -63,14 +63,17 @@ def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def judged_exposures(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """At which step exposures were judged, their spread, of how many photographs they were learnt, and seconds; where
-    light within photographs was asked for, the spread of that, and of how many grids were."""
-    for line in lines:
-        if "exposure_spread" in line:
-            told = {"spread": "exposure_spread", "learnt": "exposures", "seconds": "exposure_seconds"}
-            within = {"within": "light_spread", "grids": "grids"} if "light_spread" in line else {}
-            return {"step": line["step"]} | {name: line[key] for name, key in (told | within).items()}
-    return {}
+    """At which step exposures were judged, their spread, of how many photographs they were learnt, by how much they
+    were off each time they were told again, and seconds of it all; where light within photographs was asked for, the
+    spread of that, and of how many grids were."""
+    told = [line for line in lines if "exposure_seconds" in line]
+    if not told:
+        return {}
+    first = told[0]
+    found = {"step": first["step"], "spread": first.get("exposure_spread"), "learnt": first["exposures"]}
+    found["motions"] = [line["exposure_motion"] for line in told if "exposure_motion" in line]
+    found["seconds"] = sum(line["exposure_seconds"] for line in told)
+    return found | ({"within": first["light_spread"], "grids": first["grids"]} if "light_spread" in first else {})
 
 
 def judged_poses(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -156,8 +159,9 @@ def exposure_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     """Exposures that were learnt: the model has none of theirs."""
     found = evaluation.get("exposures") or {}
     if found.get("learnt"):
+        spread = "differ" if found["spread"] is None else f"are spread by {found['spread']:.1%}"
         yield (
-            f"exposures of photographs are spread by {found['spread']:.1%}, each has its own from step "
+            f"exposures of photographs {spread}, each has its own from step "
             f"{found['step']:,} on: the model has that of the mean photograph; eval.colours=fitted looks past that"
         )
     if found.get("grids"):
