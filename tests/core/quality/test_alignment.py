@@ -45,7 +45,8 @@ def elsewhere(turn: tuple[float, float, float], move: tuple[float, float, float]
 def found_for(taken: Camera, counted: Tensor | None = None, gain: float = 1.0) -> Camera:
     """Where a photograph taken there is found to be taken, from a render at the origin."""
     image, depth = picture(AT_ORIGIN)
-    return aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), gain * picture(taken)[0] + 1 - gain, counted)
+    photograph = gain * picture(taken)[0] + 1 - gain
+    return aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, counted, wrong=3.0)
 
 
 def off(one: Camera, other: Camera) -> tuple[float, float]:
@@ -78,6 +79,38 @@ def test_turns_and_moves_are_found_together_whatever_the_exposure(turn, move) ->
     assert beside(found, taken) < 0.05
     assert angle < 0.3
     assert distance < 0.01
+
+
+def small(camera: Camera) -> Camera:
+    """At a quarter of the size."""
+    return camera.resize(WIDTH // 4, HEIGHT // 4)
+
+
+@pytest.mark.parametrize(("turn", "wrong"), [((14.0, -8.0, 0.0), 3.0), ((6.0, 8.0, 4.0), 2.0), ((1.6, -0.8, 0.0), 0.5)])
+def test_small_pictures_are_not_held_back_from_where_they_were_taken(turn, wrong) -> None:
+    """60 x 45 px. What a pose that is far off leaves says nothing of what the prior is worth: it would stay there."""
+    taken = small(elsewhere(turn, (0.0, 0.0, 0.0)))
+    image, depth = picture(small(AT_ORIGIN))
+    photograph = picture(taken)[0]
+    found = aligned(small(AT_ORIGIN), image, depth, torch.ones_like(depth), photograph, None, wrong=wrong)
+    assert beside(found.resize(WIDTH, HEIGHT), taken.resize(WIDTH, HEIGHT)) / 4 < 0.06
+
+
+def test_a_few_pixels_that_are_not_plain_tell_where_it_was_taken() -> None:
+    """A tenth of a wall is painted, and shown with some noise: not what the plain rest leaves, nothing, is usual."""
+
+    def painted(camera: Camera, noise: float = 0.0) -> tuple[Tensor, Tensor]:
+        image, depth = picture(camera)
+        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+        across, down = camera.project(torch.tensor([[0.0, 0.0, 4.0]]))[0][0]
+        cover = (1 - (x - across).hypot(y - down) / 46).clamp(0, 1)
+        grain = noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+        return 0.5 + (image - 0.5) * cover + grain * (cover > 0), depth
+
+    taken, (image, depth) = elsewhere((4.0, -2.0, 0.0), (0.0, 0.0, 0.0)), painted(AT_ORIGIN, 0.02)
+    found = aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), painted(taken)[0], None, wrong=3.0)
+    point = torch.tensor([[0.0, 0.0, 4.0]])
+    assert (found.project(point)[0] - taken.project(point)[0]).norm() < 0.3
 
 
 def test_what_stands_in_the_way_hardly_counts_and_what_is_masked_does_not_at_all() -> None:

@@ -114,7 +114,7 @@ def test_they_are_told_again_from_what_a_better_model_shows() -> None:
 
 
 def test_what_is_learnt_stays_where_nothing_more_is_told() -> None:
-    names, truth = ["a", "b"], torch.eye(3, 4).repeat(2, 1, 1)
+    truth = torch.eye(3, 4).repeat(2, 1, 1)
     truth[0, 0, 1], truth[1, 0, 1] = 0.05, -0.05  # no gain: a channel that takes from another
     image, found = 0.2 + 0.3 * noise(3, 16, 24), Exposures(options(), ["a", "b"], 1000, CPU)
     found.begin(truth.clone())

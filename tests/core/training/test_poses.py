@@ -182,9 +182,12 @@ def test_views_are_the_same_until_poses_change() -> None:
     assert poses.views(views) is made
     moves = [in_px(a, b.camera, DEPTH).square().sum() for a, b in zip(given, made, strict=True)]
     assert motion == pytest.approx(float(torch.stack(moves).mean().sqrt()), rel=1e-5)
+    poses.spread = 0.8
     kept = poses.tensors()
     again = Poses(PoseOptions(), given, 10)
+    assert again.wrong() == again.options.spread
     again.restore(kept)
+    assert again.wrong() == 0.8
     assert torch.equal(again.views(views)[3].camera.rotation, made[3].camera.rotation)
     assert again.corrected == 5
     poses.restore({})
