@@ -37,8 +37,9 @@ from gsx.experiments.evaluation.remarks import gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
-ALIGNED = 2
-"""How often a pose is moved to where its photograph was taken, each time by a new render."""
+ALIGNED, NEAR = 2, 0.5
+"""How often a pose is moved to where its photograph was taken, each time by a new render; px that it is held to where
+it was given by (standard deviation), since half a small picture says little of the other half."""
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
 
@@ -112,7 +113,9 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
     if options.colours == "fitted":
         protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
     if options.poses == "aligned":
-        protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
+        protocol |= {
+            "poses": "aligned to the model by the left half, near the given pose; all figures of the right half"
+        }
     text = json.dumps(protocol, sort_keys=True, default=str)
     # which zooms were looked at changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
@@ -189,7 +192,8 @@ def aligned_to(run: Run, view: View) -> Camera:
     for _ in range(ALIGNED):
         shown = render(run, camera, supersample=1, depth=True)
         assert shown.depth is not None
-        camera = aligned(camera, shown.image, shown.depth, shown.alpha, view.image(), left, given=view.camera)
+        pictures = shown.image, shown.depth, shown.alpha, view.image(), left
+        camera = aligned(camera, *pictures, given=view.camera, wrong=NEAR)
     return camera
 
 
