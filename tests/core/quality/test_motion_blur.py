@@ -60,6 +60,22 @@ def test_none_is_found_where_the_photograph_is_as_sharp_or_sharper() -> None:
         assert (found.length, found.explained) == (0, 0)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_moved_in_a_half_of_the_picture_was_not_the_camera(turned: bool) -> None:
+    """Somebody ran past; or the model, there, is blurred along a line."""
+    sharp, moved = picture(), motion_blurred(picture(), 6.0, 0.0)
+    photograph = torch.cat([sharp[..., :80] + noise(0.03)[..., :80], moved[..., 80:]], 2)
+    pair = (sharp, photograph) if not turned else (sharp.mT, photograph.mT)
+    assert movement_between(*pair).explained == 0
+    assert movement_between(sharp, moved).explained > 0.9
+    # a half of which little counts does not judge the other
+    counted = torch.ones(120, 160, dtype=torch.bool)
+    counted[:, :70] = False
+    found = movement_between(sharp, photograph, counted)
+    assert abs(found.across) == pytest.approx(6, abs=0.5)
+    assert found.explained > 0.5
+
+
 def octaves() -> Tensor:
     """Detail of all sizes, in [0, 1]: no noise, so that edges of masks weigh."""
     generator, out = torch.Generator().manual_seed(0), torch.zeros(3, 120, 160)

@@ -31,8 +31,9 @@ EDGE = 6
 MARGIN, ROUNDS = 8, 2
 """Px around what does not count that say nothing at first; how often it is filled in after that, by the sharp picture
 after the movement that was found so far."""
-SMALLEST = 32
-"""Px of a side; smaller pictures have too few frequencies to tell anything by."""
+SMALLEST, FEW = 32, 0.25
+"""Px of a side; smaller pictures have too few frequencies to tell anything by. A half of a picture of which less than
+that share counts says nothing of the whole."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class Movement:
     down: float
     """Px; both with the other sign are the same movement."""
     explained: float
-    """Share of the squared difference between photograph and sharp picture at its best gains that is gone after it; 0
-    where none is."""
+    """Share of the squared difference between photograph and sharp picture at its best gains that is gone after it, in
+    the half of the picture where it is least: a camera moves all of it. 0 where none is."""
 
     @property
     def length(self) -> float:
@@ -82,16 +83,21 @@ def movement_between(
     its gains by the size of the frequency are free. None where pictures are small."""
     if min(sharp.shape[1:]) < SMALLEST:
         return Movement(0.0, 0.0, explained=0.0)
-    shown, taken = sharp.mean(0), photograph.mean(0)
-    telling = spectra_of(shown, taken, None if counted is None else well_within(counted))
+    shown, taken, weight = sharp.mean(0), photograph.mean(0), None if counted is None else well_within(counted)
+    telling = spectra_of(shown, taken, weight)
     found = descended(nearest([(0.0, 0.0), *fan()], telling), telling)
     if counted is not None:
         for _ in range(ROUNDS):
             filled = torch.where(counted, taken, motion_blurred(shown[None], *found)[0])
             found = descended(found, spectra_of(shown, filled, None))
-    still = error_after((0.0, 0.0), telling)
-    explained = 1 - error_after(found, telling) / still if still > 0 else 0.0
+    explained = min(explained_by(found, part) for part in spectra_of_parts(shown, taken, weight) or [telling])
     return Movement(*found, explained=max(0.0, explained))
+
+
+def explained_by(movement: tuple[float, float], spectra: Spectra) -> float:
+    """Share of the squared difference that is gone after a movement, px; negative where there is more."""
+    still = error_after((0.0, 0.0), spectra)
+    return 1 - error_after(movement, spectra) / still if still > 0 else 0.0
 
 
 # -- spectra -----------------------------------------------------------------------------------------------------------
@@ -116,6 +122,19 @@ def spectra_of(
         shared=times * (p * r.conj()).real,
         photograph=float((times * (p * p.conj()).real).sum()),
     )
+
+
+def spectra_of_parts(
+    sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], weight: Float[Tensor, "H W"] | None
+) -> list[Spectra]:
+    """Of the halves of two pictures along their longer sides; not of small ones, nor where little of one counts."""
+    axis = int(sharp.shape[1] >= sharp.shape[0])
+    weights = [None, None] if weight is None else list(weight.tensor_split(2, axis))
+    little = any(float(part.mean()) < FEW for part in weights if part is not None)
+    if little or sharp.shape[axis] < 2 * SMALLEST:
+        return []
+    halves = zip(sharp.tensor_split(2, axis), photograph.tensor_split(2, axis), weights, strict=True)
+    return [spectra_of(shown, taken, part) for shown, taken, part in halves]
 
 
 def well_within(counted: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:
