@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 
 TESTS = Path(__file__).parents[2]
+EXPOSURES = tuple(f"training.exposure.{word}" for word in ("when=always", "start=0.01", "until=0.02", "times=2"))
+"""Told before the second and the third of four steps."""
 MOST = {
     ("backbone=gs3d",): (5, 230),
-    ("backbone=gs3d", "training.exposure.when=always", "training.exposure.start=0.01"): (5, 270),
+    ("backbone=gs3d", *EXPOSURES): (5, 270),
     ("backbone=octree_scaffold",): (9, 415),
 }
 """Waits and launches of a step: sizes of four lists and the guard, with anchors four more."""

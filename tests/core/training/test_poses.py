@@ -18,6 +18,7 @@ from gsx.core.data.taken import Taken, posed
 from gsx.core.errors import Stopped
 from gsx.core.quality.alignment import Motion, moved, rotation_by
 from gsx.core.training import trainer
+from gsx.core.training.captures import judge_photographs
 from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.poses import PoseOptions, Poses, in_moved_world, in_px, spread_of_shifts, without_common
 from gsx.core.training.run import Run, Step
@@ -185,9 +186,11 @@ def test_views_are_the_same_until_poses_change() -> None:
     poses.spread = 0.8
     kept = poses.tensors()
     again = Poses(PoseOptions(), given, 10)
-    assert again.wrong() == again.options.spread
+    assert again.wrong() == 2.0
     again.restore(kept)
     assert again.wrong() == 0.8
+    again.spread = 0.01  # always: taken for right, and corrected
+    assert again.wrong() == again.options.spread
     assert torch.equal(again.views(views)[3].camera.rotation, made[3].camera.rotation)
     assert again.corrected == 5
     poses.restore({})
@@ -240,6 +243,10 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     assert a.keys() == b.keys()
     assert "poses.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
+    longer, _ = open_run(tmp_path / "stopped", plugins(), ["iterations=300"], training=True)
+    longer.step = longer.poses.steps()[0] - 1
+    assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
+    assert longer.poses.spread == whole.poses.spread
 
 
 def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(

@@ -96,7 +96,8 @@ class Shown:
     given: Motion = STILL
     """From the pose that the prior holds to that of the camera."""
     wrong: float = 1.0
-    """Px of this picture by which the prior has poses wrong (standard deviation)."""
+    """Px of this picture by which the prior has poses wrong (standard deviation): so many of smaller ones as well, in
+    which the search only begins."""
 
     def points(self) -> Float[Tensor, "3 P"]:
         """What pixels inside show, in the camera's frame."""
@@ -112,7 +113,6 @@ class Shown:
         )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
         counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
-        # held as loosely by its own px: it is only where the search in larger pictures begins
         return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted)
 
     @cached_property

@@ -9,7 +9,7 @@ line, and photographs that are not, look as if these were moved across it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,9 +31,11 @@ EDGE = 6
 MARGIN, ROUNDS = 8, 2
 """Px around what does not count that say nothing at first; how often it is filled in after that, by the sharp picture
 after the movement that was found so far."""
-SMALLEST, FEW = 32, 0.25
-"""Px of a side; smaller pictures have too few frequencies to tell anything by. A half of a picture of which less than
-that share counts says nothing of the whole."""
+SMALLEST = 32
+"""Px of a side; smaller pictures have too few frequencies to tell anything by."""
+SEEN = 0.1
+"""Of how much a movement shows in a picture, the share that it has to show in a half of it, for that to say whether it
+took place: it hardly shows on a plain wall, in the sky, or where little counts."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,24 @@ def movement_between(
         for _ in range(ROUNDS):
             filled = torch.where(counted, taken, motion_blurred(shown[None], *found)[0])
             found = descended(found, spectra_of(shown, filled, None))
-    explained = min(explained_by(found, part) for part in spectra_of_parts(shown, taken, weight) or [telling])
-    return Movement(*found, explained=max(0.0, explained))
+    parts = [telling] if max(shown.shape) < 2 * SMALLEST else spectra_of_halves(shown, taken, weight)
+    return Movement(*found, explained=explained_throughout(found, parts))
+
+
+def explained_throughout(movement: tuple[float, float], parts: Sequence[Spectra]) -> float:
+    """Share of the squared difference that is gone after a movement, px, in that of the parts of a picture where it is
+    least, of those that it could be seen in; 0 where there is no less."""
+    shown = [shown_by(movement, part) for part in parts]
+    shares = [explained_by(movement, p) for p, share in zip(parts, shown, strict=True) if share > SEEN * sum(shown)]
+    return max(0.0, min(shares, default=0.0))
+
+
+def shown_by(movement: tuple[float, float], spectra: Spectra) -> float:
+    """By how much a movement, px, shows: squared difference between the sharp picture after it and that at its best
+    gains."""
+    left = left_by(movement, spectra)
+    photograph = float((spectra.sharp * left.square()).sum())
+    return error_after((0.0, 0.0), replace(spectra, shared=spectra.sharp * left, photograph=photograph))
 
 
 def explained_by(movement: tuple[float, float], spectra: Spectra) -> float:
@@ -124,15 +142,12 @@ def spectra_of(
     )
 
 
-def spectra_of_parts(
+def spectra_of_halves(
     sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], weight: Float[Tensor, "H W"] | None
 ) -> list[Spectra]:
-    """Of the halves of two pictures along their longer sides; not of small ones, nor where little of one counts."""
+    """Of the halves of two pictures along their longer sides."""
     axis = int(sharp.shape[1] >= sharp.shape[0])
     weights = [None, None] if weight is None else list(weight.tensor_split(2, axis))
-    little = any(float(part.mean()) < FEW for part in weights if part is not None)
-    if little or sharp.shape[axis] < 2 * SMALLEST:
-        return []
     halves = zip(sharp.tensor_split(2, axis), photograph.tensor_split(2, axis), weights, strict=True)
     return [spectra_of(shown, taken, part) for shown, taken, part in halves]
 

@@ -39,8 +39,8 @@ class BlurOptions:
     length: Annotated[float, Range(0, 100)] = 1.0
     """Px; shorter movements blur nothing."""
     explained: Share = 0.01
-    """Share of the squared difference from the model, at its best gains, that a movement has to explain in either half
-    of a photograph."""
+    """Share of the squared difference from the model, at its best gains, that a movement has to explain in each half
+    of a photograph that shows it."""
 
     def __post_init__(self) -> None:
         refuse_wrong("blur", self)

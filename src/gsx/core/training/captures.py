@@ -17,7 +17,7 @@ from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.distractors import share_of
 from gsx.core.training.evidence import looked_at, shown_weights
-from gsx.core.training.exposure import Pair, log_gains
+from gsx.core.training.exposure import LIGHT, Pair, log_gains
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.poses import spread_of_shifts
 from gsx.core.training.render import render
@@ -27,8 +27,8 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 SMALLER = 2
-"""By how much smaller pictures are than photographs that poses and distractors are told from: in a third of the time
-as well."""
+"""By how much smaller pictures are than photographs that exposures, poses and distractors are told from: in a third of
+the time as well."""
 BLUR_PIXELS = 1 << 18
 """Of pictures that movements are estimated from."""
 
@@ -50,15 +50,22 @@ def judge_exposures(run: Run) -> dict[str, float]:
     def look(index: int) -> Pair:
         run.refuse_if_stopping()
         view = views[index]
-        shown = run.as_photographed(render(run, view.camera, supersample=1).image, view)
-        return shown.detach(), view.image(), view.counted()
+        image = render(run, view.camera, supersample=1).image
+        shown = run.as_photographed(image, view).detach().cpu()
+        return shown, view.image(), unsaturated(image, view.counted())
 
-    if number == exposures.first:
+    if exposures.matrices is None:
         found = told_of_light(run, *exposures.judge(look, number))
     else:
         found = {"exposures": len(views), "exposure_motion": exposures.tell(look, number)}
         logger.info("step %d: exposures are told again: %.1f %% off", number, 100 * found["exposure_motion"])
     return found | {"exposure_seconds": round(time.perf_counter() - begun, 3)}
+
+
+def unsaturated(image: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
+    """Pixels that count of a render at the model's own exposure, which is cut off where it is light."""
+    below = (image < LIGHT).all(0)
+    return below if counted is None else below & counted
 
 
 def told_of_light(run: Run, spread: float, within: float) -> dict[str, float]:
@@ -83,7 +90,7 @@ def judge_poses(run: Run) -> dict[str, float]:
     """Whether poses of training photographs are wrong, where that is asked first, and correct them if so; for the line
     of the step."""
     begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
-    if run.step + 1 == poses.first:
+    if poses.matrices is None:
         told["pose_spread"] = poses.spread = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
         needed, verdict = poses.needed(poses.spread), "poses are corrected from here on"
         verdict = verdict if needed else "poses are taken for right"

@@ -4,9 +4,9 @@ A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers
 (3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
 photographs and renders say instead of at the identity, and are set right by these a few times, since renders say little
 at first; their mean stays the identity, so that the model has the exposure of the mean photograph; and Adam keeps the
-steps of each photograph apart. One Adam over all of them, as
-published, goes on moving a photograph while others are shown: by several rates a visit, where one is meant. Behind A
-comes a bilateral grid, where light is found to differ within photographs (`core.training.bilateral_grid`).
+steps of each photograph apart. One Adam over all of them, as published, goes on moving a photograph while others are
+shown: by several rates a visit, where one is meant. Behind A comes a bilateral grid, where light is found to differ
+within photographs (`core.training.bilateral_grid`).
 """
 
 import math
@@ -40,7 +40,7 @@ class ExposureOptions:
     """auto: where photographs differ."""
     start: Share = 0.2
     """Share of the steps after which it is judged, and exposures are told first."""
-    until: Share = 0.75
+    until: Share = 0.7
     """Share of the steps after which they are told last."""
     times: Annotated[int, Range(1, 1000)] = 5
     """How often they are, at shares that grow by the same factor; between that they are learnt."""
@@ -140,6 +140,12 @@ def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> fl
     return math.sqrt(max(0.0, float(covariance.mean())))
 
 
+def relative_gains(found: Sequence[Light]) -> Float[Tensor, "N 3"]:
+    """Log gains of photographs beside their mean, which is the model's; 0 where nothing is told."""
+    gains = torch.stack([one.gains[0] for one in found])
+    return (gains - gains.nanmean(0)).nan_to_num(0.0)
+
+
 # -- what is learnt ----------------------------------------------------------------------------------------------------
 
 
@@ -170,11 +176,6 @@ class Exposures:
         where nobody asks."""
         return occasions(self.options, self.iterations)
 
-    @property
-    def first(self) -> int:
-        """The step before which photographs are judged."""
-        return self.steps()[0]
-
     def due(self, number: int) -> bool:
         """Whether photographs are judged, or exposures told, before this step."""
         return due_at(number, self.steps(), self.told_last, self.matrices is not None)
@@ -195,12 +196,11 @@ class Exposures:
         return spread, within
 
     def tell(self, look: Callable[[int], Pair], number: int) -> float:
-        """Set right before a step what is learnt; returns by how much log gains of photographs change (root of the mean
-        square). look: as above, renders at the exposures of their photographs."""
+        """Set right before a step what is learnt; returns by how much that was off: log gains of photographs at their
+        exposures (root of the mean square). look: as above, renders at the exposures of their photographs."""
         found = [self.told(look(index)) for index in range(len(self.names))]
         self.correct(found, self.grids is not None, number)
-        gains = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0)
-        return float((gains - gains.mean(0)).square().mean().sqrt())
+        return float(relative_gains(found).square().mean().sqrt())
 
     def told(self, pair: Pair) -> Light:
         """Of a photograph's light."""
@@ -208,13 +208,13 @@ class Exposures:
 
     @torch.no_grad()
     def correct(self, found: Sequence[Light], with_grids: bool, number: int) -> None:
-        """Learn on from what there is, made brighter by what was found of each photograph before a step."""
-        gains = torch.stack([one.gains[0] for one in found]).nan_to_num(0.0).exp()
+        """Learn on from what there is, with the gains and slopes that were found of each photograph before a step."""
+        gains = relative_gains(found).exp()
         now = torch.eye(3, 4).expand(len(found), -1, -1) if self.matrices is None else self.matrices.cpu()
         slopes = [one.slopes[0] for one in found if with_grids and one.slopes is not None]
         grids = first_matrices(torch.stack(slopes)) if slopes else None
-        if grids is not None and self.grids is not None:
-            grids += self.grids.cpu()
+        if self.grids is not None:
+            grids = self.grids.cpu() if grids is None else grids + self.grids.cpu()
         self.begin(centred_on_identity(gains[:, :, None] * now), grids)
         self.told_last = number
 

@@ -28,7 +28,7 @@ from gsx.core.training.exposure import shared_spread
 from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
 LEAST_WRONG, USUALLY_WRONG = 0.01, 2.0
-"""Px by which poses are at least taken to be wrong, whatever the options; in checkpoints of earlier versions."""
+"""Px by which poses are taken to be wrong, at least, whatever the options; and where nothing is told of that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +74,6 @@ class Poses:
         nobody asks."""
         return occasions(self.options, self.iterations)
 
-    @property
-    def first(self) -> int:
-        """The step before which they are judged."""
-        return self.steps()[0]
-
     def due(self, number: int) -> bool:
         """Whether they are judged or corrected before this step."""
         return due_at(number, self.steps(), self.corrected, self.matrices is not None)
@@ -92,8 +87,9 @@ class Poses:
         return self.options.when == "always" or spread > self.options.spread
 
     def wrong(self) -> float:
-        """Px by which poses of the scene are taken to be wrong where they are corrected (standard deviation)."""
-        return max(self.spread, self.options.spread, LEAST_WRONG)
+        """Px by which poses of the scene are taken to be wrong where they are corrected (standard deviation): as they
+        were found to be, or USUALLY_WRONG."""
+        return max(self.spread, self.options.spread, LEAST_WRONG) if self.spread else USUALLY_WRONG
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -131,7 +127,7 @@ class Poses:
         """Go on from a checkpoint's tensors; none: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.spread = float(tensors.get("spread", USUALLY_WRONG)) if tensors else 0.0
+        self.spread = float(tensors.get("spread", 0.0)) if tensors else 0.0  # earlier versions kept none
 
 
 # -- are they wrong? ---------------------------------------------------------------------------------------------------
