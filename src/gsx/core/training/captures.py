@@ -91,8 +91,8 @@ def judge_poses(run: Run) -> dict[str, float]:
     of the step."""
     begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
     if poses.matrices is None:
-        told["pose_spread"] = poses.spread = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
-        needed, verdict = poses.needed(poses.spread), "poses are corrected from here on"
+        told["pose_spread"] = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
+        needed, verdict = poses.needed(told["pose_spread"]), "poses are corrected from here on"
         verdict = verdict if needed else "poses are taken for right"
         logger.info("step %d: photographs lie %.2f px beside: %s", run.step + 1, told["pose_spread"], verdict)
         if not needed:
@@ -119,8 +119,7 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        wrong = run.poses.wrong() * small.camera.focal / view.camera.focal
-        after.append(aligned(small.camera, *pictures, given=given, wrong=wrong))
+        after.append(aligned(small.camera, *pictures, given=given))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]
     depth = median(known) if known else run.scene.extent

@@ -27,9 +27,6 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.exposure import shared_spread
 from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
-LEAST_WRONG, USUALLY_WRONG = 0.01, 2.0
-"""Px by which poses are taken to be wrong, at least, whatever the options; and where nothing is told of that."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions:
@@ -64,8 +61,6 @@ class Poses:
     """camera_from_world, rotation and translation; None: those of the scene."""
     corrected: int = 0
     """The last step before which they were: not again where that step is taken anew."""
-    spread: float = 0.0
-    """Px by which photographs lay beside what the model showed when that was judged."""
     seen: MadeOf = field(default_factory=MadeOf)
     """Views that were asked for, and what they are by the poses of the moment."""
 
@@ -85,11 +80,6 @@ class Poses:
     def needed(self, spread: float) -> bool:
         """Whether a spread of shifts, px, asks for corrections."""
         return self.options.when == "always" or spread > self.options.spread
-
-    def wrong(self) -> float:
-        """Px by which poses of the scene are taken to be wrong where they are corrected (standard deviation): as they
-        were found to be, or USUALLY_WRONG."""
-        return max(self.spread, self.options.spread, LEAST_WRONG) if self.spread else USUALLY_WRONG
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -118,16 +108,12 @@ class Poses:
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint holds of them; nothing where they are the scene's."""
-        if self.matrices is None:
-            return {}
-        told = {"corrected": torch.tensor(self.corrected), "spread": torch.tensor(self.spread, dtype=torch.float64)}
-        return {"matrices": self.matrices} | told
+        return {} if self.matrices is None else {"matrices": self.matrices, "corrected": torch.tensor(self.corrected)}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.spread = float(tensors.get("spread", 0.0)) if tensors else 0.0  # earlier versions kept none
 
 
 # -- are they wrong? ---------------------------------------------------------------------------------------------------
