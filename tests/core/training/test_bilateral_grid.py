@@ -92,30 +92,13 @@ def test_grids_begin_where_light_differs_less_what_all_have_in_common() -> None:
     across = torch.tensor(slopes).var() * torch.tensor([0.25, 1, 1])  # red half as much; none of them down
     assert inside == pytest.approx(math.sqrt(float(across.sum()) / 6), rel=0.05)
     assert found.grids is not None
+    assert not any(found.due(number) for number in range(1, 1001)), "grids are learnt on, and not told again"
+    found.iterations = 6000
+    assert not found.due(1201), "nor judged anew where the run goes on longer"
     torch.testing.assert_close(found.grids.detach().mean(0), torch.zeros(RANK, 3, 4), atol=1e-6, rtol=0)
     for name, slope in zip("abcd", slopes, strict=True):
         wanted = shaded(image, slope - 0.05, 0)
         assert (found.applied(image, name).detach() - wanted).abs().mean() < 0.2 * (image - wanted).abs().mean()
-
-
-def test_slopes_are_told_again_from_what_grids_leave() -> None:
-    slopes = [0.3, -0.1, 0.0, -0.2]
-    image, pairs = pairs_of(slopes)
-    found = Exposures(options(grid="always"), list("abcd"), 1000, CPU)
-    found.judge(pairs_of([slope / 2 for slope in slopes])[1].__getitem__, 201)
-
-    def off() -> float:
-        """Of all pictures."""
-        pictures = zip("abcd", pairs, strict=True)
-        return float(
-            sum((found.applied(image, name).detach() - other).abs().mean() for name, (_, other, _) in pictures)
-        )
-
-    before = off()
-    found.tell(lambda index: (found.applied(image, "abcd"[index]).detach(), pairs[index][1], None), 275)
-    assert off() < 0.3 * before
-    assert found.grids is not None
-    torch.testing.assert_close(found.grids.detach().mean(0), torch.zeros(RANK, 3, 4), atol=1e-6, rtol=0)
 
 
 def test_a_photograph_of_which_nothing_is_told_begins_with_the_mean_light() -> None:

@@ -26,7 +26,7 @@ ROUNDS, ENOUGH = 10, 0.02
 COVERED = 0.5
 """Alpha of a pixel that has a depth."""
 HELD = 0.05
-"""Share of the pixels that say as much as the prior does, where that has a pose wrong by 1 px (standard deviation) of
+"""Share of the pixels that say as much as the prior does, which has a pose wrong by 1 px (standard deviation) of
 the picture at hand. Neighbours differ by the same errors of the model, which tell nothing: of all pixels a small part
 counts."""
 

@@ -177,8 +177,8 @@ class Exposures:
         return occasions(self.options, self.iterations)
 
     def due(self, number: int) -> bool:
-        """Whether photographs are judged, or exposures told, before this step."""
-        return due_at(number, self.steps(), self.told_last, self.matrices is not None)
+        """Whether photographs are judged, or exposures told, before this step; grids know more than gains tell."""
+        return self.grids is None and due_at(number, self.steps(), self.told_last, self.matrices is not None)
 
     def judge(self, look: Callable[[int], Pair], number: int) -> tuple[float, float]:
         """Judge by some photographs before a step, and begin with the gains of all, if these are spread enough, or have
@@ -198,8 +198,8 @@ class Exposures:
     def tell(self, look: Callable[[int], Pair], number: int) -> float:
         """Set right before a step what is learnt; returns by how much that was off: log gains of photographs at their
         exposures (root of the mean square). look: as above, renders at the exposures of their photographs."""
-        found = [self.told(look(index)) for index in range(len(self.names))]
-        self.correct(found, self.grids is not None, number)
+        found = [light_of(look(index), slopes=False) for index in range(len(self.names))]
+        self.correct(found, with_grids=False, number=number)
         return float(relative_gains(found).square().mean().sqrt())
 
     def told(self, pair: Pair) -> Light:
@@ -212,10 +212,9 @@ class Exposures:
         gains = relative_gains(found).exp()
         now = torch.eye(3, 4).expand(len(found), -1, -1) if self.matrices is None else self.matrices.cpu()
         slopes = [one.slopes[0] for one in found if with_grids and one.slopes is not None]
-        grids = first_matrices(torch.stack(slopes)) if slopes else None
-        if self.grids is not None:
-            grids = self.grids.cpu() if grids is None else grids + self.grids.cpu()
-        self.begin(centred_on_identity(gains[:, :, None] * now), grids)
+        self.begin(
+            centred_on_identity(gains[:, :, None] * now), first_matrices(torch.stack(slopes)) if slopes else None
+        )
         self.told_last = number
 
     def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
