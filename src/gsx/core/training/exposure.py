@@ -43,7 +43,7 @@ class ExposureOptions:
     until: Share = 0.7
     """Share of the steps after which they are told last."""
     times: Annotated[int, Range(1, 1000)] = 5
-    """How often they are, at shares that grow by the same factor; between that they are learnt."""
+    """How often they are, at shares that grow by the same factor; once where there are grids."""
     spread: Annotated[float, Range(0, 1)] = 0.06
     """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own; as they have
     where they have grids."""
