@@ -25,10 +25,10 @@ ROUNDS, ENOUGH = 10, 0.02
 """Of the search at each size; px, of the last of them."""
 COVERED = 0.5
 """Alpha of a pixel that has a depth."""
-HELD = 0.05
-"""Share of the pixels that say as much as the prior does, which has a pose wrong by 1 px (standard deviation) of
-the picture at hand. Neighbours differ by the same errors of the model, which tell nothing: of all pixels a small part
-counts."""
+HELD, HELD_SHARE = 1000, 0.2
+"""Pixels that say as much as the prior does, which has a pose wrong by 1 px (standard deviation) of the picture at
+hand; of small pictures that share of them. Neighbours differ by the same errors of the model, which tell nothing: of
+all pixels a small part counts."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -242,7 +242,7 @@ def held_least_squares(
     hold = wanted.new_full((8,), 1e-9 * len(wanted))  # what is plain has no slopes, and no gain beside its offset
     left = wanted - solved(system, right, hold) @ columns
     variance = float((weights * left.square()).sum() / weights.sum())
-    hold[:6] += variance * HELD * len(wanted) / wrong**2
+    hold[:6] += variance * min(HELD, HELD_SHARE * len(wanted)) / wrong**2
     right[:6] -= hold[:6] * off
     return solved(system, right, hold)
 
