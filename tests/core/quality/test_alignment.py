@@ -96,23 +96,6 @@ def test_small_pictures_are_not_held_back_from_where_they_were_taken(turn, wrong
     assert beside(found.resize(WIDTH, HEIGHT), taken.resize(WIDTH, HEIGHT)) / 4 < 0.06
 
 
-def test_a_few_pixels_that_are_not_plain_tell_where_it_was_taken() -> None:
-    """A tenth of a wall is painted, and shown with some noise: not what the plain rest leaves, nothing, is usual."""
-
-    def painted(camera: Camera, noise: float = 0.0) -> tuple[Tensor, Tensor]:
-        image, depth = picture(camera)
-        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-        across, down = camera.project(torch.tensor([[0.0, 0.0, 4.0]]))[0][0]
-        cover = (1 - (x - across).hypot(y - down) / 46).clamp(0, 1)
-        grain = noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
-        return 0.5 + (image - 0.5) * cover + grain * (cover > 0), depth
-
-    taken, (image, depth) = elsewhere((4.0, -2.0, 0.0), (0.0, 0.0, 0.0)), painted(AT_ORIGIN, 0.02)
-    found = aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), painted(taken)[0], None, wrong=3.0)
-    point = torch.tensor([[0.0, 0.0, 4.0]])
-    assert (found.project(point)[0] - taken.project(point)[0]).norm() < 0.3
-
-
 def test_what_stands_in_the_way_hardly_counts_and_what_is_masked_does_not_at_all() -> None:
     taken, counted = elsewhere((1.0, -1.5, 0.0), (0.03, 0.0, 0.0)), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     image, depth = picture(AT_ORIGIN)

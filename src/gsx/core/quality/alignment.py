@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
 from gsx.core.gaussians.turned import cross_matrix
-from gsx.core.quality.shifts import ALIKE, BORDER, LEAST, SMALLEST, by_medians, central, grey, robust, sloped
+from gsx.core.quality.shifts import ALIKE, BORDER, LEAST, SMALLEST, by_medians, central, grey, robust
 from gsx.core.shapes import Bool, Float
 
 ROUNDS, ENOUGH = 10, 0.02
@@ -187,8 +187,7 @@ def refined(shown: Shown, photograph: Float[Tensor, "H W"], motion: Motion) -> M
         columns = torch.cat([-motions, still[None], torch.ones_like(still)[None]])
         residual = by_medians(still, wanted, told) if residual is None else residual
         off = motion.after(shown.given).twist() / unit
-        weights = robust(residual[told], sloped(torch.stack([right, down]))[told])
-        fit = held_least_squares(columns[:, told], wanted[told], weights, off, shown.wrong)
+        fit = held_least_squares(columns[:, told], wanted[told], robust(residual[told]), off, shown.wrong)
         residual = wanted - fit @ columns
         step = fit[:6]
         motion = motion.then(unit[:3] * step[:3], unit[3:] * step[3:])
