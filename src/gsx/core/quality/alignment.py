@@ -25,10 +25,9 @@ ROUNDS, ENOUGH = 10, 0.02
 """Of the search at each size; px, of the last of them."""
 COVERED = 0.5
 """Alpha of a pixel that has a depth."""
-HELD, HELD_SHARE = 1000, 0.2
+HELD = 1000
 """Pixels that say as much as the prior does, which has a pose wrong by 1 px (standard deviation) of the picture at
-hand; of small pictures that share of them. Neighbours differ by the same errors of the model, which tell nothing: of
-all pixels a small part counts."""
+hand. Neighbours differ by the same errors of the model, which tell nothing: of all pixels a small part count."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,9 +94,6 @@ class Shown:
     """Pixels of the photograph that are looked at; None: all."""
     given: Motion = STILL
     """From the pose that the prior holds to that of the camera."""
-    wrong: float = 1.0
-    """Px of this picture by which the prior has poses wrong (standard deviation): so many of smaller ones as well, in
-    which the search only begins."""
 
     def points(self) -> Float[Tensor, "3 P"]:
         """What pixels inside show, in the camera's frame."""
@@ -113,7 +109,7 @@ class Shown:
         )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
         counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
-        return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted)
+        return Shown(camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted, given=self.given)
 
     @cached_property
     def masked(self) -> Float[Tensor, "1 H W"] | None:
@@ -135,19 +131,18 @@ def aligned(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None,
     given: Camera | None = None,
-    wrong: float = 1.0,
 ) -> Camera:
     """The camera where a photograph was taken, from a render near there; as it is where pictures do not tell.
 
     depth: blending-weighted sum of camera z, scene units, as the rasterizer has it. given: whose pose the prior holds;
-    None: that of the camera. wrong: px of the picture by which given poses are (standard deviation).
+    None: that of the camera.
     """
     inside = (alpha > COVERED) & (depth > camera.near * alpha)
     inside = inside if counted is None else inside & counted.to(inside.device)
     z = torch.where(inside, depth.double() / alpha.double().clamp_min(COVERED), 1.0)
     wanted, held = grey(photograph), STILL if given is None else motion_to(given, camera)
     counted = None if counted is None else counted.to(inside.device)
-    shown = Shown(camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=held, wrong=wrong)
+    shown = Shown(camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=held)
     found = motion_between(shown, wanted)
     if found is None or not mismatch(shown, wanted, found) <= mismatch(shown, wanted, STILL) + ALIKE:
         return camera
@@ -187,7 +182,7 @@ def refined(shown: Shown, photograph: Float[Tensor, "H W"], motion: Motion) -> M
         columns = torch.cat([-motions, still[None], torch.ones_like(still)[None]])
         residual = by_medians(still, wanted, told) if residual is None else residual
         off = motion.after(shown.given).twist() / unit
-        fit = held_least_squares(columns[:, told], wanted[told], robust(residual[told]), off, shown.wrong)
+        fit = held_least_squares(columns[:, told], wanted[told], residual[told], off)
         residual = wanted - fit @ columns
         step = fit[:6]
         motion = motion.then(unit[:3] * step[:3], unit[3:] * step[3:])
@@ -228,27 +223,16 @@ def by_motion(
 
 
 def held_least_squares(
-    columns: Float[Tensor, "8 P"],
-    wanted: Float[Tensor, "P"],
-    weights: Float[Tensor, "P"],
-    off: Float[Tensor, "6"],
-    wrong: float,
+    columns: Float[Tensor, "8 P"], wanted: Float[Tensor, "P"], residual: Float[Tensor, "P"], off: Float[Tensor, "6"]
 ) -> Float[Tensor, "8"]:
-    """Factors of columns whose sum comes closest to what is wanted, by weights of pixels. The first six are a step, px,
-    from a pose that is `off` that of the prior, which has it wrong by `wrong` px. The prior says as much beside pixels
-    as what these leave without it is large: what they leave as it is would hold a pose that is far off where it is."""
-    system, right = (columns * weights) @ columns.T, (columns * weights) @ wanted
+    """Factors of columns whose sum comes closest to what is wanted. The first six are a step, px, from a pose that is
+    `off` that of the prior; robust by the residuals of the last round."""
+    weights = robust(residual)
+    variance = float((weights * residual.square()).sum() / weights.sum())
     hold = wanted.new_full((8,), 1e-9 * len(wanted))  # what is plain has no slopes, and no gain beside its offset
-    left = wanted - solved(system, right, hold) @ columns
-    variance = float((weights * left.square()).sum() / weights.sum())
-    hold[:6] += variance * min(HELD, HELD_SHARE * len(wanted)) / wrong**2
+    hold[:6] += variance * HELD
+    system, right = (columns * weights) @ columns.T + torch.diag(hold), (columns * weights) @ wanted
     right[:6] -= hold[:6] * off
-    return solved(system, right, hold)
-
-
-def solved(system: Float[Tensor, "8 8"], right: Float[Tensor, "8"], hold: Float[Tensor, "8"]) -> Float[Tensor, "8"]:
-    """The solution of normal equations, held at nothing so firmly."""
-    system = system + torch.diag(hold)
     scale = system.diagonal().sqrt()
     return torch.linalg.solve(system / scale / scale[:, None], right / scale) / scale
 

@@ -23,7 +23,6 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.alignment import aligned
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
-from gsx.core.quality.shifts import shift_of
 from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.rasterizer.compiled import path_of
@@ -38,9 +37,8 @@ from gsx.experiments.evaluation.remarks import gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
-ALIGNED, NEAR = 2, 0.25
-"""How often a pose is moved to where its photograph was taken, each time by a new render; px by which it is taken to be
-wrong at least: where a picture lies hardly beside its render, half of it says less of the other half than the pose."""
+ALIGNED = 2
+"""How often a pose is moved to where its photograph was taken, each time by a new render."""
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
 
@@ -114,10 +112,7 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
     if options.colours == "fitted":
         protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
     if options.poses == "aligned":
-        protocol |= {
-            "poses": f"aligned to the model by the left half, by a prior of {NEAR:g} px or as it lies beside; all "
-            "figures of the right half"
-        }
+        protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
     text = json.dumps(protocol, sort_keys=True, default=str)
     # which zooms were looked at changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
@@ -188,23 +183,13 @@ def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[T
     return out
 
 
-def beside(image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], left: Bool[Tensor, "H W"]) -> float:
-    """Px by which the left half of a photograph lies beside that of a render, NEAR at least."""
-    whole = slice(left.shape[1] // 2)
-    shift = shift_of(image[..., whole], photograph[..., whole], left[:, whole])
-    return NEAR if shift is None else max(NEAR, math.hypot(*shift))
-
-
 def aligned_to(run: Run, view: View) -> Camera:
     """Where the model says that a view was taken, told from its left half."""
-    left, camera, photograph, wrong = half(view, view.counted(), right=False), view.camera, view.image(), 0.0
+    left, camera = half(view, view.counted(), right=False), view.camera
     for _ in range(ALIGNED):
         shown = render(run, camera, supersample=1, depth=True)
         assert shown.depth is not None
-        wrong = wrong or beside(shown.image, photograph, left)
-        camera = aligned(
-            camera, shown.image, shown.depth, shown.alpha, photograph, left, given=view.camera, wrong=wrong
-        )
+        camera = aligned(camera, shown.image, shown.depth, shown.alpha, view.image(), left, given=view.camera)
     return camera
 
 
