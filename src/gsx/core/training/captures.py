@@ -44,15 +44,13 @@ def judge_photographs(run: Run) -> dict[str, float]:
 def judge_exposures(run: Run) -> dict[str, float]:
     """Whether training photographs have exposures of their own, where that is asked first, and which, from what the
     model shows in their places; for the line of the step."""
-    begun, number, exposures = time.perf_counter(), run.step + 1, run.exposures
-    views = [coarser(view, run.scene.reduction, SMALLER) for view in run.photographed]
+    begun, number, exposures, views = time.perf_counter(), run.step + 1, run.exposures, run.photographed
 
     def look(index: int) -> Pair:
         run.refuse_if_stopping()
-        view = views[index]
-        image = render(run, view.camera, supersample=1).image
-        shown = run.as_photographed(image, view).detach().cpu()
-        return shown, view.image(), unsaturated(image, view.counted())
+        small, shown = seen_smaller(run, views[index], depth=False)
+        image = run.as_photographed(shown.image, small).detach().cpu()
+        return image, small.image(), unsaturated(shown.image, small.counted())
 
     if exposures.matrices is None:
         found = told_of_light(run, *exposures.judge(look, number))
@@ -231,7 +229,7 @@ def gains_between(
     return log_gains(image, photograph, counted).nan_to_num(0.0).exp()
 
 
-def seen_smaller(run: Run, view: View) -> tuple[View, TiledRendering]:
-    """(a view at a smaller size, what the model shows there, with depth)."""
+def seen_smaller(run: Run, view: View, depth: bool = True) -> tuple[View, TiledRendering]:
+    """(a view at a smaller size, what the model shows there, with depth or without)."""
     small = coarser(view, run.scene.reduction, SMALLER)
-    return small, render(run, small.camera, supersample=1, depth=True)
+    return small, render(run, small.camera, supersample=1, depth=depth)
