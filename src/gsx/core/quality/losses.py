@@ -46,11 +46,23 @@ def ssim_map(
 
 
 def blurred(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int, compiled: bool = False
+    image: Float[Tensor, "C H W"],
+    target: Float[Tensor, "C H W"],
+    padding: int,
+    compiled: bool = False,
+    of_target: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
-    """Blurred image, target, image^2, target^2 and image target, each [C h w]."""
-    maps = image, target, image * image, target * target, image * target
-    return tuple(blur(each, padding, compiled) for each in maps)
+    """Blurred image, target, image^2, target^2 and image target, each [C h w]; of_target: what `blurred_target` is."""
+    x, xx, xy = (blur(each, padding, compiled) for each in (image, image * image, image * target))
+    y, yy = blurred_target(target, padding, compiled) if of_target is None else of_target
+    return x, y, xx, yy, xy
+
+
+def blurred_target(
+    target: Float[Tensor, "C H W"], padding: int = PADDING, compiled: bool = False
+) -> tuple[Float[Tensor, "C h w"], Float[Tensor, "C h w"]]:
+    """Blurred target and target^2: what SSIM takes of a target alone."""
+    return blur(target, padding, compiled), blur(target * target, padding, compiled)
 
 
 def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""]:
@@ -60,11 +72,16 @@ def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""
 
 
 def photometric_and_gradient(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float, compiled: bool
+    image: Float[Tensor, "C H W"],
+    target: Float[Tensor, "C H W"],
+    ssim_weight: float,
+    compiled: bool,
+    of_target: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "C H W"]]:
     """The photometric loss and its gradient by the image. The blur is its own adjoint: the window is symmetric and the
     padding zero."""
-    parts, slopes_of = blurred(image, target, PADDING, compiled), compiled_slopes() if compiled else ssim_slopes
+    parts = blurred(image, target, PADDING, compiled, of_target)
+    slopes_of = compiled_slopes() if compiled else ssim_slopes
     ssim, *slopes = slopes_of(*(part.flatten() for part in parts))
     back = [blur(slope.view(image.shape), PADDING, compiled).flatten() for slope in slopes]
     combine = compiled_loss_slopes(ssim_weight) if compiled else partial(loss_slopes, ssim_weight=ssim_weight)
@@ -86,12 +103,12 @@ class Photometric(torch.autograd.Function):
     """The loss, with its gradient found on the way forward."""
 
     @staticmethod
-    def forward(ctx, image, target, ssim_weight, compiled):
+    def forward(ctx, image, target, ssim_weight, compiled, of_target):
         image, target = image.detach(), target.detach()
         if compiled and image.device.type != "cpu":  # launches cost: all of it at once
             loss, gradient = compiled_photometric(ssim_weight)(image, target)
         else:
-            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled)
+            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled, of_target)
         ctx.save_for_backward(gradient)
         return loss
 
@@ -99,11 +116,18 @@ class Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, by_loss):
         (gradient,) = ctx.saved_tensors
-        return by_loss * gradient, None, None, None
+        return by_loss * gradient, None, None, None, None
 
 
 def photometric(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], ssim_weight: float, compiled: bool = False
+    image: Float[Tensor, "C H W"],
+    target: Float[Tensor, "C H W"],
+    ssim_weight: float,
+    compiled: bool = False,
+    of_target: tuple[Tensor, Tensor] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image."""
-    return Photometric.apply(image, target, ssim_weight, compiled)
+    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image.
+
+    of_target: what `blurred_target` is, where that is known. Compiled code of a GPU finds it anew: it is one launch.
+    """
+    return Photometric.apply(image, target, ssim_weight, compiled, of_target)

@@ -1,4 +1,5 @@
-"""Photographs where a run computes: bytes on the device, as long as there is room, made into numbers there."""
+"""Photographs where a run computes: bytes on the device, as long as there is room, made into numbers there; on a CPU
+also what the loss takes of them alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,10 +9,13 @@ from torch import Tensor
 
 from gsx.core.data.scene import View
 from gsx.core.device import uploaded
+from gsx.core.quality.losses import blurred_target
 from gsx.core.shapes import Float, UInt8
 
 SHARE = 0.25
 """Of a GPU's free memory, at most, that photographs take."""
+BLURRED_BYTES = 1 << 29
+"""Of what SSIM takes of photographs, at most, that is kept."""
 
 
 def room_for_photographs(device: torch.device) -> int:
@@ -27,6 +31,8 @@ class Photographs:
     room: int
     """Bytes that are left for more of them."""
     kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
+    blurred: dict[View, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    """What SSIM takes of photographs alone: they and their squares, blurred."""
     views: Sequence[View] = ()
     """Those that are trained on now."""
 
@@ -37,10 +43,21 @@ class Photographs:
         self.views, wanted = views, set(views)
         for view in [view for view in self.kept if view not in wanted]:
             self.room += self.kept.pop(view).nbytes
+        self.blurred = {view: found for view, found in self.blurred.items() if view in wanted}
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """What `view.image()` is, on the device."""
         return numbers_of(self.bytes_of(view))
+
+    def blurred_of(self, view: View, compiled: bool) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
+        """What SSIM takes of a photograph alone; None where nothing is kept: compiled code of a GPU finds all at once,
+        and what there is no room for is as soon found anew."""
+        if self.device.type != "cpu":
+            return None
+        found = self.blurred.get(view)
+        if found is None and sum(2 * one.nbytes for one, _ in self.blurred.values()) < BLURRED_BYTES:
+            found = self.blurred[view] = blurred_target(self.of(view), compiled=compiled)
+        return found
 
     def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:
         """The photograph, on the device."""

@@ -160,7 +160,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
     shown = run.resolution.compared(rendering.image, target, view, learning=True)
-    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled)
+    of_target = run.photographs.blurred_of(view, compiled) if counted is None else None
+    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, of_target)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra
