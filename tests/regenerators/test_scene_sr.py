@@ -8,9 +8,10 @@ import torch
 from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
-from gsx.core.data.reduction import Reduction, box_average
+from gsx.core.data.reduction import Reduction, box_average, projected
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
+from gsx.core.device import multiplies_bfloat16
 from gsx.core.errors import ConfigError
 from gsx.core.training.checked_regenerator import strayed, unusable
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext
@@ -108,6 +109,26 @@ def test_before_learning_it_is_the_bicubic_enlargement() -> None:
     image = torch.rand(1, 3, 9, 11, generator=torch.Generator().manual_seed(1))
     plain = torch.nn.functional.interpolate(image, scale_factor=2, mode="bicubic", align_corners=False)
     torch.testing.assert_close(network(image), plain)
+
+
+def test_learning_in_bfloat16_changes_little_and_pictures_are_drawn_without(learnt: SceneSR) -> None:
+    assert learnt.network is not None
+    image = stripes(7, 24).float()[None] / 255
+    exact, fast = (learnt.network(image, fast) for fast in (False, True))
+    assert fast.dtype == torch.float32
+    assert 0 < float((exact - fast).abs().max()) < 0.02
+    (result,) = learnt.regenerate([request(image[0])])
+    assert torch.equal(result, projected(exact[0], image[0], 2, BOX))
+
+
+@pytest.mark.parametrize(
+    ("told", "wanted"), [({"amx_bf16": True}, True), ({"avx2": True, "avx512_bf16": False}, False)]
+)
+def test_bfloat16_is_for_processors_that_multiply_it(told: dict, wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: told, raising=False)
+    assert multiplies_bfloat16(CPU) == wanted
+    monkeypatch.delattr(torch.cpu, "get_capabilities")
+    assert not multiplies_bfloat16(CPU)
 
 
 def test_what_was_learnt_is_found_again(tmp_path: Path) -> None:

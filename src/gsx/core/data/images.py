@@ -22,6 +22,8 @@ from gsx.core.files import replacing
 from gsx.core.shapes import Float, Shaped, UInt8
 
 JPEG_QUALITY = 95
+PNG_EFFORT = {"png:compressionLevel": 1, "png:filter": 0x80}
+"""zlib's least, rows by Paeth's predictor alone: a third of the time of what libpng chooses, a tenth more bytes."""
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
     1: (False, ()),
     2: (False, (-1,)),
@@ -105,6 +107,8 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
     rounded = image if image.dtype == torch.uint8 else to_uint8(image)
     buffer = oiio.ImageBuf(np.ascontiguousarray(rounded.detach().cpu().permute(1, 2, 0).numpy()))
     buffer.specmod().attribute("Compression", f"jpeg:{JPEG_QUALITY}")
+    for name, value in PNG_EFFORT.items():
+        buffer.specmod().attribute(name, value)
     buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
     try:
         with replacing(path) as partial, in_memory(partial) as name:
