@@ -111,6 +111,19 @@ def test_what_pictures_do_not_tell_goes_back_to_the_given_pose() -> None:
     assert off(astray, AT_ORIGIN)[1] > 0.04
 
 
+def test_a_pose_that_may_be_far_off_is_held_less() -> None:
+    """Before a photograph that differs much, and was taken two pixels beside."""
+    taken, (image, depth) = elsewhere((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)), picture(AT_ORIGIN)
+    photograph = picture(taken)[0] + 0.2 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    moves = [
+        beside(aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None, beside=expected), AT_ORIGIN)
+        for expected in (0.05, 0.25, 1.0)
+    ]
+    assert moves[0] < 0.3
+    assert moves[1] == pytest.approx(1.4, abs=0.3)
+    assert moves[2] == pytest.approx(2.0, abs=0.2)
+
+
 def test_depth_is_that_of_what_covers_a_pixel() -> None:
     """The rasterizer sums depth by weights that add up to alpha."""
     taken, (image, depth) = elsewhere((0.0, 0.0, 0.0), (0.06, -0.04, 0.08)), picture(AT_ORIGIN)

@@ -17,7 +17,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.taken import Taken, posed
 from gsx.core.errors import Stopped
 from gsx.core.quality.alignment import Motion, moved, rotation_by
-from gsx.core.training import trainer
+from gsx.core.training import captures, trainer
 from gsx.core.training.captures import judge_photographs
 from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.poses import PoseOptions, Poses, in_moved_world, in_px, spread_of_shifts, without_common
@@ -219,18 +219,25 @@ WRONG = (
 )
 
 
+def wrong_run(folder: Path, stop_after: int | None = None) -> Run:
+    """A run with wrong poses, which pictures as small as these do not tell."""
+    with patch.object(captures, "spread_of_shifts", return_value=1.5):
+        return tiny_run(folder, WRONG, stop_after)
+
+
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
     """(a finished run with corrected poses, its folder)."""
     folder = tmp_path_factory.mktemp("corrected") / "run"
-    return tiny_run(folder, WRONG), folder
+    return wrong_run(folder), folder
 
 
 def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple[Run, Path], tmp_path: Path) -> None:
     whole, folder = corrected
     assert whole.poses.matrices is not None
     assert len(whole.poses.matrices) == 6
-    tiny_run(tmp_path / "stopped", WRONG, stop_after=4)
+    assert whole.poses.beside == 1.5
+    wrong_run(tmp_path / "stopped", stop_after=4)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.poses.matrices is not None
     execute(run, settings, plugins())
@@ -240,7 +247,10 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     assert all(torch.equal(a[name], b[name]) for name in a)
     longer, _ = open_run(tmp_path / "stopped", plugins(), ["iterations=300"], training=True)
     longer.step = longer.poses.steps()[0] - 1
-    assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
+    with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
+        assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
+    # px of pictures that are too small to be made smaller
+    assert [call.kwargs["beside"] for call in corrections.call_args_list] == [pytest.approx(1.5)] * 6
 
 
 def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(
@@ -255,7 +265,7 @@ def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(
 
     whole, folder = corrected
     with patch.object(trainer, "view_loss", stop):
-        tiny_run(tmp_path / "stopped", WRONG)
+        wrong_run(tmp_path / "stopped")
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert (run.step, run.poses.corrected) == (3, 4)
     execute(run, settings, plugins())

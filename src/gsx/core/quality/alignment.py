@@ -25,9 +25,11 @@ ROUNDS, ENOUGH = 10, 0.02
 """Of the search at each size; px, of the last of them."""
 COVERED = 0.5
 """Alpha of a pixel that has a depth."""
-HELD = 1000
-"""Pixels that say as much as the prior does, which has a pose wrong by 1 px (standard deviation) of the picture at
-hand. Neighbours differ by the same errors of the model, which tell nothing: of all pixels a small part count."""
+ALIKE_PIXELS = 62.5
+"""Neighbours differ by the same errors of the model, which tell nothing: so many pixels say as much as one would alone,
+about 8 x 8."""
+BESIDE = 0.25
+"""Px of the picture by which poses are expected to be wrong (standard deviation) where nothing is known of that."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,6 +96,8 @@ class Shown:
     """Pixels of the photograph that are looked at; None: all."""
     given: Motion = STILL
     """From the pose that the prior holds to that of the camera."""
+    held: float = ALIKE_PIXELS / BESIDE**2
+    """Pixels that say as much as the prior does of a pose that is wrong by 1 px."""
 
     def points(self) -> Float[Tensor, "3 P"]:
         """What pixels inside show, in the camera's frame."""
@@ -109,7 +113,8 @@ class Shown:
         )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
         counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
-        return Shown(camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted, given=self.given)
+        inside = inside == 1
+        return replace(self, camera=camera, image=image, depth=depth, inside=inside, counted=counted)
 
     @cached_property
     def masked(self) -> Float[Tensor, "1 H W"] | None:
@@ -131,18 +136,22 @@ def aligned(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None,
     given: Camera | None = None,
+    beside: float = BESIDE,
 ) -> Camera:
     """The camera where a photograph was taken, from a render near there; as it is where pictures do not tell.
 
     depth: blending-weighted sum of camera z, scene units, as the rasterizer has it. given: whose pose the prior holds;
-    None: that of the camera.
+    None: that of the camera. beside: px by which it is expected to be wrong, standard deviation.
     """
     inside = (alpha > COVERED) & (depth > camera.near * alpha)
     inside = inside if counted is None else inside & counted.to(inside.device)
     z = torch.where(inside, depth.double() / alpha.double().clamp_min(COVERED), 1.0)
-    wanted, held = grey(photograph), STILL if given is None else motion_to(given, camera)
+    wanted, from_given = grey(photograph), STILL if given is None else motion_to(given, camera)
     counted = None if counted is None else counted.to(inside.device)
-    shown = Shown(camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=held)
+    held = ALIKE_PIXELS / beside**2
+    shown = Shown(
+        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=held
+    )
     found = motion_between(shown, wanted)
     if found is None or not mismatch(shown, wanted, found) <= mismatch(shown, wanted, STILL) + ALIKE:
         return camera
@@ -182,7 +191,7 @@ def refined(shown: Shown, photograph: Float[Tensor, "H W"], motion: Motion) -> M
         columns = torch.cat([-motions, still[None], torch.ones_like(still)[None]])
         residual = by_medians(still, wanted, told) if residual is None else residual
         off = motion.after(shown.given).twist() / unit
-        fit = held_least_squares(columns[:, told], wanted[told], residual[told], off)
+        fit = held_least_squares(columns[:, told], wanted[told], residual[told], off, shown.held)
         residual = wanted - fit @ columns
         step = fit[:6]
         motion = motion.then(unit[:3] * step[:3], unit[3:] * step[3:])
@@ -223,14 +232,18 @@ def by_motion(
 
 
 def held_least_squares(
-    columns: Float[Tensor, "8 P"], wanted: Float[Tensor, "P"], residual: Float[Tensor, "P"], off: Float[Tensor, "6"]
+    columns: Float[Tensor, "8 P"],
+    wanted: Float[Tensor, "P"],
+    residual: Float[Tensor, "P"],
+    off: Float[Tensor, "6"],
+    held: float,
 ) -> Float[Tensor, "8"]:
     """Factors of columns whose sum comes closest to what is wanted. The first six are a step, px, from a pose that is
-    `off` that of the prior; robust by the residuals of the last round."""
+    `off` that of the prior, which says as much as so many pixels; robust by the residuals of the last round."""
     weights = robust(residual)
     variance = float((weights * residual.square()).sum() / weights.sum())
     hold = wanted.new_full((8,), 1e-9 * len(wanted))  # what is plain has no slopes, and no gain beside its offset
-    hold[:6] += variance * HELD
+    hold[:6] += variance * held
     system, right = (columns * weights) @ columns.T + torch.diag(hold), (columns * weights) @ wanted
     right[:6] -= hold[:6] * off
     scale = system.diagonal().sqrt()
