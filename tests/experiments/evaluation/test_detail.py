@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.data.reduction import Reduction
 from gsx.core.quality.metrics import bicubic
-from gsx.experiments.evaluation.detail import Detail, dct, details_of, explained, interior, powers
+from gsx.experiments.evaluation.detail import Detail, corner, dct, details_of, explained, interior, powers
 
 
 def detail_of(image: Tensor, truth: Tensor, factor: float) -> Detail | None:
@@ -40,9 +40,17 @@ def test_an_impulse_has_the_energies_of_the_specification() -> None:
     """0.1 at (5, 7) of 16 x 16, split at x2: 8.2229e-6 below and 3.08396e-5 above, together the MSE."""
     impulse = torch.zeros(3, 16, 16, dtype=torch.float64)
     impulse[:, 5, 7] = 0.1
-    frequency = torch.arange(16) / 16 * 2
-    high = torch.maximum(frequency[:, None], frequency[None]) >= 1
-    assert powers(impulse, [~high, high]) == pytest.approx([8.2229e-6, 3.08396e-5], rel=1e-5)
+    below, whole = powers(impulse, [corner(16, 16, 2, end) for end in (1, math.inf)])
+    assert (below, whole - below) == pytest.approx((8.2229e-6, 3.08396e-5), rel=1e-5)
+
+
+def test_a_corner_is_as_wide_and_high_as_its_frequencies() -> None:
+    """A wave across is in the corner that is wide enough, however low that is, and nowhere else."""
+    n = torch.arange(20, dtype=torch.float64)
+    wave = torch.cos(math.pi * (n + 0.5) * 12 / 20).expand(1, 8, 20)
+    assert powers(wave, [(1, 13), (8, 12), (8, 20)]) == pytest.approx([0.5, 0, 0.5], abs=1e-12)
+    assert corner(8, 20, 2, 1) == (4, 10)
+    assert corner(9, 20, 2, 1.5) == (7, 15)
 
 
 def grating(cycles: float, size: int = 160) -> Tensor:

@@ -54,12 +54,14 @@ def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
     return out
 
 
-def powers(picture: Float[Tensor, "C H W"], bands: Sequence[Tensor]) -> list[float]:
-    """Mean square of a picture in each band, over all of its pixels and channels; a channel at a time."""
-    square = torch.zeros_like(picture[0])
+def powers(picture: Float[Tensor, "C H W"], corners: Sequence[tuple[int, int]]) -> list[float]:
+    """Mean square of a picture in each corner of so many lowest frequencies, down and across, over all of its pixels
+    and channels; a channel at a time."""
+    square = torch.zeros_like(picture[0]).mT
     for channel in picture:
-        square += dct(dct(channel).mT).mT.square_()
-    return [float(square[band].sum()) / picture.numel() for band in bands]
+        square += dct(dct(channel).mT).square_()
+    found = [square[:across, :down].sum(dtype=torch.float64) for down, across in corners]
+    return [float(power) / picture.numel() for power in found]
 
 
 def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor, "3 H W"], factor: float) -> Details:
@@ -69,18 +71,27 @@ def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor
     exact = truth[:, *window]
     if min(exact.shape[1:]) < 2 or factor <= 1:
         return {}
-    rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in exact.shape[1:])
-    frequency = torch.maximum(rows[:, None], columns[None, :])  # in units of the Nyquist frequency of training
-    high = frequency >= 1
-    bands = (~high, high, high & (frequency < RECOVERABLE))
-    _, truth_high, truth_recoverable = powers(exact, bands)
+    corners = [corner(exact.shape[1], exact.shape[2], factor, end) for end in (1, RECOVERABLE, math.inf)]
+    _, truth_high, truth_recoverable = by_band(exact, corners)
     out = {}
     for name, image in images.items():
-        low, above, recoverable = powers(image[:, *window].to(exact) - exact, bands)
+        low, high, recoverable = by_band(image[:, *window].to(exact) - exact, corners)
         out[name] = Detail(
-            low=low, high=above, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
+            low=low, high=high, recoverable=recoverable, truth_high=truth_high, truth_recoverable=truth_recoverable
         )
     return out
+
+
+def by_band(picture: Float[Tensor, "C H W"], corners: Sequence[tuple[int, int]]) -> tuple[float, float, float]:
+    """Mean square of a picture in the first corner, in all but that, and in what the second has beyond it."""
+    below, up_to, whole = powers(picture, corners)
+    return below, max(0.0, whole - below), max(0.0, up_to - below)
+
+
+def corner(height: int, width: int, factor: float, end: float) -> tuple[int, int]:
+    """How many frequencies down and across lie below so many times the Nyquist frequency of training."""
+    rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in (height, width))
+    return int((rows < end).sum()), int((columns < end).sum())
 
 
 def interior(size: int, factor: float) -> slice:
