@@ -236,7 +236,7 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     whole, folder = corrected
     assert whole.poses.matrices is not None
     assert len(whole.poses.matrices) == 6
-    assert whole.poses.beside == 1.5
+    assert whole.poses.spread == 1.5
     wrong_run(tmp_path / "stopped", stop_after=4)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.poses.matrices is not None
@@ -250,7 +250,7 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
         assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
     # px of pictures that are too small to be made smaller
-    assert [call.kwargs["beside"] for call in corrections.call_args_list] == [pytest.approx(1.5)] * 6
+    assert [call.kwargs["pose_error"] for call in corrections.call_args_list] == [pytest.approx(1.5)] * 6
 
 
 def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.quality.alignment import BESIDE, aligned, usual_depth
+from gsx.core.quality.alignment import POSE_ERROR, aligned, usual_depth
 from gsx.core.quality.distractors import Difference, difference_of, distractors_in
 from gsx.core.quality.motion_blur import Movement, movement_between
 from gsx.core.rasterizer import TiledRendering
@@ -89,8 +89,8 @@ def judge_poses(run: Run) -> dict[str, float]:
     of the step."""
     begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
     if poses.matrices is None:
-        poses.beside = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
-        told["pose_spread"] = poses.beside
+        poses.spread = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
+        told["pose_spread"] = poses.spread
         needed, verdict = poses.needed(told["pose_spread"]), "poses are corrected from here on"
         verdict = verdict if needed else "poses are taken for right"
         logger.info("step %d: photographs lie %.2f px beside: %s", run.step + 1, told["pose_spread"], verdict)
@@ -118,8 +118,8 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        beside = max(BESIDE, run.poses.beside * small.camera.focal / view.camera.focal)
-        after.append(aligned(small.camera, *pictures, given=given, beside=beside))
+        error = max(POSE_ERROR, run.poses.spread * small.camera.focal / view.camera.focal)
+        after.append(aligned(small.camera, *pictures, given=given, pose_error=error))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]
     depth = median(known) if known else run.scene.extent

@@ -59,7 +59,7 @@ class Poses:
     iterations: int = 0
     matrices: Float[Tensor, "N 3 4"] | None = None
     """camera_from_world, rotation and translation; None: those of the scene."""
-    beside: float = math.nan
+    spread: float = math.nan
     """Px by which photographs were found to lie beside the model, standard deviation along an axis."""
     corrected: int = 0
     """The last step before which they were: not again where that step is taken anew."""
@@ -112,14 +112,14 @@ class Poses:
         """What a checkpoint holds of them; nothing where they are the scene's."""
         if self.matrices is None:
             return {}
-        numbers = {"corrected": torch.tensor(self.corrected), "beside": torch.tensor(self.beside).double()}
+        numbers = {"corrected": torch.tensor(self.corrected), "spread": torch.tensor(self.spread).double()}
         return {"matrices": self.matrices} | numbers
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.beside = float(tensors["beside"]) if tensors else math.nan
+        self.spread = float(tensors["spread"]) if tensors else math.nan
 
 
 # -- are they wrong? ---------------------------------------------------------------------------------------------------
