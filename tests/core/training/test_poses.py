@@ -67,6 +67,18 @@ def test_auto_asks_for_more_than_the_threshold_and_always_for_nothing() -> None:
     assert always.needed(0.0)
 
 
+def test_poses_are_held_ever_more_firmly() -> None:
+    poses = Poses(PoseOptions(when="auto", start=0.1, until=0.8, times=4), cameras(), 1000)
+    steps = poses.steps()
+    assert [poses.expected_error(number, 0.5) for number in steps] == [0.5] * 4  # nothing is known
+    for found, wanted in ((4.0, [4, 2, 1, 0.5]), (0.1, [0.5] * 4)):
+        poses.spread = found
+        assert [poses.expected_error(number, 0.5) for number in steps] == pytest.approx(wanted)
+    poses.options = PoseOptions(when="auto", times=1)
+    poses.spread = 4.0
+    assert poses.expected_error(poses.steps()[0], 0.5) == 4.0
+
+
 @pytest.mark.parametrize("options", [PoseOptions, DistractorOptions])
 @pytest.mark.parametrize(
     ("wrong", "told"),

@@ -118,7 +118,8 @@ def correct_poses(run: Run, views: Sequence[View]) -> float:
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        error = max(POSE_ERROR, run.poses.spread * small.camera.focal / view.camera.focal)
+        smaller = small.camera.focal / view.camera.focal
+        error = smaller * run.poses.expected_error(run.step + 1, POSE_ERROR / smaller)
         after.append(aligned(small.camera, *pictures, given=given, pose_error=error))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]

@@ -83,6 +83,13 @@ class Poses:
         """Whether a spread of shifts, px, asks for corrections."""
         return self.options.when == "always" or spread > self.options.spread
 
+    def expected_error(self, number: int, least: float) -> float:
+        """Px by which the scene's poses are expected to be wrong at a correction: at the first one as many as were
+        found, then ever fewer, `least` at the last one. Held loosely, those that are far off come near; held firmly,
+        the small errors of each correction do not add up."""
+        steps, wide = self.steps(), max(1.0, self.spread / least)
+        return least * wide ** (1 - steps.index(number) / max(1, len(steps) - 1))
+
     # -- what others see -----------------------------------------------------------------------------------------------
 
     def views(self, views: Sequence[View]) -> Sequence[View]:
@@ -119,7 +126,7 @@ class Poses:
         """Go on from a checkpoint's tensors; none: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.spread = float(tensors["spread"]) if tensors else math.nan
+        self.spread = float(tensors.get("spread", math.nan))
 
 
 # -- are they wrong? ---------------------------------------------------------------------------------------------------
