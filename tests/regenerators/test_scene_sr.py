@@ -15,6 +15,7 @@ from gsx.core.device import multiplies_bfloat16
 from gsx.core.errors import ConfigError
 from gsx.core.training.checked_regenerator import strayed, unusable
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext
+from gsx.regenerators import scene_sr
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 
 CPU = torch.device("cpu")
@@ -119,6 +120,16 @@ def test_learning_in_bfloat16_changes_little_and_pictures_are_drawn_without(lear
     assert 0 < float((exact - fast).abs().max()) < 0.02
     (result,) = learnt.regenerate([request(image[0])])
     assert torch.equal(result, projected(exact[0], image[0], 2, BOX))
+
+
+def test_it_learns_in_bfloat16_where_that_is_faster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, found = request(stripes(3, 12).float() / 255), []
+    for faster in (True, False):  # neither finds what the other has learnt
+        monkeypatch.setattr(scene_sr, "multiplies_bfloat16", lambda device, faster=faster: faster)
+        regenerator = SceneSR(options(steps=5))
+        assert "loss" in regenerator.prepare(context_for(tmp_path))
+        found.append(regenerator.regenerate([given])[0])
+    assert 0 < float((found[0] - found[1]).abs().max()) < 0.02
 
 
 @pytest.mark.parametrize(

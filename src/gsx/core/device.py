@@ -27,8 +27,9 @@ def machine_stamp(device: torch.device) -> tuple[str, int, str]:
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
-    """Whether matrix products of bfloat16 have units of their own on a device: several times as fast as float32."""
+    """Whether a device has units for matrix products of bfloat16, which are faster than those of float32."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        with torch.cuda.device(device):
+            return torch.cuda.is_bf16_supported(including_emulation=False)
     told: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # nothing where torch cannot tell
-    return any(told.get(name, False) for name in ("amx_bf16", "avx512_bf16"))
+    return device.type == "cpu" and any(told.get(name, False) for name in ("amx_bf16", "avx512_bf16"))

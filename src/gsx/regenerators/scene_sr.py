@@ -70,9 +70,9 @@ class Enlarger(nn.Module):
         nn.init.zeros_(self.last.weight)  # training starts from the plain enlargement
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
-    def forward(self, image: Float[Tensor, "B 3 h w"], fast: bool = False) -> Float[Tensor, "B 3 H W"]:
-        """Twice as wide and high; fast: convolutions in bfloat16."""
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=fast):
+    def forward(self, image: Float[Tensor, "B 3 h w"], bfloat16: bool = False) -> Float[Tensor, "B 3 H W"]:
+        """Twice as wide and high; bfloat16: by convolutions of such numbers."""
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=bfloat16):
             detail = self.detail(image).float()
         return interpolate(image, scale_factor=STEP, mode="bicubic", align_corners=False) + detail
 
@@ -150,11 +150,11 @@ def train(
     context: RegeneratorContext,
     options: SceneSROptions,
 ) -> tuple[float, bool]:
-    """(mean loss of the last tenth, whether all steps were taken). Convolutions in bfloat16, where a device has units
-    for that, learn as much in half of the time; pictures are drawn in float32."""
+    """(mean loss of the last tenth, whether all steps were taken). Convolutions are of bfloat16 where a device has
+    units for that, and learn as much; pictures are drawn in float32."""
     generator, reduction = torch.Generator().manual_seed(context.seed), context.reduction
     device = next(network.parameters()).device
-    fast = multiplies_bfloat16(device)
+    bfloat16 = multiplies_bfloat16(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
     losses: list[float] = []
@@ -168,7 +168,7 @@ def train(
             break
         low, truth = (part.to(device) for part in pairs(photos, reduction, options, generator))
         noise = torch.randn(low.shape, generator=generator).to(device) * options.noise / 255
-        out = network(low + noise, fast)
+        out = network(low + noise, bfloat16)
         off = reduction.inner(reduction.reduce(out, STEP) - low)
         loss = (out - truth).abs().mean() + off.abs().mean()
         optimiser.zero_grad(set_to_none=True)
@@ -215,7 +215,8 @@ def kept_at(
     for photo in photos:
         digest.update(repr(tuple(photo.shape)).encode())
         digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
-    key = content_key(asdict(options), asdict(reduction), digest.hexdigest(), seed, machine_stamp(device))
+    machine = [*machine_stamp(device), multiplies_bfloat16(device)]
+    key = content_key(asdict(options), asdict(reduction), digest.hexdigest(), seed, machine)
     return cache_folder("scene_sr", key) / "network.safetensors"
 
 

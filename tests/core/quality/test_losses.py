@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from gsx.core.compiling import available
-from gsx.core.quality.losses import blur, blurred_target, photometric, ssim_map
+from gsx.core.quality.losses import blur, moments_of, photometric, ssim_map
 
 needs_compiler = pytest.mark.skipif(not available(), reason="no working compiler")
 OFFSET = np.arange(11) - 5
@@ -110,9 +110,9 @@ def test_gradient_of_the_loss(compiled: bool) -> None:
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
 def test_what_is_known_of_a_target_is_not_found_anew(compiled: bool) -> None:
     image, target = (picture.float() for picture in pictures(3, 14, 9))
-    known = blurred_target(target, compiled=compiled)
+    known = moments_of(target, compiled=compiled)
     assert torch.equal(photometric(image, target, 0.2, compiled, known), photometric(image, target, 0.2, compiled))
-    other = blurred_target(1 - target, compiled=compiled)
+    other = moments_of(1 - target, compiled=compiled)
     assert not torch.equal(photometric(image, target, 0.2, compiled, other), photometric(image, target, 0.2, compiled))
 
 

@@ -1,5 +1,6 @@
 """Photographs where a run computes: decoded once while there is room, gone when others are trained on."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import View
-from gsx.core.quality.losses import blurred_target
+from gsx.core.quality.losses import moments_of
 from gsx.core.training import photographs as module
 from gsx.core.training.photographs import Photographs
 
@@ -48,29 +49,43 @@ def test_what_has_room_is_decoded_once_and_makes_room_for_others() -> None:
 
 
 def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    sources = [Counted(51), Counted(102), Counted(153)]
-    views = [View(str(number), CAMERA, source) for number, source in enumerate(sources)]
-    monkeypatch.setattr(module, "BLURRED_BYTES", 2 * 2 * 4 * BYTES)
+    views = [View(str(number), CAMERA, Counted(51 * number)) for number in range(3)]
+    pictures = [view.image() for view in views]
+    monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES + 1)  # two of each four-byte number of two pictures
     photographs = Photographs(torch.device("cpu"), room=0)
     photographs.see(views)
-    for _ in range(2):
-        for view, value in zip(views[:2], (51, 102), strict=True):
-            found = photographs.blurred_of(view, compiled=False)
-            wanted = blurred_target(torch.full((3, 4, 8), value) / 255.0)
-            assert found is not None
-            assert all(map(torch.equal, found, wanted))
-        assert photographs.blurred_of(views[2], compiled=False) is None
-    assert [source.asked for source in sources] == [1, 1, 0]
+    first = [
+        photographs.moments_of(view, picture, compiled=False) for view, picture in zip(views, pictures, strict=True)
+    ]
+    assert first[2] is None
+    for found, view, picture in zip(first[:2], views, pictures, strict=False):
+        assert photographs.moments_of(view, picture, compiled=False) is found
+        assert all(map(torch.equal, found, moments_of(picture)))
     photographs.see(views[2:])
-    assert not photographs.blurred
-    assert photographs.blurred_of(views[2], compiled=False) is not None
+    assert not photographs.moments
+    assert photographs.moments_of(views[2], pictures[2], compiled=False) is not None
 
 
-def test_training_is_the_same_whether_there_is_room_or_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    run = tiny_run(tmp_path / "kept", ["iterations=12"])
-    assert len(run.photographs.blurred) == len(run.scene.train)
-    monkeypatch.setattr(module, "BLURRED_BYTES", 0)
-    assert not tiny_run(tmp_path / "found_anew", ["iterations=12"]).photographs.blurred
+@pytest.mark.parametrize("words", [(), ("training.coarse=2", "training.poses.when=always", "training.poses.times=2")])
+def test_training_is_the_same_whether_there_is_room_or_not(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Also where views change on the way."""
+    most = []
+
+    def see(self: Photographs, views: Sequence[View]) -> None:
+        most.append(len(self.moments))
+        plain(self, views)
+
+    plain = Photographs.see
+    monkeypatch.setattr(Photographs, "see", see)
+    run = tiny_run(tmp_path / "kept", ["iterations=12", *words])
+    assert max(most) >= 4  # of six
+    assert not run.photographs.moments
+    monkeypatch.setattr(module, "MOMENT_BYTES", 0)
+    most.clear()
+    tiny_run(tmp_path / "found_anew", ["iterations=12", *words])
+    assert max(most) == 0
     kept, anew = (final_tensors(tmp_path / name) for name in ("kept", "found_anew"))
     assert kept.keys() == anew.keys()
     assert all(torch.equal(kept[name], anew[name]) for name in kept)

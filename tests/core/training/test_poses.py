@@ -1,6 +1,7 @@
 """Poses of photographs: found wrong where they are, left alone where they are not, corrected, kept and resumed."""
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -20,7 +21,16 @@ from gsx.core.quality.alignment import Motion, moved, rotation_by
 from gsx.core.training import captures, trainer
 from gsx.core.training.captures import judge_photographs
 from gsx.core.training.distractors import DistractorOptions
-from gsx.core.training.poses import PoseOptions, Poses, in_moved_world, in_px, spread_of_shifts, without_common
+from gsx.core.training.poses import (
+    PoseOptions,
+    Poses,
+    in_moved_world,
+    in_px,
+    shifts_by_half,
+    spread_of_shifts,
+    usual_shift,
+    without_common,
+)
 from gsx.core.training.run import Run, Step
 from gsx.core.training.trainer import view_loss
 from gsx.experiments.runs.build import build
@@ -67,16 +77,28 @@ def test_auto_asks_for_more_than_the_threshold_and_always_for_nothing() -> None:
     assert always.needed(0.0)
 
 
-def test_poses_are_held_ever_more_firmly() -> None:
-    poses = Poses(PoseOptions(when="auto", start=0.1, until=0.8, times=4), cameras(), 1000)
-    steps = poses.steps()
-    assert [poses.expected_error(number, 0.5) for number in steps] == [0.5] * 4  # nothing is known
-    for found, wanted in ((4.0, [4, 2, 1, 0.5]), (0.1, [0.5] * 4)):
-        poses.spread = found
-        assert [poses.expected_error(number, 0.5) for number in steps] == pytest.approx(wanted)
-    poses.options = PoseOptions(when="auto", times=1)
-    poses.spread = 4.0
-    assert poses.expected_error(poses.steps()[0], 0.5) == 4.0
+def errors_expected(poses: Poses, usual: float, steps: Sequence[int]) -> list[float]:
+    """At corrections before these steps."""
+    out = []
+    for number in steps:
+        out.append(poses.expected_error(number, usual, 0.5))
+        poses.correct(poses.cameras, poses.cameras, DEPTH, number, out[-1])
+    return out
+
+
+def test_poses_are_held_ever_more_firmly_also_where_a_run_goes_on_longer() -> None:
+    options = PoseOptions(when="auto", start=0.1, until=0.8, times=4)
+    for usual, wanted in ((4.0, [4, 2, 1, 0.5]), (0.1, [0.5] * 4), (math.nan, [0.5] * 4)):
+        poses = Poses(options, cameras(), 1000)
+        assert errors_expected(poses, usual, poses.steps()) == pytest.approx(wanted)
+    poses = Poses(options, cameras(), 1000)
+    assert errors_expected(poses, 4.0, poses.steps()[:3]) == pytest.approx([4, 2, 1])
+    longer = Poses(options, cameras(), 10_000)
+    longer.restore(poses.tensors())
+    assert errors_expected(longer, math.nan, longer.steps()) == pytest.approx([0.5 * 2**share for share in
+                                                                             (3 / 4, 1 / 2, 1 / 4, 0)])  # fmt: skip
+    once = Poses(PoseOptions(when="auto", times=1), cameras(), 1000)
+    assert errors_expected(once, 4.0, once.steps()) == [4.0]
 
 
 @pytest.mark.parametrize("options", [PoseOptions, DistractorOptions])
@@ -99,17 +121,33 @@ def waves(across: float, down: float) -> Tensor:
     return torch.stack([grey, 0.9 * grey, 0.8 * grey])
 
 
+def spread_between(pictures: Iterable[tuple[Tensor, Tensor, None, float]]) -> float:
+    """The spread of shifts of pictures."""
+    return spread_of_shifts(shifts_by_half(pictures))
+
+
 def test_the_spread_of_shifts_is_that_of_poses() -> None:
     shifts = 0.8 * numbers(20, 2)
-    found = spread_of_shifts((waves(0, 0), waves(*shift), None, 1.0) for shift in shifts.tolist())
+    found = spread_between((waves(0, 0), waves(*shift), None, 1.0) for shift in shifts.tolist())
     assert found == pytest.approx(float(shifts.var(0).mean().sqrt()), rel=0.05)
-    small = spread_of_shifts((waves(0, 0), waves(*shift), None, 2.0) for shift in shifts.tolist())
+    small = spread_between((waves(0, 0), waves(*shift), None, 2.0) for shift in shifts.tolist())
     assert small == pytest.approx(2 * found)  # px of photographs twice as large
     halves = [torch.cat([waves(a, 0)[..., :48], waves(b, 0)[..., 48:]], 2) for a, b in numbers(20, 2).tolist()]
     assert (
-        spread_of_shifts((waves(0, 0), one, None, 1.0) for one in halves) < 0.45
+        spread_between((waves(0, 0), one, None, 1.0) for one in halves) < 0.45
     )  # halves that do not agree tell nothing
-    assert spread_of_shifts([(waves(0, 0), waves(1, 1), None, 1.0)] * 2) == 0  # two are too few
+    assert spread_between([(waves(0, 0), waves(1, 1), None, 1.0)] * 2) == 0  # two are too few
+
+
+def test_a_usual_shift_is_that_of_most_photographs() -> None:
+    shifts = 0.8 * numbers(400, 1, 2)
+    noisy = shifts + 0.3 * numbers(400, 2, 2, seed=1)
+    assert usual_shift(noisy) == pytest.approx(0.8, rel=0.15)
+    noisy[:20] = 40.0
+    noisy[20:30] = math.nan
+    assert usual_shift(noisy) == pytest.approx(0.8, rel=0.2)
+    assert spread_of_shifts(noisy) > 5
+    assert usual_shift(torch.full((4, 2, 2), math.nan)) == 0
 
 
 # -- motions -------------------------------------------------------------------------------------------------------
@@ -190,16 +228,18 @@ def test_views_are_the_same_until_poses_change() -> None:
     poses, views = Poses(PoseOptions(), given, 10), [View(str(n), c, Asked()) for n, c in enumerate(given)]
     assert poses.views(views) is views
     other = [nudged(camera, twist) for camera, twist in zip(given, 1e-2 * numbers(8, 6), strict=True)]
-    motion = poses.correct(given, other, DEPTH, 5)
+    motion = poses.correct(given, other, DEPTH, 5, 0.7)
     made = poses.views(views)
     assert poses.views(views) is made
     moves = [in_px(a, b.camera, DEPTH).square().sum() for a, b in zip(given, made, strict=True)]
     assert motion == pytest.approx(float(torch.stack(moves).mean().sqrt()), rel=1e-5)
     kept = poses.tensors()
-    again = Poses(PoseOptions(), given, 10)
+    again = Poses(PoseOptions(when="auto", times=1), given, 10)
     again.restore(kept)
     assert torch.equal(again.views(views)[3].camera.rotation, made[3].camera.rotation)
-    assert again.corrected == 5
+    assert (again.corrected, again.error) == (5, 0.7)
+    again.restore({name: value for name, value in kept.items() if name != "error"})  # as earlier ones were
+    assert again.expected_error(3, math.nan, 0.5) == 0.5
     poses.restore({})
     assert poses.views(views) is views
 
@@ -233,7 +273,7 @@ WRONG = (
 
 def wrong_run(folder: Path, stop_after: int | None = None) -> Run:
     """A run with wrong poses, which pictures as small as these do not tell."""
-    with patch.object(captures, "spread_of_shifts", return_value=1.5):
+    with patch.object(captures, "usual_shift", return_value=1.7312345678901233):
         return tiny_run(folder, WRONG, stop_after)
 
 
@@ -248,21 +288,22 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     whole, folder = corrected
     assert whole.poses.matrices is not None
     assert len(whole.poses.matrices) == 6
-    assert whole.poses.spread == 1.5
-    wrong_run(tmp_path / "stopped", stop_after=4)
+    wrong_run(tmp_path / "stopped", stop_after=3)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.poses.matrices is not None
-    execute(run, settings, plugins())
+    assert (run.poses.corrected, run.poses.error) == (2, 1.7312345678901233)
+    with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
+        execute(run, settings, plugins())
+    # px: pictures as small as these are not made smaller
+    expected = [call.kwargs["pose_error"] for call in corrections.call_args_list]
+    assert expected == pytest.approx([(0.5 * 1.7312345678901233) ** 0.5] * 6 + [0.5] * 6)
     a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "poses.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
     longer, _ = open_run(tmp_path / "stopped", plugins(), ["iterations=300"], training=True)
     longer.step = longer.poses.steps()[0] - 1
-    with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
-        assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
-    # px of pictures that are too small to be made smaller
-    assert [call.kwargs["pose_error"] for call in corrections.call_args_list] == [pytest.approx(1.5)] * 6
+    assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
 
 
 def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(

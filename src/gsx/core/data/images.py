@@ -23,7 +23,7 @@ from gsx.core.shapes import Float, Shaped, UInt8
 
 JPEG_QUALITY = 95
 PNG_EFFORT = {"png:compressionLevel": 1, "png:filter": 0x80}
-"""zlib's least, rows by Paeth's predictor alone: a third of the time of what libpng chooses, a tenth more bytes."""
+"""Little of zlib, rows by Paeth's predictor alone: less time than what libpng chooses by itself, and more bytes."""
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
     1: (False, ()),
     2: (False, (-1,)),

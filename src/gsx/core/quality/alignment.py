@@ -96,7 +96,7 @@ class Shown:
     """Pixels of the photograph that are looked at; None: all."""
     given: Motion = STILL
     """From the pose that the prior holds to that of the camera."""
-    held: float = CORRELATED_PIXELS / POSE_ERROR**2
+    held: float
     """Pixels that say as much as the prior does of a pose that is wrong by 1 px."""
 
     def points(self) -> Float[Tensor, "3 P"]:

@@ -50,15 +50,15 @@ def blurred(
     target: Float[Tensor, "C H W"],
     padding: int,
     compiled: bool = False,
-    of_target: tuple[Tensor, Tensor] | None = None,
+    target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
-    """Blurred image, target, image^2, target^2 and image target, each [C h w]; of_target: what `blurred_target` is."""
+    """Blurred image, target, image^2, target^2 and image target, each [C h w]; target_moments: `moments_of` it."""
     x, xx, xy = (blur(each, padding, compiled) for each in (image, image * image, image * target))
-    y, yy = blurred_target(target, padding, compiled) if of_target is None else of_target
+    y, yy = moments_of(target, padding, compiled) if target_moments is None else target_moments
     return x, y, xx, yy, xy
 
 
-def blurred_target(
+def moments_of(
     target: Float[Tensor, "C H W"], padding: int = PADDING, compiled: bool = False
 ) -> tuple[Float[Tensor, "C h w"], Float[Tensor, "C h w"]]:
     """Blurred target and target^2: what SSIM takes of a target alone."""
@@ -76,11 +76,11 @@ def photometric_and_gradient(
     target: Float[Tensor, "C H W"],
     ssim_weight: float,
     compiled: bool,
-    of_target: tuple[Tensor, Tensor] | None = None,
+    target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "C H W"]]:
     """The photometric loss and its gradient by the image. The blur is its own adjoint: the window is symmetric and the
     padding zero."""
-    parts = blurred(image, target, PADDING, compiled, of_target)
+    parts = blurred(image, target, PADDING, compiled, target_moments)
     slopes_of = compiled_slopes() if compiled else ssim_slopes
     ssim, *slopes = slopes_of(*(part.flatten() for part in parts))
     back = [blur(slope.view(image.shape), PADDING, compiled).flatten() for slope in slopes]
@@ -96,19 +96,19 @@ def compiled_photometric(ssim_weight: float) -> Callable[..., tuple[Tensor, Tens
     def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
         return [(picture, axis) for picture in arguments for axis in (1, 2)]
 
-    return compiled_once(with_last(photometric_and_gradient, ssim_weight, False), varying)
+    return compiled_once(with_last(photometric_and_gradient, ssim_weight, False, None), varying)
 
 
 class Photometric(torch.autograd.Function):
     """The loss, with its gradient found on the way forward."""
 
     @staticmethod
-    def forward(ctx, image, target, ssim_weight, compiled, of_target):
+    def forward(ctx, image, target, ssim_weight, compiled, target_moments):
         image, target = image.detach(), target.detach()
         if compiled and image.device.type != "cpu":  # launches cost: all of it at once
             loss, gradient = compiled_photometric(ssim_weight)(image, target)
         else:
-            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled, of_target)
+            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled, target_moments)
         ctx.save_for_backward(gradient)
         return loss
 
@@ -124,10 +124,11 @@ def photometric(
     target: Float[Tensor, "C H W"],
     ssim_weight: float,
     compiled: bool = False,
-    of_target: tuple[Tensor, Tensor] | None = None,
+    target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> Float[Tensor, ""]:
     """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image.
 
-    of_target: what `blurred_target` is, where that is known. Compiled code of a GPU finds it anew: it is one launch.
+    target_moments: `moments_of` it, where they are known. Compiled code of a GPU finds them anew: all is
+    one launch.
     """
-    return Photometric.apply(image, target, ssim_weight, compiled, of_target)
+    return Photometric.apply(image, target, ssim_weight, compiled, target_moments)

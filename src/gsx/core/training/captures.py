@@ -19,7 +19,7 @@ from gsx.core.training.distractors import share_of
 from gsx.core.training.evidence import looked_at, shown_weights
 from gsx.core.training.exposure import LIGHT, Pair, log_gains
 from gsx.core.training.parameter_table import keep_rows
-from gsx.core.training.poses import spread_of_shifts
+from gsx.core.training.poses import shifts_by_half, spread_of_shifts, usual_shift
 from gsx.core.training.render import render
 from gsx.core.training.resolution import coarser
 from gsx.core.training.run import Run
@@ -88,15 +88,16 @@ def judge_poses(run: Run) -> dict[str, float]:
     """Whether poses of training photographs are wrong, where that is asked first, and correct them if so; for the line
     of the step."""
     begun, poses, told, views = time.perf_counter(), run.poses, dict[str, float](), run.photographed
+    usual = math.nan
     if poses.matrices is None:
-        poses.spread = spread_of_shifts(beside_renders(run, poses.judged_by(views)))
-        told["pose_spread"] = poses.spread
+        halves = shifts_by_half(beside_renders(run, poses.judged_by(views)))
+        told["pose_spread"], usual = spread_of_shifts(halves), usual_shift(halves)
         needed, verdict = poses.needed(told["pose_spread"]), "poses are corrected from here on"
         verdict = verdict if needed else "poses are taken for right"
         logger.info("step %d: photographs lie %.2f px beside: %s", run.step + 1, told["pose_spread"], verdict)
         if not needed:
             return told | {"poses": 0, "pose_seconds": round(time.perf_counter() - begun, 3)}
-    told["poses"], told["pose_motion"] = len(views), correct_poses(run, views)
+    told["poses"], told["pose_motion"] = len(views), correct_poses(run, views, usual)
     logger.info("step %d: poses are corrected by %.2f px", run.step + 1, told["pose_motion"])
     return told | {"pose_seconds": round(time.perf_counter() - begun, 3)}
 
@@ -110,21 +111,22 @@ def beside_renders(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Te
         yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal
 
 
-def correct_poses(run: Run, views: Sequence[View]) -> float:
-    """Move each photograph to where the model says that it was taken; returns how far pictures move, px."""
-    after, depths = list[Camera](), list[float]()
+def correct_poses(run: Run, views: Sequence[View], usual: float) -> float:
+    """Move each photograph to where the model says that it was taken; returns how far pictures move, px. usual: px by
+    which they were found to lie beside."""
+    after, depths, number = list[Camera](), list[float](), run.step + 1
+    error = run.poses.expected_error(number, usual, SMALLER * POSE_ERROR)
     for view, given in zip(views, run.poses.cameras, strict=True):
         run.refuse_if_stopping()
         small, shown = seen_smaller(run, view)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        smaller = small.camera.focal / view.camera.focal
-        error = smaller * run.poses.expected_error(run.step + 1, POSE_ERROR / smaller)
-        after.append(aligned(small.camera, *pictures, given=given, pose_error=error))
+        expected = error * small.camera.focal / view.camera.focal
+        after.append(aligned(small.camera, *pictures, given=given, pose_error=expected))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]
     depth = median(known) if known else run.scene.extent
-    return run.poses.correct([view.camera for view in views], after, depth, run.step + 1)
+    return run.poses.correct([view.camera for view in views], after, depth, number, error)
 
 
 def judge_blur(run: Run) -> dict[str, float]:

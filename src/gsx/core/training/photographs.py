@@ -9,13 +9,13 @@ from torch import Tensor
 
 from gsx.core.data.scene import View
 from gsx.core.device import uploaded
-from gsx.core.quality.losses import blurred_target
+from gsx.core.quality.losses import moments_of
 from gsx.core.shapes import Float, UInt8
 
 SHARE = 0.25
 """Of a GPU's free memory, at most, that photographs take."""
-BLURRED_BYTES = 1 << 29
-"""Of what SSIM takes of photographs, at most, that is kept."""
+MOMENT_BYTES = 1 << 29
+"""That SSIM's moments of photographs take, at most."""
 
 
 def room_for_photographs(device: torch.device) -> int:
@@ -31,8 +31,8 @@ class Photographs:
     room: int
     """Bytes that are left for more of them."""
     kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
-    blurred: dict[View, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    """What SSIM takes of photographs alone: they and their squares, blurred."""
+    moments: dict[View, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    """What SSIM takes of photographs alone (`moments_of`)."""
     views: Sequence[View] = ()
     """Those that are trained on now."""
 
@@ -43,20 +43,25 @@ class Photographs:
         self.views, wanted = views, set(views)
         for view in [view for view in self.kept if view not in wanted]:
             self.room += self.kept.pop(view).nbytes
-        self.blurred = {view: found for view, found in self.blurred.items() if view in wanted}
+        self.moments = {view: found for view, found in self.moments.items() if view in wanted}
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """What `view.image()` is, on the device."""
         return numbers_of(self.bytes_of(view))
 
-    def blurred_of(self, view: View, compiled: bool) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
-        """What SSIM takes of a photograph alone; None where nothing is kept: compiled code of a GPU finds all at once,
-        and what there is no room for is as soon found anew."""
-        if self.device.type != "cpu":
+    def moments_of(
+        self, view: View, target: Float[Tensor, "3 H W"], compiled: bool
+    ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
+        """What SSIM takes of a photograph alone, `target`; None where it is not kept: compiled code of a GPU finds all
+        at once, and what there is no room for is as soon found anew."""
+        found = self.moments.get(view)
+        if found is not None or self.device.type != "cpu":
+            return found
+        taken = sum(2 * one.nbytes for one, _ in self.moments.values())
+        if taken + 2 * target.nbytes > MOMENT_BYTES:
             return None
-        found = self.blurred.get(view)
-        if found is None and sum(2 * one.nbytes for one, _ in self.blurred.values()) < BLURRED_BYTES:
-            found = self.blurred[view] = blurred_target(self.of(view), compiled=compiled)
+        with torch.no_grad():  # as the loss finds them: by the same compiled code
+            found = self.moments[view] = moments_of(target, compiled=compiled)
         return found
 
     def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:

@@ -27,6 +27,9 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.exposure import shared_spread
 from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
+MEDIAN_SQUARE = 0.4549
+"""Of normally distributed numbers of variance 1."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions:
@@ -59,8 +62,8 @@ class Poses:
     iterations: int = 0
     matrices: Float[Tensor, "N 3 4"] | None = None
     """camera_from_world, rotation and translation; None: those of the scene."""
-    spread: float = math.nan
-    """Px by which photographs were found to lie beside the model, standard deviation along an axis."""
+    error: float = math.nan
+    """Px by which the prior of the last correction took the scene's poses to be wrong, standard deviation."""
     corrected: int = 0
     """The last step before which they were: not again where that step is taken anew."""
     seen: MadeOf = field(default_factory=MadeOf)
@@ -83,12 +86,14 @@ class Poses:
         """Whether a spread of shifts, px, asks for corrections."""
         return self.options.when == "always" or spread > self.options.spread
 
-    def expected_error(self, number: int, least: float) -> float:
-        """Px by which the scene's poses are expected to be wrong at a correction: at the first one as many as were
-        found, then ever fewer, `least` at the last one. Held loosely, those that are far off come near; held firmly,
-        the small errors of each correction do not add up."""
-        steps, wide = self.steps(), max(1.0, self.spread / least)
-        return least * wide ** (1 - steps.index(number) / max(1, len(steps) - 1))
+    def expected_error(self, number: int, usual: float, least: float) -> float:
+        """Px by which the prior of a correction takes the scene's poses to be wrong: as many as is usual at the first
+        one, then ever fewer by the same factor, `least` at the last one. Held loosely those that are far off come near;
+        held firmly the small errors of each correction do not add up. A run that goes on longer holds them no less."""
+        steps = self.steps()
+        left = len(steps) - 1 - steps.index(number)
+        wide = max(1.0, (usual if self.matrices is None else self.error) / least)
+        return least * (wide if self.matrices is None else wide ** (left / (left + 1)))
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -101,13 +106,15 @@ class Poses:
 
     # -- what changes them ---------------------------------------------------------------------------------------------
 
-    def correct(self, before: Sequence[Camera], after: Sequence[Camera], depth: float, number: int) -> float:
+    def correct(
+        self, before: Sequence[Camera], after: Sequence[Camera], depth: float, number: int, error: float
+    ) -> float:
         """Move each pose from one camera to another before a step, less what all motions have in common; returns how
         far pictures move by that, px (root of the mean square). depth: at which moves are weighed against turns, scene
-        units."""
+        units; error: what the prior expected (`expected_error`)."""
         after = without_common(before, after, depth)
         self.take(torch.stack([torch.cat([c.rotation, c.translation[:, None]], 1).double() for c in after]))
-        self.corrected = number
+        self.corrected, self.error = number, error
         steps = torch.stack([in_px(b, a, depth) for b, a in zip(before, after, strict=True)])
         return math.sqrt(float(steps.square().sum(1).mean()))
 
@@ -119,26 +126,42 @@ class Poses:
         """What a checkpoint holds of them; nothing where they are the scene's."""
         if self.matrices is None:
             return {}
-        numbers = {"corrected": torch.tensor(self.corrected), "spread": torch.tensor(self.spread).double()}
-        return {"matrices": self.matrices} | numbers
+        error = torch.tensor(self.error, dtype=torch.float64)
+        return {"matrices": self.matrices, "corrected": torch.tensor(self.corrected), "error": error}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from a checkpoint's tensors; none: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.spread = float(tensors.get("spread", math.nan))
+        self.error = float(tensors.get("error", math.nan))  # nothing is known of it in older checkpoints
 
 
 # -- are they wrong? ---------------------------------------------------------------------------------------------------
 
 
-def spread_of_shifts(pictures: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]]) -> float:
-    """Px by which photographs lie beside renders, standard deviation along an axis: what left and right halves have in
-    common; 0 where too few tell. Pictures are renders, photographs, which pixels count, and px of a photograph in one
-    of theirs."""
+def shifts_by_half(
+    pictures: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]],
+) -> Float[Tensor, "N 2 2"]:
+    """How far to the right and down the left and the right half of each photograph lie beside its render, px; nan where
+    nothing tells. Pictures are renders, photographs, which pixels count, and px of a photograph in one of theirs."""
     found = [[of_half(*picture, right) for right in (False, True)] for picture in pictures]
-    halves = torch.tensor(found, dtype=torch.float64)
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def spread_of_shifts(halves: Float[Tensor, "N 2 2"]) -> float:
+    """Px by which photographs lie beside renders, standard deviation along an axis: what left and right halves have in
+    common; 0 where too few tell."""
     return shared_spread(halves[:, 0], halves[:, 1])
+
+
+def usual_shift(halves: Float[Tensor, "N 2 2"]) -> float:
+    """The same by the median over photographs and axes, which a few that lie far beside hardly change; 0 where that is
+    negative, or nothing tells."""
+    known = halves[halves.isfinite().all(2).all(1)]
+    if not len(known):
+        return 0.0
+    left, right = (known - known.median(0).values).unbind(1)
+    return math.sqrt(max(0.0, float((left * right).median())) / MEDIAN_SQUARE)
 
 
 def of_half(

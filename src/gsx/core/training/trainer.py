@@ -45,6 +45,7 @@ def train(run: Run, plugins: Plugins) -> None:
         plugins.emit.gsx_step_finished(run=run, step=step)
     if run.recorder is not None:
         run.recorder.forget()
+    run.photographs.see(())
     plugins.emit.gsx_training_finished(run=run)
 
 
@@ -160,8 +161,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
     shown = run.resolution.compared(rendering.image, target, view, learning=True)
-    of_target = run.photographs.blurred_of(view, compiled) if counted is None else None
-    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, of_target)
+    moments = run.photographs.moments_of(view, target, compiled) if counted is None else None
+    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, moments)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra

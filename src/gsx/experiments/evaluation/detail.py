@@ -57,7 +57,7 @@ def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
 def powers(picture: Float[Tensor, "C H W"], corners: Sequence[tuple[int, int]]) -> list[float]:
     """Mean square of a picture in each corner of so many lowest frequencies, down and across, over all of its pixels
     and channels; a channel at a time."""
-    square = torch.zeros_like(picture[0]).mT
+    square = picture.new_zeros(picture.shape[2], picture.shape[1])
     for channel in picture:
         square += dct(dct(channel).mT).square_()
     found = [square[:across, :down].sum(dtype=torch.float64) for down, across in corners]
