@@ -106,9 +106,11 @@ def compiled_once(
     traced = sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
 
     def call(*given: Any) -> Any:
-        arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
+        arguments = given
+        if Parameter in map(type, given):
+            arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
         first = arguments[0]
-        if (first[0] if isinstance(first, list) else first).device.type != "cpu":
+        if not (first[0] if isinstance(first, list) else first).is_cpu:
             return traced(*arguments)
         if record(kept, arguments):
             return function(*arguments)

@@ -97,7 +97,8 @@ class Shown:
     given: Motion = STILL
     """From the pose that the prior holds to that of the camera."""
     held: float
-    """Pixels that say as much as the prior does of a pose that is wrong by 1 px."""
+    """Pixels that say as much as the prior does of a pose that is wrong by 1 px: as many at half the size, where as
+    large a part of the scene, and as wrong a pose, have a quarter of the pixels and half of the px."""
 
     def points(self) -> Float[Tensor, "3 P"]:
         """What pixels inside show, in the camera's frame."""
