@@ -81,7 +81,7 @@ def errors_expected(poses: Poses, usual: float, steps: Sequence[int]) -> list[fl
     """At corrections before these steps."""
     out = []
     for number in steps:
-        out.append(poses.expected_error(number, usual, 0.5))
+        out.append(poses.expected_error(number, usual))
         poses.correct(poses.cameras, poses.cameras, DEPTH, number, out[-1])
     return out
 
@@ -239,7 +239,7 @@ def test_views_are_the_same_until_poses_change() -> None:
     assert torch.equal(again.views(views)[3].camera.rotation, made[3].camera.rotation)
     assert (again.corrected, again.error) == (5, 0.7)
     again.restore({name: value for name, value in kept.items() if name != "error"})  # as earlier ones were
-    assert again.expected_error(3, math.nan, 0.5) == 0.5
+    assert again.expected_error(3, math.nan) == 0.5
     poses.restore({})
     assert poses.views(views) is views
 
@@ -256,6 +256,14 @@ def test_appearance_codes_go_with_photographs_whatever_their_pose(tmp_path: Path
     for views, step in ((run.resolution.views(1), 1), (run.photographed, 1), (run.photographed, 10), (own, 10)):
         assert [run.backbone.photograph_of(view.camera, step) for view in views] == list(range(6))
     assert run.backbone.photograph_of(run.scene.test[0].camera, 10) == -1
+
+
+def test_small_photographs_are_not_made_smaller(tmp_path: Path) -> None:
+    settings = tiny_settings(tmp_path, "scene.width=96", "scene.height=72", "iterations=10")
+    run = build(settings, load_scene(settings), tmp_path, training=True)
+    for least, width in ((0, 48), (48 * 36, 48), (48 * 36 + 1, 96)):
+        small, shown = captures.seen_smaller(run, run.scene.train[0], depth=False, least=least)
+        assert (small.camera.width, shown.image.shape[2]) == (width, width)
 
 
 # -- runs ------------------------------------------------------------------------------------------------------------
@@ -294,9 +302,8 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     assert (run.poses.corrected, run.poses.error) == (2, 1.7312345678901233)
     with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
         execute(run, settings, plugins())
-    # px: pictures as small as these are not made smaller
-    expected = [call.kwargs["pose_error"] for call in corrections.call_args_list]
-    assert expected == pytest.approx([(0.5 * 1.7312345678901233) ** 0.5] * 6 + [0.5] * 6)
+    held = [call.kwargs["hold"] for call in corrections.call_args_list]
+    assert held == pytest.approx([250 / (0.5 * 1.7312345678901233)] * 6 + [1000] * 6)
     a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "poses.matrices" in a

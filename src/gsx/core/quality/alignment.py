@@ -25,11 +25,8 @@ ROUNDS, ENOUGH = 10, 0.02
 """Of the search at each size; px, of the last of them."""
 COVERED = 0.5
 """Alpha of a pixel that has a depth."""
-CORRELATED_PIXELS = 62.5
-"""Neighbours differ by the same errors of the model, which tell nothing: so many pixels say as much as one would alone,
-about 8 x 8."""
-POSE_ERROR = 0.25
-"""Px of the picture by which poses are expected to be wrong (standard deviation) where nothing is known of that."""
+HELD = 1000.0
+"""Pixels that say as much as the prior does of a pose that is wrong by 1 px, where nothing is known of its error."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,21 +134,20 @@ def aligned(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None,
     given: Camera | None = None,
-    pose_error: float = POSE_ERROR,
+    hold: float = HELD,
 ) -> Camera:
     """The camera where a photograph was taken, from a render near there; as it is where pictures do not tell.
 
     depth: blending-weighted sum of camera z, scene units, as the rasterizer has it. given: whose pose the prior holds;
-    None: that of the camera. pose_error: px by which it is expected to be wrong, standard deviation.
+    None: that of the camera. hold: pixels that say as much as that of a pose that is wrong by 1 px.
     """
     inside = (alpha > COVERED) & (depth > camera.near * alpha)
     inside = inside if counted is None else inside & counted.to(inside.device)
     z = torch.where(inside, depth.double() / alpha.double().clamp_min(COVERED), 1.0)
     wanted, from_given = grey(photograph), STILL if given is None else motion_to(given, camera)
     counted = None if counted is None else counted.to(inside.device)
-    held = CORRELATED_PIXELS / pose_error**2
     shown = Shown(
-        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=held
+        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=hold
     )
     found = motion_between(shown, wanted)
     if found is None or not mismatch(shown, wanted, found) <= mismatch(shown, wanted, STILL) + ALIKE:

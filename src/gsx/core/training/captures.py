@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.quality.alignment import POSE_ERROR, aligned, usual_depth
+from gsx.core.quality.alignment import aligned, usual_depth
 from gsx.core.quality.distractors import Difference, difference_of, distractors_in
 from gsx.core.quality.motion_blur import Movement, movement_between
 from gsx.core.rasterizer import TiledRendering
@@ -19,7 +19,7 @@ from gsx.core.training.distractors import share_of
 from gsx.core.training.evidence import looked_at, shown_weights
 from gsx.core.training.exposure import LIGHT, Pair, log_gains
 from gsx.core.training.parameter_table import keep_rows
-from gsx.core.training.poses import shifts_by_half, spread_of_shifts, usual_shift
+from gsx.core.training.poses import CORRELATED_PIXELS, shifts_by_half, spread_of_shifts, usual_shift
 from gsx.core.training.render import render
 from gsx.core.training.resolution import coarser
 from gsx.core.training.run import Run
@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 SMALLER = 2
 """By how much smaller pictures are than photographs that exposures, poses and distractors are told from: in a third of
 the time as well."""
+POSE_PIXELS = 1 << 13
+"""Of pictures that poses are told from, at least: those of small photographs are not made smaller."""
 BLUR_PIXELS = 1 << 18
 """Of pictures that movements are estimated from."""
 
@@ -115,14 +117,14 @@ def correct_poses(run: Run, views: Sequence[View], usual: float) -> float:
     """Move each photograph to where the model says that it was taken; returns how far pictures move, px. usual: px by
     which they were found to lie beside."""
     after, depths, number = list[Camera](), list[float](), run.step + 1
-    error = run.poses.expected_error(number, usual, SMALLER * POSE_ERROR)
+    error = run.poses.expected_error(number, usual)
+    hold = CORRELATED_PIXELS / error**2
     for view, given in zip(views, run.poses.cameras, strict=True):
         run.refuse_if_stopping()
-        small, shown = seen_smaller(run, view)
+        small, shown = seen_smaller(run, view, least=POSE_PIXELS)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        expected = error * small.camera.focal / view.camera.focal
-        after.append(aligned(small.camera, *pictures, given=given, pose_error=expected))
+        after.append(aligned(small.camera, *pictures, given=given, hold=hold))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]
     depth = median(known) if known else run.scene.extent
@@ -234,7 +236,9 @@ def gains_between(
     return log_gains(image, photograph, counted).nan_to_num(0.0).exp()
 
 
-def seen_smaller(run: Run, view: View, depth: bool = True) -> tuple[View, TiledRendering]:
-    """(a view at a smaller size, what the model shows there, with depth or without)."""
-    small = coarser(view, run.scene.reduction, SMALLER)
+def seen_smaller(run: Run, view: View, depth: bool = True, least: int = 0) -> tuple[View, TiledRendering]:
+    """(a view at a smaller size, what the model shows there, with depth or without); as it is where fewer pixels than
+    `least` would be left."""
+    pixels = view.camera.width * view.camera.height / SMALLER**2
+    small = coarser(view, run.scene.reduction, SMALLER) if pixels >= least else view
     return small, render(run, small.camera, supersample=1, depth=depth)

@@ -27,6 +27,10 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.exposure import shared_spread
 from gsx.core.training.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
+CORRELATED_PIXELS = 250
+"""Of a photograph, about 16 x 16: neighbours differ by the same errors of the model, and say as much as one of them."""
+LEAST_ERROR = 0.5
+"""Px of a photograph by which a pose is expected to be wrong, at least (standard deviation)."""
 MEDIAN_SQUARE = 0.4549
 """Of normally distributed numbers of variance 1."""
 
@@ -86,14 +90,15 @@ class Poses:
         """Whether a spread of shifts, px, asks for corrections."""
         return self.options.when == "always" or spread > self.options.spread
 
-    def expected_error(self, number: int, usual: float, least: float) -> float:
+    def expected_error(self, number: int, usual: float) -> float:
         """Px by which the prior of a correction takes the scene's poses to be wrong: as many as is usual at the first
-        one, then ever fewer by the same factor, `least` at the last one. Held loosely those that are far off come near;
-        held firmly the small errors of each correction do not add up. A run that goes on longer holds them no less."""
+        one, then ever fewer by the same factor, LEAST_ERROR at the last one. Held loosely those that are far off come
+        near; held firmly the small errors of each correction do not add up. A run that goes on longer holds them no
+        less."""
         steps = self.steps()
         left = len(steps) - 1 - steps.index(number)
-        wide = max(1.0, (usual if self.matrices is None else self.error) / least)
-        return least * (wide if self.matrices is None else wide ** (left / (left + 1)))
+        wide = max(1.0, (usual if self.matrices is None else self.error) / LEAST_ERROR)
+        return LEAST_ERROR * (wide if self.matrices is None else wide ** (left / (left + 1)))
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
