@@ -222,7 +222,7 @@ class KeptFunction:
 
     def code_for(self, arguments: tuple[Any, ...]) -> Code | None:
         """Code that holds for arguments; None where that is left to torch.compile."""
-        kind = (*modes(), *[a.requires_grad if isinstance(a, Tensor) else kind_of(a) for a in arguments])
+        kind = (*modes(), *map(kind_of, arguments))
         codes, named = self.codes.setdefault(kind, []), self.named(arguments)
         for code in codes:
             if code.holds(named):

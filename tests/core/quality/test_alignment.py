@@ -116,8 +116,8 @@ def test_a_pose_that_may_be_far_off_is_held_less() -> None:
     taken, (image, depth) = elsewhere((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)), picture(AT_ORIGIN)
     photograph = picture(taken)[0] + 0.2 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
     moves = [
-        beside(aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None, hold=hold), AT_ORIGIN)
-        for hold in (25000, 1000, 62.5)
+        beside(aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None, held=held), AT_ORIGIN)
+        for held in (25000, 1000, 62.5)
     ]
     assert moves[0] < 0.3
     assert moves[1] == pytest.approx(1.4, abs=0.3)

@@ -302,7 +302,7 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     assert (run.poses.corrected, run.poses.error) == (2, 1.7312345678901233)
     with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
         execute(run, settings, plugins())
-    held = [call.kwargs["hold"] for call in corrections.call_args_list]
+    held = [call.kwargs["held"] for call in corrections.call_args_list]
     assert held == pytest.approx([250 / (0.5 * 1.7312345678901233)] * 6 + [1000] * 6)
     a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()

@@ -111,8 +111,7 @@ class Shown:
         )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
         counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
-        inside = inside == 1
-        return replace(self, camera=camera, image=image, depth=depth, inside=inside, counted=counted)
+        return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted)
 
     @cached_property
     def masked(self) -> Float[Tensor, "1 H W"] | None:
@@ -134,12 +133,12 @@ def aligned(
     photograph: Float[Tensor, "3 H W"],
     counted: Bool[Tensor, "H W"] | None,
     given: Camera | None = None,
-    hold: float = HELD,
+    held: float = HELD,
 ) -> Camera:
     """The camera where a photograph was taken, from a render near there; as it is where pictures do not tell.
 
     depth: blending-weighted sum of camera z, scene units, as the rasterizer has it. given: whose pose the prior holds;
-    None: that of the camera. hold: pixels that say as much as that of a pose that is wrong by 1 px.
+    None: that of the camera. held: pixels that say as much as that of a pose that is wrong by 1 px.
     """
     inside = (alpha > COVERED) & (depth > camera.near * alpha)
     inside = inside if counted is None else inside & counted.to(inside.device)
@@ -147,7 +146,7 @@ def aligned(
     wanted, from_given = grey(photograph), STILL if given is None else motion_to(given, camera)
     counted = None if counted is None else counted.to(inside.device)
     shown = Shown(
-        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=hold
+        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=held
     )
     found = motion_between(shown, wanted)
     if found is None or not mismatch(shown, wanted, found) <= mismatch(shown, wanted, STILL) + ALIKE:

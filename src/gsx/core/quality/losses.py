@@ -128,7 +128,6 @@ def photometric(
 ) -> Float[Tensor, ""]:
     """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image.
 
-    target_moments: `moments_of` it, where they are known. Compiled code of a GPU finds them anew: all is
-    one launch.
+    target_moments: `moments_of` it, where they are known. Compiled code of a GPU finds them anew: all is one launch.
     """
     return Photometric.apply(image, target, ssim_weight, compiled, target_moments)

@@ -360,7 +360,8 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     # in storage a view begins, which enters no code; every other size, dtypes, strides and devices are checked one by
     # one, and 32-bit indices suffice (RasterSettings.compiled_values)
     unchecked = {"SHAPE_ENV"} if loop.__name__ in SHARING else set()
-    options |= {"size_asserts": False}  # the code's own checks of the same sizes: a quarter of what a call costs
+    # what is checked then is not asserted once more by the code itself, which costs a quarter of a call
+    options |= {"size_asserts": False}
     names = [name for name in signature(loop).parameters if name != "rules"]
 
     def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:

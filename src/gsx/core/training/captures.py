@@ -118,13 +118,13 @@ def correct_poses(run: Run, views: Sequence[View], usual: float) -> float:
     which they were found to lie beside."""
     after, depths, number = list[Camera](), list[float](), run.step + 1
     error = run.poses.expected_error(number, usual)
-    hold = CORRELATED_PIXELS / error**2
+    held = CORRELATED_PIXELS / error**2
     for view, given in zip(views, run.poses.cameras, strict=True):
         run.refuse_if_stopping()
         small, shown = seen_smaller(run, view, least=POSE_PIXELS)
         assert shown.depth is not None
         pictures = shown.image, shown.depth, shown.alpha, small.image(), small.counted()
-        after.append(aligned(small.camera, *pictures, given=given, hold=hold))
+        after.append(aligned(small.camera, *pictures, given=given, held=held))
         depths.append(usual_depth(shown.depth, shown.alpha))
     known = [depth for depth in depths if math.isfinite(depth)]
     depth = median(known) if known else run.scene.extent

@@ -95,10 +95,11 @@ class Poses:
         one, then ever fewer by the same factor, LEAST_ERROR at the last one. Held loosely those that are far off come
         near; held firmly the small errors of each correction do not add up. A run that goes on longer holds them no
         less."""
+        if self.matrices is None:
+            return max(LEAST_ERROR, usual)  # which may be nan
         steps = self.steps()
         left = len(steps) - 1 - steps.index(number)
-        wide = max(1.0, (usual if self.matrices is None else self.error) / LEAST_ERROR)
-        return LEAST_ERROR * (wide if self.matrices is None else wide ** (left / (left + 1)))
+        return LEAST_ERROR * max(1.0, self.error / LEAST_ERROR) ** (left / (left + 1))
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
