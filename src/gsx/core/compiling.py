@@ -103,7 +103,11 @@ def compiled_once(
     if left_out:
         keep = {"guard_filter_fn": lambda guards: [guard.guard_type not in left_out for guard in guards]}
         given_options = given_options | keep
-    traced = sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
+
+    @functools.cache
+    def traced() -> Callable[..., Any]:
+        """What is not kept; torch's compiler takes a second to import."""
+        return sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
 
     def call(*given: Any) -> Any:
         arguments = given
@@ -111,11 +115,11 @@ def compiled_once(
             arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
         first = arguments[0]
         if not (first[0] if isinstance(first, list) else first).is_cpu:
-            return traced(*arguments)
+            return traced()(*arguments)
         if record(kept, arguments):
             return function(*arguments)
         code = kept.code_for(arguments)
-        return traced(*arguments) if code is None else code.run(*arguments)
+        return traced()(*arguments) if code is None else code.run(*arguments)
 
     return call
 

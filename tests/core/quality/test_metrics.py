@@ -7,7 +7,6 @@ import pytest
 import pytorch_msssim
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gsx.core.quality import metrics
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
@@ -37,6 +36,8 @@ def test_psnr_of_equal_images_is_infinite() -> None:
 
 
 def test_psnr_agrees_with_torchmetrics() -> None:
+    from torchmetrics.functional.image import peak_signal_noise_ratio  # takes seconds to import
+
     image, target = pictures(40, 30)
     assert psnr(image, target) == pytest.approx(float(peak_signal_noise_ratio(image, target, data_range=1.0)), abs=1e-4)
 
@@ -60,6 +61,8 @@ def test_strips_of_any_height_add_up_to_the_picture(pixels: int, monkeypatch: py
 @pytest.mark.parametrize(("height", "width"), [(32, 40), (8, 20), (6, 6)])
 @pytest.mark.parametrize("noise", [0.02, 0.4])
 def test_torchmetrics_variant_agrees_with_torchmetrics(height: int, width: int, noise: float) -> None:
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     image, target = (picture.double() for picture in pictures(height, width, noise))
     theirs = structural_similarity_index_measure(image[None], target[None], data_range=1.0, sigma=1.5)
     assert ssim(image, target, "torchmetrics") == pytest.approx(float(theirs), abs=1e-6)
