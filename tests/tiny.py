@@ -29,7 +29,6 @@ OVERRIDES = (
     "scene.test_views=2",
     "scene.points=300",
     "scene.samples=1",
-    "rasterizer.chunk=32",
     "training.test_points=2",
     "eval.flight=false",
     "device=cpu",

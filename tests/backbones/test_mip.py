@@ -580,8 +580,7 @@ def test_without_the_filter_the_rules_are_those_asked_for(tmp_path: Path, backbo
     rules = ("rasterizer.dilation=0.7", "rasterizer.compensate=true")
     run = built(tmp_path, backbone, "backbone.filter=none", *rules)
     assert (run.raster.dilation, run.raster.compensate) == (0.7, True)
-    plain = replace(RasterSettings(), path=run.raster.path, chunk=run.raster.chunk)
-    assert built(tmp_path, backbone, "backbone.filter=none").raster == plain
+    assert built(tmp_path, backbone, "backbone.filter=none").raster == replace(RasterSettings(), path=run.raster.path)
 
 
 @pytest.mark.parametrize(
