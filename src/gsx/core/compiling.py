@@ -12,7 +12,9 @@ from torch.nn import Parameter
 from gsx.core.kept_code import KeptFunction, record
 
 Result = TypeVar("Result")
-WHOLE_LOOPS: dict[str, str | int | bool] = {
+OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
+"""Of the compiler: what is looked up by number is looked up by numbers of ours, in lists that have them all."""
+WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
     "cpp.enable_floating_point_contract_flag": "fast",

@@ -15,7 +15,7 @@ from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
-from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, to_lanes
+from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
 from gsx.core.rasterizer.path import warn_once
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.segments import SegmentComposite, cut, segment_job
@@ -88,10 +88,11 @@ def block_moments(
     job.loops.moments(rows, job.basis.x, job.basis.y, job.basis.products, before, behind, gradient, out)
 
 
-def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"]) -> Float[Tensor, "S K V L"]:
-    """Zeros for the moments of all blocks, in the format of their rows."""
+def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"], blended: int) -> Float[Tensor, "S K V L"]:
+    """For the moments of all blocks, in the format of their rows; zeros where not all of them were blended."""
     width = TABLE + job.rules.channels + 2 * job.rules.absolute
-    return rows.new_zeros(*rows.shape[:2], width, rows.shape[3])
+    size = (*rows.shape[:2], width, rows.shape[3])
+    return rows.new_empty(size) if blended == len(rows) else rows.new_zeros(size)
 
 
 # -- chunks --------------------------------------------------------------------------------------------------------
@@ -105,6 +106,12 @@ class Stage:
     groups: slice | Int[Tensor, "B"]
     previous: slice | Int[Tensor, "B"] | None
     """Blocks of the same groups one chunk before."""
+
+    @property
+    def size(self) -> int:
+        """Its number of blocks."""
+        blocks = self.blocks
+        return blocks.stop - blocks.start if isinstance(blocks, slice) else len(blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +197,7 @@ def chunk_moments(
 ) -> Float[Tensor, "S K V L"]:
     """Moments of every entry, back to front; zero for blocks that were not blended."""
     behind = torch.zeros_like(kept.inside)
-    moments = room_for_moments(job, rows)
+    moments = room_for_moments(job, rows, sum(stage.size for stage in kept.stages))
     for stage in reversed(kept.stages):
         rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
         found = take(moments, stage.blocks)
@@ -223,8 +230,8 @@ class CompiledComposite(torch.autograd.Function):
         job, intersections, count, rows, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
         moments = chunk_moments(job, rows, kept, seen)
-        values = job.loops.entry_gradients(rows, moments).mT.flatten(0, 2)
-        total = sum_by_splat(values, intersections, job.lanes.places, count).to(dtype)
+        values = job.loops.entry_gradients(rows, moments).flatten(0, 2)
+        total = sum_by_splat(values, intersections, places_of(job.lanes, intersections), count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)

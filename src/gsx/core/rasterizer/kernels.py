@@ -244,10 +244,14 @@ def moments(
     rules: Rules,
 ) -> None:
     """What `sums_of` makes of what `slopes` finds, into `out`; `behind` is moved in front of the blocks. Both are loops
-    of one call: calls cost, and there are hundreds in a step."""
-    slope, weight, rest = slopes(rows, x, y, before, behind, gradient, rules)
+    of one call: calls cost, and there are hundreds in a step.
+
+    Slopes and weights lie in one tensor: so the compiler sums both in one loop, and nine sums at once keep a core busy.
+    """
+    by_entry, weights, rest = slopes(rows, x, y, before, behind, gradient, rules)
     behind.copy_(rest)
-    out.copy_(sums_of(rows, torch.stack(slope, 1), torch.stack(weight, 1), x, y, products, gradient, rules))
+    slope, weight = torch.stack([*by_entry, *weights], 1).chunk(2, 1)
+    out.copy_(sums_of(rows, slope, weight, x, y, products, gradient, rules))
 
 
 def absolute_moments(
@@ -304,8 +308,9 @@ def shapes_of(rows: Float[Tensor, "S K F *L"], rules: Rules) -> tuple[Tensor, ..
 
 def entry_gradients(
     rows: Float[Tensor, "S K F *L"], moments: Float[Tensor, "S K V *L"], rules: Rules
-) -> Float[Tensor, "S K V *L"]:
-    """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments."""
+) -> Float[Tensor, "S K *L V"]:
+    """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments, numbers of an
+    entry side by side."""
     x, y, u0, u1, u2 = shapes_of(rows, rules)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
     one, mx, my, mxx, mxy, myy, *others = moments.unbind(2)
@@ -313,12 +318,12 @@ def entry_gradients(
     by_u0 = -2 * (u0 * mxx + u1 * mxy + k0 * mx) - x * by_k0
     by_u1 = -2 * (u0 * mxy + u1 * myy + k0 * my) - y * by_k0
     by_u2 = -2 * (u2 * myy + k1 * my) - y * by_k1
-    return torch.stack([-u0 * by_k0, -u1 * by_k0 - u2 * by_k1, by_u0, by_u1, by_u2, one, *others], 2)
+    return torch.stack([-u0 * by_k0, -u1 * by_k0 - u2 * by_k1, by_u0, by_u1, by_u2, one, *others], -1)
 
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"blend": 30, "moments": 50}
+SHARING = {"blend": 30, "moments": 120}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsx.core.compiling import fused
 from gsx.core.device import uploaded
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections
@@ -28,16 +27,16 @@ class Lanes:
 
     tiles: Int[Tensor, "G L"]
     """Tile of each lane; T, one past the last, fills the last group up."""
+    pairs: Int[Tensor, "S K L"]
+    """Pair of each entry, pairs sorted by tile; P, one past the last, behind the end of a list."""
     entries: Int[Tensor, "S K L"]
-    """Row of the screen splat; M, one past the last, is padding."""
+    """Row of each entry's screen splat; M, one past the last, is padding."""
     groups: Int[Tensor, "S"]
     """Group of each block."""
     active: list[int]
     """Groups that have each chunk."""
     bases: list[int]
     """First block of each chunk."""
-    places: Int[Tensor, "P"]
-    """Entry of each pair, pairs sorted by splat."""
 
 
 def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int) -> Lanes:
@@ -45,51 +44,58 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
 
     The first two groups of every `batch` groups get equally many chunks (torch specialises on sizes of one).
     """
-    ranks, tiles, longest = rank_tiles(intersections.starts.diff())
+    tiles, longest = by_length(intersections.starts.diff())
     counts = (longest.cpu() + (chunk - 1)) // chunk  # of each group: those of its first, longest list
     counts = counts[: max(2, int((counts > 0).sum()))]
     counts[1::batch] = counts[::batch][: len(counts[1::batch])]
     active = (len(counts) - counts.bincount().cumsum(0))[:-1]
     bases, blocks = active.cumsum(0) - active, int(active.sum())
-    table = uploaded(torch.stack([active, bases]), ranks.device)
-    places = entry_places(intersections.tiles, intersections.starts, ranks, table[1], chunk)
-    entries = places.new_full((blocks * chunk * LANES,), splats)
-    entries.scatter_(0, places.long(), intersections.splats.int())
+    tiles, table = tiles[: len(counts)], uploaded(torch.stack([active, bases]), tiles.device)
     chunks = torch.repeat_interleave(table[0], output_size=blocks)
+    groups = torch.arange(blocks, device=chunks.device) - table[1][chunks]
+    pairs = pairs_in_blocks(intersections, tiles, groups, chunks, chunk)
+    rows = pad(intersections.splats.int(), (0, 1), value=splats)
     return Lanes(
-        tiles=tiles[: len(counts)],
-        entries=entries.view(blocks, chunk, LANES),
-        groups=torch.arange(blocks, device=chunks.device) - table[1][chunks],
+        tiles=tiles,
+        pairs=pairs,
+        entries=rows.index_select(0, pairs.view(-1)).view(pairs.shape),
+        groups=groups,
         active=active.tolist(),
         bases=bases.tolist(),
-        places=torch.empty_like(places).scatter_(0, intersections.slots, places),
     )
 
 
-def rank_tiles(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "G L"], Int[Tensor, "G"]]:
-    """Rank of every tile by list length, longest first; the tiles by rank in groups, T where lists are empty; and the
-    longest list of each group. At least two groups."""
+def by_length(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "G L"], Int[Tensor, "G"]]:
+    """Tiles in groups, longest lists first, T where a list is empty; and the longest list of each group. At least two
+    groups."""
     lengths, order = torch.sort(lengths, descending=True, stable=True)
-    ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
     count = max(2, -(-len(order) // LANES)) * LANES
     tiles = pad(torch.where(lengths > 0, order, len(order)), (0, count - len(order)), value=len(order))
-    return ranks, tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES].long()
+    return tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES].long()
 
 
-@fused
-def entry_places(
-    tiles: Int[Tensor, "P"], starts: Int[Tensor, "T_1"], ranks: Int[Tensor, "T"], bases: Int[Tensor, "N"], chunk: int
-) -> Int[Tensor, "P"]:
-    """Place of every pair (sorted by tile) in the flat [S K L] entries; fewer than 2^31, as max_pairs sees to.
+def pairs_in_blocks(
+    intersections: TileIntersections,
+    tiles: Int[Tensor, "G L"],
+    groups: Int[Tensor, "S"],
+    chunks: Int[Tensor, "S"],
+    chunk: int,
+) -> Int[Tensor, "S K L"]:
+    """Pair of every entry: those of a list follow each other. There are fewer than 2^31, as max_pairs sees to."""
+    count = len(intersections.splats)
+    edges = pad(intersections.starts.int(), (0, 1), value=count)
+    begin, end = (edges[number].index_select(0, groups) for number in (tiles, tiles + 1))
+    first = begin + (chunks * chunk).int()[:, None]
+    pairs = first[:, None] + torch.arange(chunk, device=first.device, dtype=torch.int32)[:, None]
+    return torch.where(pairs < end[:, None], pairs, count)
 
-    `tiles`, `starts`: those of `TileIntersections`.
-    """
-    # per tile: place of a list's first entry but for its chunk, and where the list begins
-    lane = (ranks // LANES * chunk * LANES + ranks % LANES).int()
-    lane, begin = torch.stack([lane, starts[:-1].int()], 1).index_select(0, tiles).unbind(1)
-    number = torch.arange(len(lane), device=lane.device, dtype=torch.int32) - begin
-    step = torch.div(number, chunk, rounding_mode="floor")
-    return lane + (number - step * chunk) * LANES + (bases * (chunk * LANES)).int().index_select(0, step)
+
+def places_of(lanes: Lanes, intersections: TileIntersections) -> Int[Tensor, "P"]:
+    """Entry of each pair, pairs sorted by splat."""
+    pairs, count = lanes.pairs.view(-1), len(intersections.slots)
+    slots = pad(intersections.slots, (0, 1), value=count).index_select(0, pairs)
+    places = torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
+    return pairs.new_empty(count + 1).scatter_(0, slots, places)[:count]
 
 
 def centres(lanes: Lanes, grid: TileGrid, like: Tensor) -> Float[Tensor, "S 2 1 L"]:
