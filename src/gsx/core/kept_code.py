@@ -40,6 +40,11 @@ CHECKED = ("TENSOR_MATCH", "DUPLICATE_INPUT", "SHAPE_ENV")
 holds of sizes that vary. Other values are looked up, and what the function calls is in the name of the file."""
 
 
+TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_overhead": False}
+"""How torch traces: whatever was compiled before, from which it would guess that more varies; and without a clock of
+its own around every call."""
+
+
 @dataclass(frozen=True, eq=False)
 class Code:
     """What torch made of a function: whether it is right for arguments by name, and the code."""
@@ -278,17 +283,18 @@ class KeptFunction:
         """Name of the file of code for these arguments."""
         varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
         forms = [form_of(value, varying) for value in arguments]
-        about = self.function.__name__, self.digest, sorted(self.options.items()), self.checked
+        about = self.function.__name__, self.digest, sorted(self.options.items()), self.checked, sorted(TRACING.items())
         return f"{self.function.__name__}-{content_key(about, forms, *modes(), machine())}"
 
     def compile(self, arguments: tuple[Any, ...]) -> Any:
         """What torch makes of the function for arguments such as these."""
         options = self.options | {"guard_filter_fn": lambda found: [self.checks(guard) for guard in found]}
+        if "SHAPE_ENV" not in self.checked:
+            arguments = tuple(map(from_the_start, arguments))
         for tensor, axis in self.varying(arguments):
             torch._dynamo.maybe_mark_dynamic(tensor, axis)
         compiled: Any = torch.compile(self.function, fullgraph=True, options=options)
-        # whatever was compiled before: torch would guess from it that more varies
-        with torch._dynamo.config.patch(automatic_dynamic_shapes=False):
+        with torch._dynamo.config.patch(TRACING):
             return compiled.aot_compile((arguments, {}))
 
     def checks(self, guard: Any) -> bool:
@@ -306,6 +312,15 @@ def kind_of(value: Any) -> object:
     if isinstance(value, Tensor):
         return value.requires_grad
     return tuple(map(kind_of, value)) if isinstance(value, list | tuple) else value
+
+
+def from_the_start(value: Any) -> Any:
+    """A tensor (or each of some) as a view that begins where its storage does: where one begins elsewhere, torch asks
+    at every call where that is, and makes nothing of the answer."""
+    if not isinstance(value, Tensor):
+        return type(value)(map(from_the_start, value)) if isinstance(value, list | tuple) else value
+    whole = torch.empty_strided(value.shape, value.stride(), dtype=value.dtype, device=value.device)
+    return whole.copy_(value.detach())[:].requires_grad_(value.requires_grad) if value.storage_offset() else value
 
 
 def code_of(made: Any) -> Code:
