@@ -14,6 +14,9 @@ from gsx.core.kept_code import KeptFunction, record
 Result = TypeVar("Result")
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
 """Of the compiler: what is looked up by number is looked up by numbers of ours, in lists that have them all."""
+IN_VECTORS: dict[str, Any] = {"cpp.enable_tiling_heuristics": False}
+"""Of the compiler: rows whose numbers lie side by side are taken by vectors as well, which it else leaves to scalars
+where many are read; found by trying."""
 WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import WHOLE_LOOPS, compile_rows
+from gsx.core.compiling import IN_VECTORS, WHOLE_LOOPS, compile_rows
 from gsx.core.shapes import Float
 
 BAND_0 = 0.28209479177387814
@@ -40,7 +40,7 @@ def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor,
 @functools.lru_cache
 def compiled_harmonics(degree: int) -> Callable[..., Tensor]:
     """`harmonics_along` and its backward through torch.compile, for any number of offsets."""
-    return compile_rows(harmonics_along, degree)
+    return compile_rows(harmonics_along, degree, options=IN_VECTORS)
 
 
 def contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import OWN_INDICES, compile_rows, compiled_once, with_last
+from gsx.core.compiling import IN_VECTORS, OWN_INDICES, compile_rows, compiled_once, with_last
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
 from gsx.core.shapes import Float, Int
 
@@ -38,7 +38,7 @@ def window(
 def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
     """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
     pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
-    return torch.div(pixel, tile, rounding_mode="floor").clamp(-FAR, FAR).nan_to_num().int() + int(past)
+    return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
 
 
 def box(
@@ -141,13 +141,13 @@ def spans(
     row = top + (place - starts[rank]).int()
     begin, end = row_spans(mean_x, mean_y, (u0, u1, u2), limit, row, tile, reach)
     begin, end = begin.maximum(left), end.minimum(right)
-    return row, begin, (end - begin).clamp_min(0).long()
+    return row, begin, (end - begin).clamp_min(0)
 
 
 @functools.lru_cache
 def compiled_boxes(alpha_min: float, tile: int, reach: float, windowed: bool) -> Callable[..., tuple[Tensor, ...]]:
     """`boxes` of these rules through torch.compile, for any number of splats and any raster."""
-    return compile_rows(boxes, alpha_min, tile, reach, windowed)
+    return compile_rows(boxes, alpha_min, tile, reach, windowed, options=IN_VECTORS)
 
 
 @functools.lru_cache

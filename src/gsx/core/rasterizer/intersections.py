@@ -160,7 +160,7 @@ def pair_tiles(
 ) -> Int[Tensor, "P"]:
     """Tile of every pair, where pairs of a span follow each other from its column `begin` on, the first of them pair
     `before`."""
-    place = torch.arange(line.shape[0], device=line.device)
+    place = torch.arange(line.shape[0], device=line.device, dtype=torch.int32)
     return place + (row * columns + begin - before).index_select(0, line)
 
 
@@ -182,14 +182,14 @@ def sorted_pairs(
     """
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
-    tiles = pair_tiles(line, row, begin, widths.cumsum(0) - widths, columns)
+    tiles = pair_tiles(line, row, begin, widths.cumsum(0, dtype=torch.int32) - widths, columns)
     if needed is not None:
         tiles = torch.where(torch.arange(len(tiles), device=tiles.device) < needed[1], tiles, columns * rows)
     tiles, slots = torch.sort(tiles.to(narrow), stable=True)
-    splats = order[rank].index_select(0, line).index_select(0, slots)
+    splats = order.int().index_select(0, rank).index_select(0, line).index_select(0, slots)
     if needed is not None:
         splats = torch.where(tiles < columns * rows, splats, len(order))
-    counts = torch.zeros_like(order).index_add_(0, rank, widths)
+    counts = widths.new_zeros(len(order)).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
     return TileIntersections(
         splats=splats,

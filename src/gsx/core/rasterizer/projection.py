@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import compile_rows
+from gsx.core.compiling import IN_VECTORS, compile_rows
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import InputError
@@ -194,4 +194,4 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 @functools.lru_cache
 def compiled_geometry(published: bool, compensate: bool, exchange: bool) -> Geometry:
     """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
-    return compile_rows(geometry)
+    return compile_rows(geometry, options=IN_VECTORS)
