@@ -289,6 +289,7 @@ class KeptFunction:
     def compile(self, arguments: tuple[Any, ...]) -> Any:
         """What torch makes of the function for arguments such as these."""
         options = self.options | {"guard_filter_fn": lambda found: [self.checks(guard) for guard in found]}
+        arguments = tuple(map(without_gradient, arguments))
         if "SHAPE_ENV" not in self.checked:
             arguments = tuple(map(from_the_start, arguments))
         for tensor, axis in self.varying(arguments):

@@ -14,8 +14,10 @@ from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.compiled import takes
+from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
+from gsx.experiments.runs.rasterizer_path import compile_now
 from gsx.experiments.trade.rasterizer.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
 from gsx.experiments.trade.rasterizer.subject import Shot, Subject
 
@@ -165,6 +167,8 @@ class Bench:
         row = Row(knob=trial.knob, changes=trial.changes)
         try:
             settings = replace(self.base, **trial.changes)
+            if compiles(settings, self.subject.device.type):
+                compile_now(settings, self.subject.device, helped=True)
             for shot in self.subject.shots:
                 self.render(shot, settings, torch.float32)
             figures = self.figures(self.draw(settings, torch.float32))
