@@ -76,22 +76,10 @@ def padded_table(
     return torch.cat([table, nothing])
 
 
-def block_moments(
-    job: Job,
-    rows: Float[Tensor, "B K F L"],
-    before: Float[Tensor, "B P L"],
-    behind: Float[Tensor, "B P L"],
-    gradient: list[Float[Tensor, "B P L"]],
-    out: Float[Tensor, "B K V L"],
-) -> None:
-    """Moments of some blocks into `out`; `behind` is moved in front of them."""
-    job.loops.moments(rows, job.basis.x, job.basis.y, job.basis.products, before, behind, gradient, out)
-
-
-def room_for_moments(job: Job, rows: Float[Tensor, "S K F L"], blended: int) -> Float[Tensor, "S K V L"]:
-    """For the moments of all blocks, in the format of their rows; zeros where not all of them were blended."""
+def room_for_gradients(job: Job, rows: Float[Tensor, "S K F L"], blended: int) -> Float[Tensor, "S K L V"]:
+    """For the gradients of all entries, in the format of their rows; zeros where not all blocks were blended."""
     width = TABLE + job.rules.channels + 2 * job.rules.absolute
-    size = (*rows.shape[:2], width, rows.shape[3])
+    size = (*rows.shape[:2], rows.shape[3], width)
     return rows.new_empty(size) if blended == len(rows) else rows.new_zeros(size)
 
 
@@ -192,19 +180,19 @@ def blend_chunks(
     return accumulated, kept
 
 
-def chunk_moments(
+def chunk_gradients(
     job: Job, rows: Float[Tensor, "S K F L"], kept: Chunks, gradient: list[Float[Tensor, "G P L"]]
-) -> Float[Tensor, "S K V L"]:
-    """Moments of every entry, back to front; zero for blocks that were not blended."""
-    behind = torch.zeros_like(kept.inside)
-    moments = room_for_moments(job, rows, sum(stage.size for stage in kept.stages))
+) -> Float[Tensor, "S K L V"]:
+    """Gradient of every entry, back to front; zero for blocks that were not blended."""
+    behind, basis = torch.zeros_like(kept.inside), job.basis
+    found = room_for_gradients(job, rows, sum(stage.size for stage in kept.stages))
     for stage in reversed(kept.stages):
         rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
-        found = take(moments, stage.blocks)
-        block_moments(job, take(rows, stage.blocks), kept.before(stage), rest, seen, found)
+        part, own = take(found, stage.blocks), take(rows, stage.blocks)
+        job.loops.gradients(own, basis.x, basis.y, basis.products, kept.before(stage), rest, seen, part)
         if not isinstance(stage.groups, slice):
-            behind[stage.groups], moments[stage.blocks] = rest, found
-    return moments
+            behind[stage.groups], found[stage.blocks] = rest, part
+    return found
 
 
 # -- the autograd function -----------------------------------------------------------------------------------------
@@ -215,23 +203,24 @@ class CompiledComposite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, intersections, job):
+        learning = any(ctx.needs_input_grad)
+        places = places_of(job.lanes, intersections) if learning else None  # while the lists are in the cache
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         ones = means.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
         inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
         accumulated, kept = blend_chunks(job, rows, inside)
-        if any(ctx.needs_input_grad):
-            ctx.kept = (job, intersections, len(means), rows, kept, absgrad is not None, means.dtype)
+        if learning:
+            ctx.kept = (job, intersections, places, len(means), rows, kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, intersections, count, rows, kept, absolute, dtype = ctx.kept
+        job, intersections, places, count, rows, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
-        moments = chunk_moments(job, rows, kept, seen)
-        values = job.loops.entry_gradients(rows, moments).flatten(0, 2)
-        total = sum_by_splat(values, intersections, places_of(job.lanes, intersections), count).to(dtype)
+        values = chunk_gradients(job, rows, kept, seen).flatten(0, 2)
+        total = sum_by_splat(values, intersections, places, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)

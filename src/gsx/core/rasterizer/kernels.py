@@ -232,7 +232,7 @@ def sums_of(
     return torch.stack(sums, 2)
 
 
-def moments(
+def gradients(
     rows: Float[Tensor, "B K F *L"],
     x: Float[Tensor, "P *one"],
     y: Float[Tensor, "P *one"],
@@ -240,18 +240,18 @@ def moments(
     before: Float[Tensor, "B P *L"],
     behind: Float[Tensor, "B P *L"],
     gradient: list[Float[Tensor, "B P *L"]],
-    out: Float[Tensor, "B K V *L"],
+    out: Float[Tensor, "B K *L V"],
     rules: Rules,
 ) -> None:
-    """What `sums_of` makes of what `slopes` finds, into `out`; `behind` is moved in front of the blocks. Both are loops
-    of one call: calls cost, and there are hundreds in a step.
+    """What `entry_gradients` makes of sums of what `slopes` finds, into `out`; `behind` is moved in front of the
+    blocks. All are loops of one call: calls cost, and there are hundreds in a step.
 
     Slopes and weights lie in one tensor: so the compiler sums both in one loop, and nine sums at once keep a core busy.
     """
     by_entry, weights, rest = slopes(rows, x, y, before, behind, gradient, rules)
     behind.copy_(rest)
     slope, weight = torch.stack([*by_entry, *weights], 1).chunk(2, 1)
-    out.copy_(sums_of(rows, slope, weight, x, y, products, gradient, rules))
+    out.copy_(entry_gradients(rows, sums_of(rows, slope, weight, x, y, products, gradient, rules), rules))
 
 
 def absolute_moments(
@@ -323,7 +323,7 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"blend": 30, "moments": 120}
+SHARING = {"blend": 30, "gradients": 120}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
@@ -346,15 +346,14 @@ class Kernels:
     """The compiled loops of one set of rules."""
 
     blend: Callable[..., None]
-    moments: Callable[..., None]
+    gradients: Callable[..., None]
     make_rows: Callable[..., Tensor]
-    entry_gradients: Callable[..., Tensor]
 
 
 @functools.lru_cache
 def kernels(rules: Rules) -> Kernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (blend, moments, make_rows, entry_gradients)
+    loops = (blend, gradients, make_rows)
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 
