@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from gsx.core.allocator import keep_freed_memory
 from gsx.core.errors import GsxError, InputError, nearest
 from gsx.experiments.runs.build import choose_device
 from measuring import adapter
@@ -167,4 +168,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    keep_freed_memory()  # as runs do
     sys.exit(main())

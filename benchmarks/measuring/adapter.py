@@ -1,11 +1,17 @@
 """All that the benchmarks know of the rasterizer's inside. When pairing or blending change shape, mend it here."""
 
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterSettings, compiled
 from gsx.core.rasterizer.compiled import composite_compiled
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
@@ -58,6 +64,35 @@ def blend_screen(
     """Everything behind projection: pair, then blend."""
     pairs = pair_screen(screen, camera, settings)
     return blend_pairs(screen, pairs, camera, settings), pairs
+
+
+LOOPS = {"forward": "blend", "backward": "gradients"}
+"""The compiled loop over blocks of each phase, on a CPU."""
+
+
+@contextmanager
+def loops_timed() -> Iterator[dict[str, float]]:
+    """Milliseconds spent in each compiled loop since the context began, by name."""
+    spent, kernels = defaultdict[str, float](float), compiled.kernels
+
+    def clocked(name: str, loop: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            begun = time.perf_counter()
+            result = loop(*arguments)
+            spent[name] += 1e3 * (time.perf_counter() - begun)
+            return result
+
+        return call
+
+    def watched(rules: Any) -> Any:
+        own = kernels(rules)
+        return type(own)(**{name: clocked(name, loop) for name, loop in vars(own).items()})
+
+    compiled.kernels = watched  # type: ignore[assignment]
+    try:
+        yield spent
+    finally:
+        compiled.kernels = kernels
 
 
 def to_raster(tiles: Float[Tensor, "T P C"], camera: Camera, tile: int) -> Float[Tensor, "C H W"]:

@@ -3,19 +3,20 @@
 import torch
 
 from gsx.core.rasterizer.projection import project
-from measuring.adapter import count_pairs, pair_screen, settings_of
+from measuring.adapter import LOOPS, count_pairs, loops_timed, pair_screen, settings_of
 from measuring.bench import Bench, Row, section
 from measuring.cases import blending, camera_of, gradient_of, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, best, evaluation_limit, measured_limits, sizes_of
 from measuring.results import Section
 from measuring.scaling import base
-from measuring.watches import Timing, take_turns
+from measuring.watches import Job, Timing, take_turns, timed
 
 ABOUT_SHARES = (
     "Of exp: evaluations over exponentials per second. Of exp + flops: over what one exponential and then the "
     "arithmetic would allow at the best of the measured rates; above 1, alphas are got with less than torch's "
-    "exponential. Operations per evaluation:"
+    "exponential. Blending lists, tables and pictures apart: the loops over blocks alone. Operations per evaluation:"
 )
+ALONE = "compiled loops over blocks alone"
 FLOPS = {"forward": sum(FORWARD_FLOPS.values()), "backward": sum(BACKWARD_FLOPS.values())}
 
 
@@ -51,7 +52,20 @@ def time_blending(bench: Bench) -> tuple[dict[str, Timing], dict[str, int]]:
             screen = project(splats_of(case, bench.device), camera, settings)
         jobs[path] = blending(screen, camera, settings, gradient)
         evaluations[path] = count_pairs(pair_screen(screen, camera, settings)) * settings.tile_size**2
-    return take_turns(jobs, bench.device, bench.patience), evaluations
+    timings = take_turns(jobs, bench.device, bench.patience)
+    if bench.device.type == "cpu" and "compiled" in jobs:
+        timings[ALONE], evaluations[ALONE] = loops_of(jobs["compiled"], bench), evaluations["compiled"]
+    return timings, evaluations
+
+
+def loops_of(job: Job, bench: Bench) -> Timing:
+    """What of the phases of a job by the compiled path is spent in its loops over blocks."""
+    rounds = []
+    for _ in range(bench.patience.repeats):
+        with loops_timed() as spent:
+            timed(job, bench.device)
+        rounds.append({phase: spent[name] for phase, name in LOOPS.items()})
+    return Timing(sum(rounds[0].values()), rounds)
 
 
 def rate_row(path: str, phase: str, timing: Timing, evaluations: int, limits: list[Limit]) -> Row:
