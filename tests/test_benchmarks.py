@@ -12,10 +12,12 @@ from torch import Tensor
 import rasterizer as benchmark
 import step
 from gsx.core.errors import InputError
+from gsx.core.rasterizer import compiled
+from gsx.core.rasterizer.kernels import Kernels
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
 from measuring import naive, rival, stages
-from measuring.adapter import settings_of
+from measuring.adapter import LOOPS, loops_timed, settings_of
 from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, backward_bytes, evaluation_limit, forward_bytes
 from measuring.memory import HostPeaks, peak_memory, unmeasurable
@@ -574,6 +576,17 @@ def test_a_stage_is_slower_beyond_a_tenth_and_half_a_millisecond() -> None:
 
     assert step.slower([row(10.0, 10.9), row(1.0, 1.4), row(10.0, 5.0), row(None, 5.0)]) == []
     assert step.slower([row(10.0, 11.2)]) == ["gs3d, loss: 10.0 ms before, 11.2 now"]
+
+
+def test_loops_are_timed_by_the_names_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    loops = {name: lambda *given: given for name in Kernels.__dataclass_fields__}
+    monkeypatch.setattr(compiled, "kernels", lambda _: Kernels(**loops))
+    own = compiled.kernels
+    with loops_timed() as spent:
+        assert [getattr(compiled.kernels(None), name)(7) for name in LOOPS.values()] == [(7,), (7,)]
+    assert set(spent) == set(LOOPS.values())
+    assert min(spent.values()) > 0
+    assert compiled.kernels is own
 
 
 def test_least_times_of_stages_by_hand() -> None:

@@ -20,6 +20,9 @@ from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.experiments.runs.compose import compose
 
+LOOPS = {"forward": "blend", "backward": "gradients"}
+"""The compiled loop over blocks of each phase, on a CPU."""
+
 
 def settings_of(path: str, *overrides: str) -> RasterSettings:
     """The shipped settings of a path (eager, compiled), with overrides such as `rasterizer.tile_size=16`."""
@@ -64,10 +67,6 @@ def blend_screen(
     """Everything behind projection: pair, then blend."""
     pairs = pair_screen(screen, camera, settings)
     return blend_pairs(screen, pairs, camera, settings), pairs
-
-
-LOOPS = {"forward": "blend", "backward": "gradients"}
-"""The compiled loop over blocks of each phase, on a CPU."""
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """Blending against what the machine can do at best."""
 
+import time
+
 import torch
 
 from gsx.core.rasterizer.projection import project
@@ -9,7 +11,7 @@ from measuring.cases import blending, camera_of, gradient_of, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, best, evaluation_limit, measured_limits, sizes_of
 from measuring.results import Section
 from measuring.scaling import base
-from measuring.watches import Job, Timing, take_turns, timed
+from measuring.watches import LEAST, Job, Timing, take_turns, timed
 
 ABOUT_SHARES = (
     "Of exp: evaluations over exponentials per second. Of exp + flops: over what one exponential and then the "
@@ -60,8 +62,10 @@ def time_blending(bench: Bench) -> tuple[dict[str, Timing], dict[str, int]]:
 
 def loops_of(job: Job, bench: Bench) -> Timing:
     """What of the phases of a job by the compiled path is spent in its loops over blocks."""
-    rounds = []
-    for _ in range(bench.patience.repeats):
+    rounds, begun = list[dict[str, float]](), time.perf_counter()
+    while len(rounds) < bench.patience.repeats:
+        if len(rounds) >= LEAST and time.perf_counter() - begun > bench.patience.seconds:
+            break
         with loops_timed() as spent:
             timed(job, bench.device)
         rounds.append({phase: spent[name] for phase, name in LOOPS.items()})

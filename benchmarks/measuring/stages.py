@@ -19,15 +19,16 @@ from gsx.experiments.runs.open import open_run
 VIEWS, UNTIMED = 10, 5
 """Training views that the steps walk through; steps before the clock starts, which compile."""
 REST = "everything else"
-PLACES = {
-    "projection": ("gsx.core.rasterizer.render", "project"),
-    "tiles": ("gsx.core.rasterizer.render", "intersect_tiles"),
-    "lists": ("gsx.core.rasterizer.compiled", "lay_out"),
-    "blending": ("gsx.core.rasterizer.render", "blend"),
-    "blending, backward": ("gsx.core.rasterizer.compiled", "CompiledComposite.backward"),
-    "loss": ("gsx.core.training.trainer", "photometric"),
-    "backward, but for blending": ("torch", "Tensor.backward"),
-}
+PLACES = [
+    ("projection", "gsx.core.rasterizer.render", "project"),
+    ("tiles", "gsx.core.rasterizer.render", "intersect_tiles"),
+    ("lists", "gsx.core.rasterizer.compiled", "lay_out"),
+    ("lists", "gsx.core.rasterizer.compiled", "places_of"),
+    ("blending", "gsx.core.rasterizer.render", "blend"),
+    ("blending, backward", "gsx.core.rasterizer.compiled", "CompiledComposite.backward"),
+    ("loss", "gsx.core.training.trainer", "photometric"),
+    ("backward, but for blending", "torch", "Tensor.backward"),
+]
 """Functions that a stage begins and ends with, where the step looks them up."""
 METHODS = {
     "splats": "draw",
@@ -77,7 +78,7 @@ class StageClock:
 
 def install(clock: StageClock, run: Run) -> None:
     """Have the stages of the run's steps clocked, for the rest of this process. A source may lack some."""
-    for name, (module, path) in PLACES.items():
+    for name, module, path in PLACES:
         *owners, last = path.split(".")
         owner = import_module(module)
         for part in owners:

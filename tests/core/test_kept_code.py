@@ -13,7 +13,7 @@ import torch
 from compilations import new_code
 from torch import Tensor
 
-from gsx.core.compiling import available, compile_rows
+from gsx.core.compiling import available, compile_rows, with_last
 from gsx.core.kept_code import FOLDER, KeptFunction, digest_of, lacking, made_by_one, make_ahead, recorded
 from gsx.core.quality.similarity import compiled_correlate, correlate
 
@@ -198,6 +198,19 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
     with made(monkeypatch) as compiled:
         function(x, y).sum().backward()
     assert compiled == []
+
+
+def test_nobody_asks_where_views_begin_whose_symbols_are_not_checked(folder: Path) -> None:
+    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
+        return [(tensor, 0) for tensor in arguments]
+
+    views = [tuple(tensor[1:] for tensor in rows(count)) for count in (7, 9)]
+    for unchecked, asked in ((set(), True), ({"SHAPE_ENV"}, False)):
+        kept = KeptFunction(with_last(weighted, 2), varying, {}, unchecked)
+        code = kept.make(folder / f"{asked}.bin", views[0])
+        assert ("call_storage_offset" in code.run.__code__.co_names) == asked
+        for x, y in views:
+            torch.testing.assert_close(code.run(x, y), weighted(x, y, 2))
 
 
 OTHER = """

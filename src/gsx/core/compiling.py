@@ -23,7 +23,7 @@ WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
     "cpp.enable_floating_point_contract_flag": "fast",
     "cpp.dynamic_threads": True,
 }
-"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract."""
+"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract; indices are not checked."""
 
 
 @functools.lru_cache

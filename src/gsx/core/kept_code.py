@@ -41,8 +41,8 @@ holds of sizes that vary. Other values are looked up, and what the function call
 
 
 TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_overhead": False}
-"""How torch traces: whatever was compiled before, from which it would guess that more varies; and without a clock of
-its own around every call."""
+"""How torch traces: whatever was compiled before, from which it would guess that more varies; and without marks for its
+profiler around every call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,12 +295,17 @@ class KeptFunction:
         for tensor, axis in self.varying(arguments):
             torch._dynamo.maybe_mark_dynamic(tensor, axis)
         compiled: Any = torch.compile(self.function, fullgraph=True, options=options)
-        with torch._dynamo.config.patch(TRACING):
+        with torch._dynamo.config.patch(known_to_torch(TRACING)):
             return compiled.aot_compile((arguments, {}))
 
     def checks(self, guard: Any) -> bool:
         """Whether one of torch's conditions is checked at every call."""
         return guard.guard_type in self.checked
+
+
+def known_to_torch(settings: dict[str, Any]) -> dict[str, Any]:
+    """Those of dynamo's settings that this torch has."""
+    return {name: value for name, value in settings.items() if hasattr(torch._dynamo.config, name)}
 
 
 def modes() -> tuple[object, ...]:
@@ -316,8 +321,8 @@ def kind_of(value: Any) -> object:
 
 
 def from_the_start(value: Any) -> Any:
-    """A tensor (or each of some) as a view that begins where its storage does: where one begins elsewhere, torch asks
-    at every call where that is, and makes nothing of the answer."""
+    """A tensor without gaps (or each of some) as a view that begins where its storage does: where one begins elsewhere,
+    torch asks at every call where that is, and makes nothing of the answer."""
     if not isinstance(value, Tensor):
         return type(value)(map(from_the_start, value)) if isinstance(value, list | tuple) else value
     whole = torch.empty_strided(value.shape, value.stride(), dtype=value.dtype, device=value.device)
@@ -357,7 +362,7 @@ def record(function: KeptFunction, arguments: tuple[Any, ...]) -> bool:
 
 
 def without_gradient(value: Any) -> Any:
-    """An argument that has gathered no gradient, which code would be told of."""
+    """An argument that has gathered no gradient, which code would be told of; of the same strides if it has no gaps."""
     if not isinstance(value, Tensor) or not value.requires_grad:
         return value
     alone = value.detach().clone(memory_format=torch.preserve_format).requires_grad_()

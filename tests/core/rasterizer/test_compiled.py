@@ -11,7 +11,9 @@ import torch
 from compilations import new_code
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
+from gsx.core.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS
 from gsx.core.gaussians.splats import Splats
+from gsx.core.kept_code import TRACING
 from gsx.core.rasterizer import (
     FixedLists,
     Needed,
@@ -129,6 +131,21 @@ def test_the_compilers_options_are_those_it_knows(monkeypatch: pytest.MonkeyPatc
     older = [name for name in every if name != "realize_cpu_opcount_threshold"]  # torch 2.11
     monkeypatch.setattr(torch._inductor, "list_options", lambda: older)
     assert thresholds() == ["realize_opcount_threshold"]
+    assert set(WHOLE_LOOPS | IN_VECTORS | OWN_INDICES) <= set(older)
+    assert all(hasattr(torch._dynamo.config, name) for name in TRACING)
+
+
+def test_places_of_pairs_are_only_found_for_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("asked for")
+
+    splats = random_splats(300, seed=4)
+    wanted = rasterize(splats, front_camera(), QUICK).image
+    monkeypatch.setattr("gsx.core.rasterizer.compiled.places_of", refuse)
+    with torch.no_grad():
+        torch.testing.assert_close(rasterize(splats, front_camera(), QUICK).image, wanted)
+    with pytest.raises(AssertionError, match="asked for"):
+        rasterize(leaves(splats), front_camera(), QUICK)
 
 
 def test_a_crop_is_the_crop_of_the_picture() -> None:

@@ -328,6 +328,18 @@ def test_what_fails_is_a_row_with_its_reason() -> None:
     assert "must divide 16" in bench.measured(Trial(knob="x", changes={"tile_size": 5})).failure
 
 
+def test_what_is_tried_compiled_is_compiled_by_two_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(settings: RasterSettings, device: torch.device, helped: bool) -> None:
+        raise RuntimeError(f"alpha_min {settings.alpha_min}, helped {helped}")
+
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.bench.compiles", lambda settings, _: settings.path != "eager")
+    monkeypatch.setattr("gsx.experiments.trade.rasterizer.bench.compile_now", refuse)
+    bench = Bench(tiny_subject(), RasterSettings(path="eager"))
+    assert bench.measured(Trial(knob="x", changes={})).failure == ""
+    tried = bench.measured(Trial(knob="x", changes={"path": "compiled", "alpha_min": 0.01}))
+    assert "alpha_min 0.01, helped True" in tried.failure
+
+
 class Scripted(Bench):
     """Takes times from a list and writes down who asked."""
 

@@ -38,7 +38,7 @@ def window(
 def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
     """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
     pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
-    return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
+    return torch.div(pixel, tile, rounding_mode="floor").clamp(-FAR, FAR).nan_to_num().int() + int(past)
 
 
 def box(
@@ -124,19 +124,19 @@ def row_spans(
 
 def spans(
     rank: Int[Tensor, "R"],
-    shapes: Float[Tensor, "6 V"],
-    sides: Int[Tensor, "3 V"],
+    shapes: Float[Tensor, "V 6"],
+    sides: Int[Tensor, "V 4"],
     starts: Int[Tensor, "V"],
     tile: int,
     reach: float,
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"], Int[Tensor, "R"]]:
     """(tile row, first column, number of columns) of every row of tiles of V splats; `rank`: its splat.
 
-    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column; `starts`: number
-    of a splat's first row in the list.
+    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column, past-the-last row;
+    `starts`: number of a splat's first row in the list.
     """
-    mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind())
-    top, left, right = (column[rank] for column in sides.unbind())
+    mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind(1))
+    top, left, right = (column[rank] for column in sides[:, :3].unbind(1))
     place = torch.arange(rank.shape[0], device=rank.device)
     row = top + (place - starts[rank]).int()
     begin, end = row_spans(mean_x, mean_y, (u0, u1, u2), limit, row, tile, reach)
@@ -155,6 +155,6 @@ def compiled_spans(tile: int, reach: float) -> Callable[..., tuple[Tensor, ...]]
     """`spans` of these rules through torch.compile, for any number of splats and rows."""
 
     def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(tensor, tensor.dim() - 1) for tensor in arguments]
+        return [(tensor, 0) for tensor in arguments]
 
     return compiled_once(with_last(spans, tile, reach), varying, OWN_INDICES)

@@ -76,11 +76,12 @@ def padded_table(
     return torch.cat([table, nothing])
 
 
-def room_for_gradients(job: Job, rows: Float[Tensor, "S K F L"], blended: int) -> Float[Tensor, "S K L V"]:
-    """For the gradients of all entries, in the format of their rows; zeros where not all blocks were blended."""
+def room_for_gradients(job: Job, rows: Float[Tensor, "S K F L"], count: int) -> Float[Tensor, "S K L V"]:
+    """Room for the gradient of every entry, in the format of the rows; zeros unless all blocks, `count` of them, were
+    blended."""
     width = TABLE + job.rules.channels + 2 * job.rules.absolute
     size = (*rows.shape[:2], rows.shape[3], width)
-    return rows.new_empty(size) if blended == len(rows) else rows.new_zeros(size)
+    return rows.new_empty(size) if count == len(rows) else rows.new_zeros(size)
 
 
 # -- chunks --------------------------------------------------------------------------------------------------------

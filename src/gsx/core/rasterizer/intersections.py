@@ -145,13 +145,13 @@ def in_order(
     means: Float[Tensor, "M 2"],
     conic_factors: Float[Tensor, "M 3"],
     limits: Float[Tensor, "M"],
-) -> tuple[Int[Tensor, "M"], Float[Tensor, "6 M"], Int[Tensor, "3 M"]]:
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 6"], Int[Tensor, "M 4"]]:
     """(rows of tiles of every splat, and its shape and sides as `spans` wants them), nearest splats first; none where a
     box has no columns."""
-    sides = torch.stack([first[1], first[0], last[0], last[1]])[:, order]
-    heights = (sides[3] - sides[0]).clamp_min(0) * (sides[2] > sides[1])
-    shapes = torch.cat([means.T, conic_factors.T, limits[None]])[:, order]
-    return heights, shapes, sides[:3]
+    sides = torch.stack([first[1], first[0], last[0], last[1]], 1).index_select(0, order)
+    heights = (sides[:, 3] - sides[:, 0]).clamp_min(0) * (sides[:, 2] > sides[:, 1])
+    shapes = torch.cat([means, conic_factors, limits[:, None]], 1).index_select(0, order)
+    return heights, shapes, sides
 
 
 @fused

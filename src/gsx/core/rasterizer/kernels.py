@@ -246,7 +246,7 @@ def gradients(
     """What `entry_gradients` makes of sums of what `slopes` finds, into `out`; `behind` is moved in front of the
     blocks. All are loops of one call: calls cost, and there are hundreds in a step.
 
-    Slopes and weights lie in one tensor: so the compiler sums both in one loop, and nine sums at once keep a core busy.
+    Slopes and weights lie in one tensor: so the compiler sums both in one loop, and sums in parallel keep a core busy.
     """
     by_entry, weights, rest = slopes(rows, x, y, before, behind, gradient, rules)
     behind.copy_(rest)

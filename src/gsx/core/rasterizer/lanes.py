@@ -54,7 +54,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
     chunks = torch.repeat_interleave(table[0], output_size=blocks)
     groups = torch.arange(blocks, device=chunks.device) - table[1][chunks]
     pairs = pairs_in_blocks(intersections, tiles, groups, chunks, chunk)
-    rows = pad(intersections.splats.int(), (0, 1), value=splats)
+    rows = pad(intersections.splats, (0, 1), value=splats)
     return Lanes(
         tiles=tiles,
         pairs=pairs,
@@ -71,7 +71,7 @@ def by_length(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "G L"], Int[Tensor
     lengths, order = torch.sort(lengths, descending=True, stable=True)
     count = max(2, -(-len(order) // LANES)) * LANES
     tiles = pad(torch.where(lengths > 0, order, len(order)), (0, count - len(order)), value=len(order))
-    return tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES].long()
+    return tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES]
 
 
 def pairs_in_blocks(
@@ -81,7 +81,8 @@ def pairs_in_blocks(
     chunks: Int[Tensor, "S"],
     chunk: int,
 ) -> Int[Tensor, "S K L"]:
-    """Pair of every entry: those of a list follow each other. There are fewer than 2^31, as max_pairs sees to."""
+    """Pair of every entry: those of a list follow each other. With what fills blocks up they stay below 2^31, since
+    max_pairs is at most 2^30."""
     count = len(intersections.splats)
     edges = pad(intersections.starts.int(), (0, 1), value=count)
     begin, end = (edges[number].index_select(0, groups) for number in (tiles, tiles + 1))

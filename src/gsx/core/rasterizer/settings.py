@@ -87,7 +87,7 @@ class RasterSettings:
     compiled_values: Annotated[int, Range(0, LARGEST_BATCH)] = 0
     """Compiled path: alpha values evaluated at once (by segments: slopes held at once); 0: 2^22 on a CPU, 2^26 on a
     GPU."""
-    max_pairs: Annotated[int, Range(1, 1 << 31)] = 100_000_000
+    max_pairs: Annotated[int, Range(1, 1 << 30)] = 100_000_000
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
