@@ -1,8 +1,6 @@
 """All that the benchmarks know of the rasterizer's inside. When pairing or blending change shape, mend it here."""
 
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,6 +17,7 @@ from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.experiments.runs.compose import compose
+from measuring.stages import StageClock
 
 LOOPS = {"forward": "blend", "backward": "gradients"}
 """The compiled loop over blocks of each phase, on a CPU."""
@@ -71,25 +70,16 @@ def blend_screen(
 
 @contextmanager
 def loops_timed() -> Iterator[dict[str, float]]:
-    """Milliseconds spent in each compiled loop since the context began, by name."""
-    spent, kernels = defaultdict[str, float](float), compiled.kernels
-
-    def clocked(name: str, loop: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            begun = time.perf_counter()
-            result = loop(*arguments)
-            spent[name] += 1e3 * (time.perf_counter() - begun)
-            return result
-
-        return call
+    """Seconds spent in each compiled loop since the context began, by name."""
+    clock, kernels = StageClock(), compiled.kernels
 
     def watched(rules: Any) -> Any:
         own = kernels(rules)
-        return type(own)(**{name: clocked(name, loop) for name, loop in vars(own).items()})
+        return type(own)(**{name: clock.clocked(name, loop) for name, loop in vars(own).items()})
 
     compiled.kernels = watched  # type: ignore[assignment]
     try:
-        yield spent
+        yield clock.seconds
     finally:
         compiled.kernels = kernels
 

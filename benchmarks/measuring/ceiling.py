@@ -1,7 +1,5 @@
 """Blending against what the machine can do at best."""
 
-import time
-
 import torch
 
 from gsx.core.rasterizer.projection import project
@@ -11,7 +9,7 @@ from measuring.cases import blending, camera_of, gradient_of, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, best, evaluation_limit, measured_limits, sizes_of
 from measuring.results import Section
 from measuring.scaling import base
-from measuring.watches import LEAST, Job, Timing, take_turns, timed
+from measuring.watches import Job, Timing, rounds_of, take_turns, timed
 
 ABOUT_SHARES = (
     "Of exp: evaluations over exponentials per second. Of exp + flops: over what one exponential and then the "
@@ -62,13 +60,11 @@ def time_blending(bench: Bench) -> tuple[dict[str, Timing], dict[str, int]]:
 
 def loops_of(job: Job, bench: Bench) -> Timing:
     """What of the phases of a job by the compiled path is spent in its loops over blocks."""
-    rounds, begun = list[dict[str, float]](), time.perf_counter()
-    while len(rounds) < bench.patience.repeats:
-        if len(rounds) >= LEAST and time.perf_counter() - begun > bench.patience.seconds:
-            break
+    rounds = []
+    for _ in rounds_of(bench.patience):
         with loops_timed() as spent:
             timed(job, bench.device)
-        rounds.append({phase: spent[name] for phase, name in LOOPS.items()})
+        rounds.append({phase: 1e3 * spent[name] for phase, name in LOOPS.items()})
     return Timing(sum(rounds[0].values()), rounds)
 
 

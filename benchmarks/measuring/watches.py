@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -112,6 +112,15 @@ class Timing:
         return statistics.median(sum(each.values()) for each in self.rounds)
 
 
+def rounds_of(patience: Patience) -> Iterator[int]:
+    """Numbers of rounds, as many as there is patience for."""
+    begun = time.perf_counter()
+    for number in range(patience.repeats):
+        if number >= LEAST and time.perf_counter() - begun > patience.seconds:
+            return
+        yield number
+
+
 def take_turns(jobs: Mapping[str, Job], device: torch.device, patience: Patience) -> dict[str, Timing]:
     """Time jobs call by call in turn, so that whatever slows the machine slows all of them.
 
@@ -119,10 +128,7 @@ def take_turns(jobs: Mapping[str, Job], device: torch.device, patience: Patience
     """
     first = {name: sum(timed(job, device).values()) for name, job in jobs.items()}
     rounds: dict[str, list[dict[str, float]]] = {name: [] for name in jobs}
-    begun = time.perf_counter()
-    for number in range(patience.repeats):
-        if number >= LEAST and time.perf_counter() - begun > patience.seconds:
-            break
+    for _ in rounds_of(patience):
         for name, job in jobs.items():
             rounds[name].append(timed(job, device))
     return {name: Timing(first[name], rounds[name]) for name in jobs}

@@ -320,6 +320,14 @@ def kind_of(value: Any) -> object:
     return tuple(map(kind_of, value)) if isinstance(value, list | tuple) else value
 
 
+def without_gradient(value: Any) -> Any:
+    """An argument that has gathered no gradient, which code would be told of; of the same strides if it has no gaps."""
+    if not isinstance(value, Tensor) or not value.requires_grad:
+        return value
+    alone = value.detach().clone(memory_format=torch.preserve_format).requires_grad_()
+    return alone.view_as(alone) if value._is_view() else alone
+
+
 def from_the_start(value: Any) -> Any:
     """A tensor without gaps (or each of some) as a view that begins where its storage does: where one begins elsewhere,
     torch asks at every call where that is, and makes nothing of the answer."""
@@ -357,16 +365,8 @@ def record(function: KeptFunction, arguments: tuple[Any, ...]) -> bool:
     """Whether calls are only to be known; this one is then."""
     calls = RECORDED.get()
     if calls is not None:
-        calls.append((function, tuple(map(without_gradient, arguments)), torch.is_grad_enabled()))
+        calls.append((function, arguments, torch.is_grad_enabled()))
     return calls is not None
-
-
-def without_gradient(value: Any) -> Any:
-    """An argument that has gathered no gradient, which code would be told of; of the same strides if it has no gaps."""
-    if not isinstance(value, Tensor) or not value.requires_grad:
-        return value
-    alone = value.detach().clone(memory_format=torch.preserve_format).requires_grad_()
-    return alone.view_as(alone) if value._is_view() else alone
 
 
 def file_of(call: Call) -> Path | None:

@@ -125,18 +125,18 @@ def row_spans(
 def spans(
     rank: Int[Tensor, "R"],
     shapes: Float[Tensor, "V 6"],
-    sides: Int[Tensor, "V 4"],
+    sides: Int[Tensor, "V 3"],
     starts: Int[Tensor, "V"],
     tile: int,
     reach: float,
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"], Int[Tensor, "R"]]:
     """(tile row, first column, number of columns) of every row of tiles of V splats; `rank`: its splat.
 
-    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column, past-the-last row;
-    `starts`: number of a splat's first row in the list.
+    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column; `starts`: number
+    of a splat's first row in the list.
     """
     mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind(1))
-    top, left, right = (column[rank] for column in sides[:, :3].unbind(1))
+    top, left, right = (column[rank] for column in sides.unbind(1))
     place = torch.arange(rank.shape[0], device=rank.device)
     row = top + (place - starts[rank]).int()
     begin, end = row_spans(mean_x, mean_y, (u0, u1, u2), limit, row, tile, reach)

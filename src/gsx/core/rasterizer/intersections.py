@@ -145,13 +145,13 @@ def in_order(
     means: Float[Tensor, "M 2"],
     conic_factors: Float[Tensor, "M 3"],
     limits: Float[Tensor, "M"],
-) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 6"], Int[Tensor, "M 4"]]:
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 6"], Int[Tensor, "M 3"]]:
     """(rows of tiles of every splat, and its shape and sides as `spans` wants them), nearest splats first; none where a
     box has no columns."""
-    sides = torch.stack([first[1], first[0], last[0], last[1]], 1).index_select(0, order)
-    heights = (sides[:, 3] - sides[:, 0]).clamp_min(0) * (sides[:, 2] > sides[:, 1])
-    shapes = torch.cat([means, conic_factors, limits[:, None]], 1).index_select(0, order)
-    return heights, shapes, sides
+    heights = (last[1] - first[1]).clamp_min(0) * (last[0] > first[0])
+    shapes = torch.cat([means, conic_factors, limits[:, None]], 1)
+    sides = torch.stack([first[1], first[0], last[0]], 1)
+    return heights.index_select(0, order), shapes.index_select(0, order), sides.index_select(0, order)
 
 
 @fused
