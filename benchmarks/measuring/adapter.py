@@ -70,18 +70,17 @@ def blend_screen(
 
 @contextmanager
 def loops_timed() -> Iterator[dict[str, float]]:
-    """Seconds spent in each compiled loop since the context began, by name."""
-    clock, kernels = StageClock(), compiled.kernels
+    """Seconds spent in each compiled loop over blocks since the context began, by name."""
+    clock, settled = StageClock(), compiled.settled
 
-    def watched(rules: Any) -> Any:
-        own = kernels(rules)
-        return type(own)(**{name: clock.clocked(name, loop) for name, loop in vars(own).items()})
+    def watched(loop: Any) -> Any:
+        return clock.clocked(loop.kept.function.__name__, settled(loop))
 
-    compiled.kernels = watched  # type: ignore[assignment]
+    compiled.settled = watched  # type: ignore[assignment]
     try:
         yield clock.seconds
     finally:
-        compiled.kernels = kernels
+        compiled.settled = settled
 
 
 def to_raster(tiles: Float[Tensor, "T P C"], camera: Camera, tile: int) -> Float[Tensor, "C H W"]:

@@ -4,17 +4,21 @@ import os
 import subprocess
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
 from compilations import new_code
 from torch import Tensor
+from torch._inductor.output_code import CompiledFxGraph
 
-from gsx.core.compiling import available, compile_rows, with_last
-from gsx.core.kept_code import FOLDER, KeptFunction, digest_of, lacking, made_by_one, make_ahead, recorded
+from gsx.core import kept_code
+from gsx.core.compiling import available, compile_rows, compiled_once, settled, with_last
+from gsx.core.kept_code import FOLDER, KeptFunction, digest_of, flat, lacking, made_by_one, make_ahead, recorded
 from gsx.core.quality.similarity import compiled_correlate, correlate
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
@@ -211,6 +215,75 @@ def test_nobody_asks_where_views_begin_whose_symbols_are_not_checked(folder: Pat
         assert ("call_storage_offset" in code.run.__code__.co_names) == asked
         for x, y in views:
             torch.testing.assert_close(code.run(x, y), weighted(x, y, 2))
+
+
+def added(x: Tensor, parts: list[Tensor], out: Tensor, weight: float) -> None:
+    """What is compiled here of functions that return nothing: arguments in another order than their code's."""
+    out.copy_(parts[1] - weight * parts[0] + x[:, :1])
+
+
+def all_rows(arguments: tuple[Any, ...]) -> list[tuple[Tensor, int]]:
+    """The rows of all tensors vary."""
+    return [(tensor, 0) for tensor in flat(arguments)]
+
+
+def added_by(call: Callable[..., None], count: int) -> bool:
+    """Whether `call` does what `added` does, with as many rows."""
+    (x, first), (second, out) = rows(count), rows(count + 1)
+    out = out[1:].clone()
+    call(x, [first, second[1:]], out)
+    torch.testing.assert_close(out, second[1:] - 2 * first + x[:, :1])
+    return True
+
+
+@contextmanager
+def layers() -> Iterator[list[object]]:
+    """An entry for each call meanwhile that goes through torch's layers around compiled code."""
+    calls, through = list[object](), CompiledFxGraph.__call__
+    with patch.object(CompiledFxGraph, "__call__", lambda self, inputs: calls.append(self) or through(self, inputs)):
+        yield calls
+
+
+def test_settled_calls_go_to_the_code_itself(folder: Path) -> None:
+    compiled = compiled_once(with_last(added, 2.0), all_rows, {}, {"SHAPE_ENV"}, fullgraph=True)
+    assert added_by(compiled, 6)
+    with layers() as calls:
+        assert added_by(compiled, 4)
+        assert len(calls) == 1
+        call = settled(compiled)
+        assert added_by(call, 5)
+        assert len(calls) == 2  # to see where the code is, with copies
+        assert all(added_by(call, count) for count in (9, 2, 40))
+        assert added_by(settled(compiled), 7)
+        assert len(calls) == 2
+
+
+@pytest.mark.parametrize("problem", ["another interface", "called twice", "something else given"])
+def test_where_the_code_is_not_found_settled_calls_go_through_torch(
+    problem: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched = kept_code.watched
+
+    def otherwise(run: Callable[..., None], arguments: list[Any]) -> object:
+        calls, result = watched(run, arguments)
+        if problem == "another interface":
+            raise AttributeError(problem)
+        if problem == "something else given":
+            calls[0][1].append(torch.zeros(()))
+        return (2 * calls if problem == "called twice" else calls), result
+
+    monkeypatch.setattr(kept_code, "watched", otherwise)
+    call = settled(compiled_once(with_last(added, 2.0), all_rows, {}, {"SHAPE_ENV"}, fullgraph=True))
+    assert added_by(call, 6)
+    with layers() as calls:
+        assert added_by(call, 3)
+    assert len(calls) == 1
+
+
+def test_what_returns_something_is_not_called_directly(folder: Path) -> None:
+    kept = KeptFunction(with_last(weighted, 2), all_rows, {}, set())
+    code = kept.code_for(rows(6))
+    assert code.direct_for(rows(6)) is code.run
 
 
 OTHER = """

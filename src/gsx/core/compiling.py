@@ -3,6 +3,7 @@
 import functools
 import types
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
 import torch
@@ -114,17 +115,47 @@ def compiled_once(
         """What is not kept; torch's compiler takes a second to import."""
         return sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
 
-    def call(*given: Any) -> Any:
+    return CompiledOnce(kept, traced)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledOnce:
+    """A function whose code is looked up by what it is called with."""
+
+    kept: KeptFunction
+    traced: Callable[[], Callable[..., Any]]
+    """The function through torch.compile, where its code cannot be kept."""
+
+    def __call__(self, *given: Any) -> Any:
         arguments = given
         if Parameter in map(type, given):
             arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in given)
+        return self.found(arguments)(*arguments)
+
+    def found(self, arguments: tuple[Any, ...], directly: bool = False) -> Callable[..., Any]:
+        """What these arguments are to be given to; `directly`: by `Code.direct_for`."""
         first = arguments[0]
         if not (first[0] if isinstance(first, list) else first).is_cpu:
-            return traced()(*arguments)
-        if record(kept, arguments):
-            return function(*arguments)
-        code = kept.code_for(arguments)
-        return traced()(*arguments) if code is None else code.run(*arguments)
+            return self.traced()
+        if record(self.kept, arguments):
+            return self.kept.function
+        code = self.kept.code_for(arguments)
+        if code is None:
+            return self.traced()
+        return code.direct_for(arguments) if directly else code.run
+
+
+def settled(function: Callable[..., None]) -> Callable[..., None]:
+    """`function`, which must return nothing, for calls that differ in how many rows their arguments have and in nothing
+    else: a compiled one looks its code up at the first of them, and each goes to it directly."""
+    if not isinstance(function, CompiledOnce):
+        return function
+    found = list[Callable[..., None]]()
+
+    def call(*arguments: Any) -> None:
+        if not found:
+            found.append(function.found(arguments, directly=True))
+        found[0](*arguments)
 
     return call
 

@@ -13,13 +13,14 @@ import logging
 import os
 import platform
 import shutil
+import threading
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import torch
 from torch import Tensor
@@ -45,12 +46,21 @@ TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_ov
 profiler around every call."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Code:
     """What torch made of a function: whether it is right for arguments by name, and the code."""
 
     holds: Callable[[dict[str, Any]], bool]
     run: Callable[..., Any]
+    direct: Callable[..., None] | None = None
+    """`run` without torch's layers, once it was asked for."""
+
+    def direct_for(self, arguments: tuple[Any, ...]) -> Callable[..., None]:
+        """`run` of a function that returns nothing, for arguments that are as these but for their number of rows, which
+        is the same in all that have another."""
+        if self.direct is None:
+            self.direct = without_layers(self.run, arguments)
+        return self.direct
 
 
 def place() -> Path | None:
@@ -340,6 +350,72 @@ def from_the_start(value: Any) -> Any:
 def code_of(made: Any) -> Code:
     """Code and conditions of what torch has made or loaded."""
     return Code(made._artifacts.guard_manager.check, made.fn)
+
+
+# -- torch's layers ----------------------------------------------------------------------------------------------------
+
+WATCHING = threading.Lock()
+"""Held while torch's class is another."""
+
+
+def flat(arguments: Iterable[Any]) -> list[Tensor]:
+    """Arguments, and in place of lists what is in them."""
+    found = list[Tensor]()
+    for value in arguments:
+        found += value if isinstance(value, list) else [value]
+    return found
+
+
+def without_layers(run: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., None]:
+    """`run` of a function that returns nothing, straight to the code that was written for it: what torch does before
+    and after, for the sake of what such functions have not, takes more than twice as long as a call of little work.
+
+    Where that code is, and in which order it wants its tensors and their number of rows, is seen at a call with copies.
+    Where that is not as expected, `run` as it is.
+    """
+    copies = [[v.clone() for v in value] if isinstance(value, list) else value.clone() for value in arguments]
+    tensors = flat(copies)
+    try:
+        calls, result = watched(run, copies)
+    except Exception:  # of an interface that may change; whatever else it is, the next call tells
+        return run
+    if result is not None or len(calls) != 1:
+        return run
+    code, inputs = calls[0]
+    number = {id(tensor): n for n, tensor in enumerate(tensors)}
+    order = [number.get(id(value)) for value in inputs]
+    others = [value for n, value in zip(order, inputs, strict=True) if n is None]
+    if any(isinstance(value, Tensor) or value != len(tensors[0]) for value in others):
+        return run
+
+    def call(*given: Any) -> None:
+        values = flat(given)
+        code([len(values[0]) if n is None else values[n] for n in order])
+
+    return call
+
+
+Met: TypeAlias = tuple[Callable[[list[Any]], Any], list[Any]]
+"""Code that was called, and what it was given."""
+
+
+def watched(run: Callable[..., Any], arguments: Sequence[Any]) -> tuple[list[Met], Any]:
+    """(the code that a call comes to, and what it returns)."""
+    from torch._inductor import output_code
+
+    calls, graphs = list[Met](), cast(Any, output_code.CompiledFxGraph)
+    with WATCHING:
+        through = graphs.__call__
+
+        def noted(graph: Any, inputs: list[Any]) -> Any:
+            calls.append((graph.current_callable, list(inputs)))
+            return through(graph, inputs)
+
+        try:
+            graphs.__call__ = noted
+            return calls, run(*arguments)
+        finally:
+            graphs.__call__ = through
 
 
 # -- ahead -------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from gsx.core.rasterizer import (
     rasterize,
     rasterize_fixed,
 )
-from gsx.core.rasterizer.compiled import available, takes
+from gsx.core.rasterizer.compiled import Chunks, Rows, Stage, available, room_for_gradients, takes
 from gsx.core.rasterizer.kernels import EXP_TOP, exp_polynomial, kernels, thresholds
 from gsx.core.rasterizer.segment_kernels import segment_kernels
 from gsx.core.rasterizer.segments import parts
@@ -146,6 +146,20 @@ def test_places_of_pairs_are_only_found_for_gradients(monkeypatch: pytest.Monkey
         torch.testing.assert_close(rasterize(splats, front_camera(), QUICK).image, wanted)
     with pytest.raises(AssertionError, match="asked for"):
         rasterize(leaves(splats), front_camera(), QUICK)
+
+
+def test_room_for_gradients_is_zero_where_no_slice_was_blended() -> None:
+    rows = torch.rand(9, 2, 12, 16)
+    picked = torch.tensor([4, 6])
+    stages = [Stage(range(2, 4), range(2), None), Stage(picked, picked, None), Stage(range(7, 8), range(2), None)]
+    kept = Chunks(stages, Rows(rows), Rows(rows), Rows(rows))
+    torch.use_deterministic_algorithms(True)  # what is not written is not a number
+    try:
+        found = room_for_gradients(kept, 9)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert found.shape == (9, 2, 16, 9)
+    assert [bool((block == 0).all()) for block in found] == [True, True, False, False, True, True, True, False, True]
 
 
 def test_a_crop_is_the_crop_of_the_picture() -> None:

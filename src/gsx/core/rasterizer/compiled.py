@@ -6,13 +6,14 @@ whose pixels have all ended leave. `segments`: all blocks of all tiles at once (
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import available
+from gsx.core.compiling import available, settled
 from gsx.core.rasterizer.fixed_lists import FixedLists
-from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of
+from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
@@ -76,31 +77,37 @@ def padded_table(
     return torch.cat([table, nothing])
 
 
-def room_for_gradients(job: Job, rows: Float[Tensor, "S K F L"], count: int) -> Float[Tensor, "S K L V"]:
-    """Room for the gradient of every entry, in the format of the rows; zeros unless all blocks, `count` of them, were
-    blended."""
-    width = TABLE + job.rules.channels + 2 * job.rules.absolute
-    size = (*rows.shape[:2], rows.shape[3], width)
-    return rows.new_empty(size) if count == len(rows) else rows.new_zeros(size)
-
-
 # -- chunks --------------------------------------------------------------------------------------------------------
+
+
+Where: TypeAlias = range | Int[Tensor, "B"]
+"""Rows that follow each other, or indices once groups have left."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One chunk of some groups of a batch: slices, or indices once groups have left."""
+    """One chunk of some groups of a batch."""
 
-    blocks: slice | Int[Tensor, "B"]
-    groups: slice | Int[Tensor, "B"]
-    previous: slice | Int[Tensor, "B"] | None
+    blocks: Where
+    groups: Where
+    previous: Where | None
     """Blocks of the same groups one chunk before."""
 
-    @property
-    def size(self) -> int:
-        """Its number of blocks."""
-        blocks = self.blocks
-        return blocks.stop - blocks.start if isinstance(blocks, slice) else len(blocks)
+
+class Rows:
+    """A tensor by its rows, of which the same are wanted again and again: a view takes as long as a small chunk."""
+
+    def __init__(self, values: Float[Tensor, "N *rest"]) -> None:
+        self.values, self.views = values, dict[range, Tensor]()
+
+    def take(self, where: Where) -> Float[Tensor, "B *rest"]:
+        """Rows as a view of something: torch compiles anew for arguments that are no views."""
+        if not isinstance(where, range):
+            return self.values[where][:]
+        view = self.views.get(where)
+        if view is None:
+            view = self.views[where] = self.values[where.start : where.stop]
+        return view
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,18 +115,16 @@ class Chunks:
     """What the chunk schedule keeps for its way back."""
 
     stages: list[Stage]
-    inside: Float[Tensor, "G P L"]
-    after: Float[Tensor, "S P L"]
-    """Transmittance behind every block."""
+    rows: Rows
+    """[S K F L]."""
+    inside: Rows
+    """[G P L]."""
+    after: Rows
+    """Transmittance behind every block, [S P L]."""
 
     def before(self, stage: Stage) -> Float[Tensor, "B P L"]:
         """Transmittance in front of a stage's blocks."""
-        return take(self.inside, stage.groups) if stage.previous is None else take(self.after, stage.previous)
-
-
-def take(values: Float[Tensor, "N *rest"], where: slice | Int[Tensor, "B"]) -> Float[Tensor, "B *rest"]:
-    """Rows as a view of something: torch compiles anew for arguments that are no views."""
-    return values[where] if isinstance(where, slice) else values[where][:]
+        return self.inside.take(stage.groups) if stage.previous is None else self.after.take(stage.previous)
 
 
 def stage_of(job: Job, number: int, begin: int, left: Int[Tensor, "B"] | None) -> Stage | None:
@@ -130,70 +135,74 @@ def stage_of(job: Job, number: int, begin: int, left: Int[Tensor, "B"] | None) -
     end, base = min(lanes.active[number], begin + job.batch), lanes.bases[number]
     last = lanes.bases[number - 1] if number else 0
     if left is None:
-        previous = slice(last + begin, last + end) if number else None
-        return Stage(slice(base + begin, base + end), slice(begin, end), previous)
+        previous = range(last + begin, last + end) if number else None
+        return Stage(range(base + begin, base + end), range(begin, end), previous)
     groups = left[left < end]
     return Stage(base + groups, groups, last + groups) if len(groups) else None
 
 
 def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
     """Groups that go on, where enough have ended for the others to be picked out; at least two, for the compiler."""
-    going = kept.after[stage.blocks].amax((1, 2)) >= job.rules.stop  # a pixel of theirs has not ended
+    going = kept.after.take(stage.blocks).amax((1, 2)) >= job.rules.stop  # a pixel of theirs has not ended
     total = int(going.sum())
     if total > WORTH_LEAVING * len(going):
         return None
     going[: 2 if total else 0] = True
     groups = stage.groups
-    if isinstance(groups, slice):
+    if isinstance(groups, range):
         groups = torch.arange(groups.start, groups.stop, device=going.device)
     return groups[going]
-
-
-def blend_stage(
-    job: Job, stage: Stage, rows: Float[Tensor, "S K F L"], accumulated: list[Float[Tensor, "G P L"]], kept: Chunks
-) -> None:
-    """Blend one stage into `accumulated` and `kept.after`."""
-    part = [take(channel, stage.groups) for channel in accumulated]
-    picked = not isinstance(stage.blocks, slice)
-    after = take(kept.after, stage.blocks)
-    job.loops.blend(take(rows, stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
-    if picked:
-        kept.after[stage.blocks] = after
-        for channel, value in zip(accumulated, part, strict=True):
-            channel[stage.groups] = value
 
 
 def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
     """Channels and coverage, front to back."""
-    accumulated = [torch.zeros_like(inside) for _ in range(job.rules.channels + 1)]
-    kept = Chunks([], inside, inside.new_empty(len(rows), *inside.shape[1:]))
+    accumulated = [Rows(torch.zeros_like(inside)) for _ in range(job.rules.channels + 1)]
+    kept = Chunks([], Rows(rows), Rows(inside), Rows(inside.new_empty(len(rows), *inside.shape[1:])))
+    blend = settled(job.loops.blend)
     for begin in range(0, len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, begin, left)) is not None:
-            blend_stage(job, stage, rows, accumulated, kept)
+            part, after = [channel.take(stage.groups) for channel in accumulated], kept.after.take(stage.blocks)
+            blend(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
+            if left is not None:
+                kept.after.values[stage.blocks] = after
+                for channel, value in zip(accumulated, part, strict=True):
+                    channel.values[stage.groups] = value
             kept.stages.append(stage)
             number += 1
             if number % CHECK_EVERY == 0:
                 fewer = leave(job, stage, kept)
                 left = left if fewer is None else fewer
-    return accumulated, kept
+    return [channel.values for channel in accumulated], kept
 
 
-def chunk_gradients(
-    job: Job, rows: Float[Tensor, "S K F L"], kept: Chunks, gradient: list[Float[Tensor, "G P L"]]
-) -> Float[Tensor, "S K L V"]:
-    """Gradient of every entry, back to front; zero for blocks that were not blended."""
-    behind, basis = torch.zeros_like(kept.inside), job.basis
-    found = room_for_gradients(job, rows, sum(stage.size for stage in kept.stages))
-    for stage in reversed(kept.stages):
-        rest, seen = take(behind, stage.groups), [take(g, stage.groups) for g in gradient]
-        part, own = take(found, stage.blocks), take(rows, stage.blocks)
-        job.loops.gradients(own, basis.x, basis.y, basis.products, kept.before(stage), rest, seen, part)
-        if not isinstance(stage.groups, slice):
-            behind[stage.groups], found[stage.blocks] = rest, part
+def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
+    """Room for `width` numbers of every entry, in the format of the rows; zero but where slices of blocks were
+    blended."""
+    rows, past = kept.rows.values, 0
+    found = rows.new_empty(*rows.shape[:2], rows.shape[3], width)
+    slices = sorted((s.blocks.start, s.blocks.stop) for s in kept.stages if isinstance(s.blocks, range))
+    for begin, end in (*slices, (len(rows), len(rows))):
+        if past < begin:
+            found[past:begin].zero_()
+        past = end
     return found
+
+
+def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "S K L V"]:
+    """Gradient of every entry, back to front; zero for blocks that were not blended."""
+    seen, behind, basis = [Rows(channel) for channel in gradient], Rows(torch.zeros_like(gradient[0])), job.basis
+    found = Rows(room_for_gradients(kept, TABLE + job.rules.channels + 2 * job.rules.absolute))
+    gradients = settled(job.loops.gradients)
+    for stage in reversed(kept.stages):
+        rest, part = behind.take(stage.groups), found.take(stage.blocks)
+        given = kept.before(stage), rest, [channel.take(stage.groups) for channel in seen], part
+        gradients(kept.rows.take(stage.blocks), basis.x, basis.y, basis.products, *given)
+        if not isinstance(stage.groups, range):
+            behind.values[stage.groups], found.values[stage.blocks] = rest, part
+    return found.values
 
 
 # -- the autograd function -----------------------------------------------------------------------------------------
@@ -208,19 +217,18 @@ class CompiledComposite(torch.autograd.Function):
         places = places_of(job.lanes, intersections) if learning else None  # while the lists are in the cache
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
-        ones = means.new_ones(1, job.grid.height, job.grid.width, dtype=job.precision.accumulation)
-        inside = to_lanes(job.grid.to_tiles(ones), job.lanes)[0].clone()  # 0 in border tiles beyond the raster
+        inside = to_lanes(inside_of(job.grid, job.precision.accumulation, means.device), job.lanes)[0].clone()
         accumulated, kept = blend_chunks(job, rows, inside)
         if learning:
-            ctx.kept = (job, intersections, places, len(means), rows, kept, absgrad is not None, means.dtype)
+            ctx.kept = (job, intersections, places, len(means), kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, intersections, places, count, rows, kept, absolute, dtype = ctx.kept
+        job, intersections, places, count, kept, absolute, dtype = ctx.kept
         seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
-        values = chunk_gradients(job, rows, kept, seen).flatten(0, 2)
+        values = chunk_gradients(job, kept, seen).flatten(0, 2)
         total = sum_by_splat(values, intersections, places, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None

@@ -83,3 +83,9 @@ def basis_of(tile: int, dtype: torch.dtype, device: torch.device) -> Basis:
     """That of tiles of so many px."""
     x, y = pixel_centres(tile, torch.empty(0, dtype=dtype, device=device))[:2, :, None].unbind(0)
     return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
+
+
+@functools.lru_cache(maxsize=64)
+def inside_of(grid: TileGrid, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "T 1 P"]:
+    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
+    return grid.to_tiles(torch.ones(1, grid.height, grid.width, dtype=dtype, device=device))

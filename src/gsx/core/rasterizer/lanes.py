@@ -96,7 +96,7 @@ def places_of(lanes: Lanes, intersections: TileIntersections) -> Int[Tensor, "P"
     pairs, count = lanes.pairs.view(-1), len(intersections.slots)
     slots = pad(intersections.slots, (0, 1), value=count).index_select(0, pairs)
     places = torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
-    return pairs.new_empty(count + 1).scatter_(0, slots, places)[:count]
+    return pairs.new_empty(count + 1).index_copy_(0, slots, places)[:count]
 
 
 def centres(lanes: Lanes, grid: TileGrid, like: Tensor) -> Float[Tensor, "S 2 1 L"]:
@@ -113,6 +113,7 @@ def to_lanes(tiles: Float[Tensor, "T C P"], lanes: Lanes) -> list[Float[Tensor, 
 
 def from_lanes(channels: list[Float[Tensor, "G P L"]], lanes: Lanes, count: int) -> Float[Tensor, "T P C"]:
     """Tiles of a picture from channels in lanes; tiles without a list are zero."""
-    values = torch.stack(channels, 3).permute(0, 2, 1, 3)
-    picture = values.new_zeros(count + 1, values.shape[2], values.shape[3])
-    return picture.index_copy_(0, lanes.tiles.view(-1), values.flatten(0, 1))[:count]
+    picture = channels[0].new_zeros(len(channels), count + 1, channels[0].shape[1])
+    for plane, channel in zip(picture, channels, strict=True):
+        plane.index_copy_(0, lanes.tiles.view(-1), channel.mT.flatten(0, 1))
+    return picture[:, :count].permute(1, 2, 0)
