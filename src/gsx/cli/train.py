@@ -11,6 +11,7 @@ from typing import Any
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
+from gsx.core.collector import collecting_nothing
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.core.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
@@ -42,12 +43,12 @@ def verb_train(arguments: list[str]) -> int:
             raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
     if flags:
         return hand_to_hydra(arguments)
-    from gsx.experiments.tables.sweep import is_table
+    with collecting_nothing():
+        from gsx.experiments.runs.compose import compose
+        from gsx.experiments.tables.sweep import is_table
 
     if is_table(arguments):
         return fill_table(arguments)
-    from gsx.experiments.runs.compose import compose
-
     folders: list[Path] = []
     code = train(compose(arguments, loaded := plugins()), loaded, folders)
     return tell_report(code, folders[0])

@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from gsx.core.cache import source_revision
+from gsx.core.collector import collecting_nothing
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import keep_names, write_json
@@ -72,6 +73,7 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
     raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
+@collecting_nothing()
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
 
