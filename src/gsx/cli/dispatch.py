@@ -13,7 +13,6 @@ from gsx.cli.messages import discard_unwritten, explained, set_up_logging, unhea
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
-from gsx.core.collector import end_at_once
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.processes import processes
 
@@ -54,7 +53,6 @@ Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
     141 nobody reads on (`| head`)."""
-    end_at_once()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files as they are, whatever their bytes

@@ -1,6 +1,5 @@
 """Python's collector of reference cycles, where it costs and finds nothing."""
 
-import atexit
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +16,3 @@ def collecting_nothing() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-def end_at_once() -> None:
-    """When this process ends, do not look for cycles among all that it has loaded: that takes most of a second."""
-    atexit.unregister(gc.freeze)
-    atexit.register(gc.freeze)
