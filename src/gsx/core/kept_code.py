@@ -368,7 +368,7 @@ def flat(arguments: Iterable[Any]) -> list[Tensor]:
 
 def without_layers(run: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., None]:
     """`run` of a function that returns nothing, straight to the code that was written for it: what torch does before
-    and after, for the sake of what such functions have not, takes more than twice as long as a call of little work.
+    and after, for the sake of what such functions have not, takes longer than a call of little work.
 
     Where that code is, and in which order it wants its tensors and their number of rows, is seen at a call with copies.
     Where that is not as expected, `run` as it is.
