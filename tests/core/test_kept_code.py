@@ -244,6 +244,11 @@ def layers() -> Iterator[list[object]]:
         yield calls
 
 
+def test_code_of_one_row_is_not_called_for_more(folder: Path) -> None:
+    call = settled(compiled_once(with_last(added, 2.0), all_rows, {}, {"SHAPE_ENV"}, fullgraph=True))
+    assert all(added_by(call, count) for count in (1, 5, 1, 3))
+
+
 def test_settled_calls_go_to_the_code_itself(folder: Path) -> None:
     compiled = compiled_once(with_last(added, 2.0), all_rows, {}, {"SHAPE_ENV"}, fullgraph=True)
     assert added_by(compiled, 6)
@@ -258,9 +263,9 @@ def test_settled_calls_go_to_the_code_itself(folder: Path) -> None:
         assert len(calls) == 2
 
 
-@pytest.mark.parametrize("problem", ["another interface", "called twice", "something else given"])
+@pytest.mark.parametrize("problem", ["another interface", "called twice", torch.zeros(()), 17])
 def test_where_the_code_is_not_found_settled_calls_go_through_torch(
-    problem: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    problem: object, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watched = kept_code.watched
 
@@ -268,9 +273,10 @@ def test_where_the_code_is_not_found_settled_calls_go_through_torch(
         calls, result = watched(run, arguments)
         if problem == "another interface":
             raise AttributeError(problem)
-        if problem == "something else given":
-            calls[0][1].append(torch.zeros(()))
-        return (2 * calls if problem == "called twice" else calls), result
+        if problem == "called twice":
+            return 2 * calls, result
+        calls[0][1].append(problem)  # something else is given
+        return calls, result
 
     monkeypatch.setattr(kept_code, "watched", otherwise)
     call = settled(compiled_once(with_last(added, 2.0), all_rows, {}, {"SHAPE_ENV"}, fullgraph=True))

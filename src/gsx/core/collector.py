@@ -1,4 +1,4 @@
-"""Python's collector of reference cycles, where it costs and finds nothing."""
+"""Python's collector of reference cycles, where it costs and finds next to nothing."""
 
 import gc
 from collections.abc import Iterator

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.kept_code import KeptFunction, record
+from gsx.core.kept_code import KeptFunction, flat, record
 
 Result = TypeVar("Result")
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
@@ -133,9 +133,8 @@ class CompiledOnce:
         return self.found(arguments)(*arguments)
 
     def found(self, arguments: tuple[Any, ...], directly: bool = False) -> Callable[..., Any]:
-        """What these arguments are to be given to; `directly`: by `Code.direct_for`."""
-        first = arguments[0]
-        if not (first[0] if isinstance(first, list) else first).is_cpu:
+        """The code that holds for these arguments; `directly`: by `Code.direct_for`."""
+        if not flat(arguments[:1])[0].is_cpu:
             return self.traced()
         if record(self.kept, arguments):
             return self.kept.function
@@ -147,15 +146,20 @@ class CompiledOnce:
 
 def settled(function: Callable[..., None]) -> Callable[..., None]:
     """`function`, which must return nothing, for calls that differ in how many rows their arguments have and in nothing
-    else: a compiled one looks its code up at the first of them, and each goes to it directly."""
+    else: of a compiled one whose code is kept, that is looked up at the first call with more than one row, and called
+    directly from then on. Parameters are none of its arguments."""
     if not isinstance(function, CompiledOnce):
         return function
     found = list[Callable[..., None]]()
 
     def call(*arguments: Any) -> None:
-        if not found:
+        if found:
+            found[0](*arguments)
+        elif len(flat(arguments)[0]) > 1:
             found.append(function.found(arguments, directly=True))
-        found[0](*arguments)
+            found[0](*arguments)
+        else:  # torch makes code of its own for one row, which is wrong for more
+            function(*arguments)
 
     return call
 

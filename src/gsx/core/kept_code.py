@@ -56,8 +56,8 @@ class Code:
     """`run` without torch's layers, once it was asked for."""
 
     def direct_for(self, arguments: tuple[Any, ...]) -> Callable[..., None]:
-        """`run` of a function that returns nothing, for arguments that are as these but for their number of rows, which
-        is the same in all that have another."""
+        """`run` of a function that returns nothing, for arguments that are as these but for how many rows those have
+        whose number varies: all equally many, here and then more than one."""
         if self.direct is None:
             self.direct = without_layers(self.run, arguments)
         return self.direct
@@ -355,7 +355,7 @@ def code_of(made: Any) -> Code:
 # -- torch's layers ----------------------------------------------------------------------------------------------------
 
 WATCHING = threading.Lock()
-"""Held while torch's class is another."""
+"""Held by who watches: one at a time. Other threads go on calling compiled code."""
 
 
 def flat(arguments: Iterable[Any]) -> list[Tensor]:
@@ -400,15 +400,16 @@ Met: TypeAlias = tuple[Callable[[list[Any]], Any], list[Any]]
 
 
 def watched(run: Callable[..., Any], arguments: Sequence[Any]) -> tuple[list[Met], Any]:
-    """(the code that a call comes to, and what it returns)."""
+    """(the code that a call comes to in this thread, and what it returns)."""
     from torch._inductor import output_code
 
-    calls, graphs = list[Met](), cast(Any, output_code.CompiledFxGraph)
+    calls, graphs, own = list[Met](), cast(Any, output_code.CompiledFxGraph), threading.get_ident()
     with WATCHING:
         through = graphs.__call__
 
         def noted(graph: Any, inputs: list[Any]) -> Any:
-            calls.append((graph.current_callable, list(inputs)))
+            if threading.get_ident() == own:
+                calls.append((graph.current_callable, list(inputs)))
             return through(graph, inputs)
 
         try:

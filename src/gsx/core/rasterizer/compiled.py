@@ -19,7 +19,7 @@ from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, k
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
 from gsx.core.rasterizer.path import warn_once
 from gsx.core.rasterizer.precision import Precision
-from gsx.core.rasterizer.segments import SegmentComposite, cut, segment_job
+from gsx.core.rasterizer.segments import SegmentComposite, cut, parts, segment_job
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
 
@@ -116,9 +116,9 @@ class Chunks:
 
     stages: list[Stage]
     rows: Rows
-    """[S K F L]."""
+    """What blending reads of every entry, [S K F L]."""
     inside: Rows
-    """[G P L]."""
+    """1 at pixels of the raster, 0 at those of border tiles beyond it, [G P L]."""
     after: Rows
     """Transmittance behind every block, [S P L]."""
 
@@ -127,12 +127,12 @@ class Chunks:
         return self.inside.take(stage.groups) if stage.previous is None else self.after.take(stage.previous)
 
 
-def stage_of(job: Job, number: int, begin: int, left: Int[Tensor, "B"] | None) -> Stage | None:
-    """Chunk `number` of the batch from group `begin`, or of the groups `left`; None where no group has it."""
-    lanes = job.lanes
+def stage_of(job: Job, number: int, batch: slice, left: Int[Tensor, "B"] | None) -> Stage | None:
+    """Chunk `number` of a batch of groups, or of those of them that are `left`; None where no group has it."""
+    lanes, begin = job.lanes, batch.start
     if number >= len(lanes.active) or lanes.active[number] <= begin:
         return None
-    end, base = min(lanes.active[number], begin + job.batch), lanes.bases[number]
+    end, base = min(lanes.active[number], batch.stop), lanes.bases[number]
     last = lanes.bases[number - 1] if number else 0
     if left is None:
         previous = range(last + begin, last + end) if number else None
@@ -161,9 +161,9 @@ def blend_chunks(
     accumulated = [Rows(torch.zeros_like(inside)) for _ in range(job.rules.channels + 1)]
     kept = Chunks([], Rows(rows), Rows(inside), Rows(inside.new_empty(len(rows), *inside.shape[1:])))
     blend = settled(job.loops.blend)
-    for begin in range(0, len(inside), job.batch):
+    for batch in parts(len(inside), job.batch):
         number, left = 0, None
-        while (stage := stage_of(job, number, begin, left)) is not None:
+        while (stage := stage_of(job, number, batch, left)) is not None:
             part, after = [channel.take(stage.groups) for channel in accumulated], kept.after.take(stage.blocks)
             blend(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
             if left is not None:

@@ -85,7 +85,7 @@ def basis_of(tile: int, dtype: torch.dtype, device: torch.device) -> Basis:
     return Basis(x=x.contiguous(), y=y.contiguous(), products=torch.stack([x * x, x * y, y * y]))
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=2)
 def inside_of(grid: TileGrid, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "T 1 P"]:
-    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
+    """1 at pixels of the raster, 0 at those of border tiles beyond it; few are kept, they are as large as a picture."""
     return grid.to_tiles(torch.ones(1, grid.height, grid.width, dtype=dtype, device=device))

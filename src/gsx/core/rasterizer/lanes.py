@@ -42,7 +42,8 @@ class Lanes:
 def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int) -> Lanes:
     """Lay the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
 
-    The first two groups of every `batch` groups get equally many chunks (torch specialises on sizes of one).
+    The first two groups of every `batch` groups get equally many chunks, and no batch has a single group: torch
+    specialises on sizes of one.
     """
     tiles, longest = by_length(intersections.starts.diff())
     counts = (longest.cpu() + (chunk - 1)) // chunk  # of each group: those of its first, longest list
