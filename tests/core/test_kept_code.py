@@ -215,12 +215,9 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
 
 
 def test_nobody_asks_where_views_begin_whose_symbols_are_not_checked(folder: Path) -> None:
-    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(tensor, 0) for tensor in arguments]
-
     views = [tuple(tensor[1:] for tensor in rows(count)) for count in (7, 9)]
     for unchecked, asked in ((set(), True), ({"SHAPE_ENV"}, False)):
-        kept = KeptFunction(with_last(weighted, 2), varying, {}, unchecked)
+        kept = KeptFunction(with_last(weighted, 2), all_rows, {}, unchecked)
         code = kept.make(folder / f"{asked}.bin", views[0])
         assert ("call_storage_offset" in code.run.__code__.co_names) == asked
         for x, y in views:

@@ -153,13 +153,9 @@ def settled(function: Callable[..., None]) -> Callable[..., None]:
     found = list[Callable[..., None]]()
 
     def call(*arguments: Any) -> None:
-        if found:
-            found[0](*arguments)
-        elif len(flat(arguments)[0]) > 1:
+        if not found and len(flat(arguments)[0]) > 1:  # of one row torch makes code of its own, wrong for more
             found.append(function.found(arguments, directly=True))
-            found[0](*arguments)
-        else:  # torch makes code of its own for one row, which is wrong for more
-            function(*arguments)
+        (found[0] if found else function)(*arguments)
 
     return call
 

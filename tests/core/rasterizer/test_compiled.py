@@ -52,13 +52,10 @@ def test_picture_and_gradient_are_those_of_the_truth(schedule: str, scene: str) 
 
 @pytest.mark.parametrize("size", [(40, 56), (64, 64)])
 def test_small_batches_draw_the_truth(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    groups, blend = (
-        [],
-        kernels.__wrapped__,
-    )  # two at once would leave the last of three alone, which torch specialises on
+    groups = list[int]()  # of each call; two at once would leave the last of three alone, and torch specialises on that
 
     def watched(rules: Rules) -> Kernels:
-        own = blend(rules)
+        own = kernels(rules)
         return replace(own, blend=lambda rows, *others: groups.append(len(rows)) or own.blend(rows, *others))
 
     monkeypatch.setattr("gsx.core.rasterizer.compiled.kernels", watched)

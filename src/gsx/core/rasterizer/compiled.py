@@ -5,6 +5,7 @@ whose pixels have all ended leave. `segments`: all blocks of all tiles at once (
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -154,6 +155,16 @@ def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
     return groups[going]
 
 
+def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated: list[Rows], kept: Chunks) -> None:
+    """Blend one stage by `blend` into `accumulated` and `kept.after`."""
+    part, after = [channel.take(stage.groups) for channel in accumulated], kept.after.take(stage.blocks)
+    blend(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
+    if not isinstance(stage.groups, range):
+        kept.after.values[stage.blocks] = after
+        for channel, value in zip(accumulated, part, strict=True):
+            channel.values[stage.groups] = value
+
+
 def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
@@ -164,12 +175,7 @@ def blend_chunks(
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, batch, left)) is not None:
-            part, after = [channel.take(stage.groups) for channel in accumulated], kept.after.take(stage.blocks)
-            blend(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
-            if left is not None:
-                kept.after.values[stage.blocks] = after
-                for channel, value in zip(accumulated, part, strict=True):
-                    channel.values[stage.groups] = value
+            blend_stage(job, blend, stage, accumulated, kept)
             kept.stages.append(stage)
             number += 1
             if number % CHECK_EVERY == 0:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import WHOLE_LOOPS, compiled_once, with_last
+from gsx.core.kept_code import flat
 from gsx.core.shapes import Float, Int
 
 TABLE = 6
@@ -369,7 +370,7 @@ def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     names = [name for name in signature(loop).parameters if name != "rules"]
 
     def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
-        given = [value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE]
-        return [(tensor, 0) for value in given for tensor in (value if isinstance(value, list) else [value])]
+        given = flat(value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE)
+        return [(tensor, 0) for tensor in given]
 
     return compiled_once(with_last(loop, rules), varying, options, unchecked, fullgraph=True)
