@@ -26,6 +26,8 @@ from gsx.core.kept_code import (
     lacking,
     made_by_one,
     make_ahead,
+    nothing_kept,
+    others_make,
     recorded,
     without_layers,
 )
@@ -203,15 +205,34 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
         function(x, y).sum().backward()
     assert (len(calls), names) == (1, [])
     assert lacking(calls)
+    assert not others_make(calls)
     (file,) = [kept.file(arguments) for kept, arguments, _ in calls]
     with made_by_one(file), file.with_suffix(".lock").open():  # whoever else makes it
+        assert others_make(calls)
         make_ahead(calls)
     assert lacking(calls)
     make_ahead(calls)
     assert not lacking(calls)
+    assert not others_make(calls)
     with made(monkeypatch) as compiled:
         function(x, y).sum().backward()
     assert compiled == []
+
+
+def test_a_compiler_is_not_asked_for_where_calls_are_only_to_be_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsx.core.compiling.complaint", lambda device: f"none for {device}")
+    with recorded():
+        assert available("nothing")
+    assert not available("nothing")
+
+
+def test_a_place_is_new_until_something_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    assert nothing_kept()
+    (tmp_path / FOLDER).mkdir()
+    assert not nothing_kept()
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    assert not nothing_kept()
 
 
 def test_nobody_asks_where_views_begin_whose_symbols_are_not_checked(folder: Path) -> None:

@@ -10,21 +10,22 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.kept_code import KeptFunction, flat, record
+from gsx.core.kept_code import KeptFunction, flat, record, recording
 
 Result = TypeVar("Result")
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
 """Of the compiler: what is looked up by number is looked up by numbers of ours, in lists that have them all."""
+CONTRACTED: dict[str, Any] = {"cpp.enable_floating_point_contract_flag": "fast"}
+"""Of the compiler, for all functions: products and sums contract. It prepares its headers anew for other flags."""
 IN_VECTORS: dict[str, Any] = {"cpp.enable_tiling_heuristics": False}
 """Of the compiler: rows whose numbers lie side by side are taken by vectors as well, which it else leaves to scalars
 where many are read; found by trying."""
 WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
-    "cpp.enable_floating_point_contract_flag": "fast",
     "cpp.dynamic_threads": True,
 }
-"""Of the compiler: an unrolled loop stays in one piece, and products and sums contract; indices are not checked."""
+"""Of the compiler: an unrolled loop stays in one piece; indices are not checked."""
 
 
 @functools.lru_cache
@@ -44,8 +45,8 @@ def few_operations(x: Tensor) -> Tensor:
 
 
 def available(device: str = "cpu") -> bool:
-    """Whether torch.compile works on this machine."""
-    return not complaint(device)
+    """Whether torch.compile works on this machine; taken for granted where calls are only to be known."""
+    return recording() or not complaint(device)
 
 
 def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
@@ -104,7 +105,7 @@ def compiled_once(
     `unchecked`: conditions of torch's, by type, that need not be checked; `fullgraph`: torch raises what it would else
     leave to Python.
     """
-    left_out, given_options = set(unchecked), options or {}
+    left_out, given_options = set(unchecked), CONTRACTED | (options or {})
     kept = KeptFunction(function, varying, given_options, left_out)
     if left_out:
         keep = {"guard_filter_fn": lambda guards: [guard.guard_type not in left_out for guard in guards]}
@@ -113,7 +114,7 @@ def compiled_once(
     @functools.cache
     def traced() -> Callable[..., Any]:
         """What is not kept; torch's compiler takes a second to import."""
-        return sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options or None), varying)
+        return sizes_free(torch.compile(function, fullgraph=fullgraph, options=given_options), varying)
 
     return CompiledOnce(kept, traced)
 

@@ -70,6 +70,12 @@ def place() -> Path | None:
     return Path(own) / FOLDER if own and as_expected() else None
 
 
+def nothing_kept() -> bool:
+    """Whether there is a place in which no function was ever kept."""
+    own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
+    return own is not None and not (Path(own) / FOLDER).exists()
+
+
 @functools.cache
 def as_expected() -> bool:
     """Whether torch has all that is used here of an interface that may change."""
@@ -438,6 +444,11 @@ def recorded() -> Iterator[list[Call]]:
         RECORDED.reset(token)
 
 
+def recording() -> bool:
+    """Whether calls are only to be known."""
+    return RECORDED.get() is not None
+
+
 def record(function: KeptFunction, arguments: tuple[Any, ...]) -> bool:
     """Whether calls are only to be known; this one is then."""
     calls = RECORDED.get()
@@ -467,3 +478,13 @@ def make_ahead(calls: Sequence[Call]) -> None:
 def lacking(calls: Sequence[Call]) -> bool:
     """Whether code for one of these calls is not kept yet."""
     return any(file is None or not file.exists() for file in map(file_of, calls))
+
+
+def others_make(calls: Sequence[Call]) -> bool:
+    """Whether somebody else is making code for one of these calls."""
+    for file in map(file_of, calls):
+        if file is not None and not file.exists():
+            with made_by_one(file) as alone:
+                if not alone:
+                    return True
+    return False

@@ -13,7 +13,7 @@ from raster_scenes import changed, errors_of, front_camera, leaves, random_splat
 
 from gsx.core.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS
 from gsx.core.gaussians.splats import Splats
-from gsx.core.kept_code import TRACING
+from gsx.core.kept_code import TRACING, file_of, recorded
 from gsx.core.rasterizer import (
     FixedLists,
     Needed,
@@ -72,6 +72,11 @@ def test_the_shipped_number_of_unrolled_splats() -> None:
     errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
     assert errors.largest <= 1e-5
     assert errors.gradient <= 1e-4
+    with recorded() as calls:
+        render_with_gradients(splats, front_camera(), rules)
+    loops = {call[0].function.__name__: file_of(call).read_bytes().count(b"#pragma omp for") for call in calls}
+    assert loops["blend"] == 1
+    assert loops["gradients"] <= 9  # slopes, two of sums, and six that lay columns out: more would talk through memory
 
 
 def test_one_tile_size_and_form_of_the_exponent_after_another() -> None:

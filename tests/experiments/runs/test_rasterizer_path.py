@@ -2,21 +2,33 @@
 done, and only then."""
 
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import pytest
 import torch
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from gsx.core.kept_code import Call, KeptFunction, file_of, recorded
+from gsx.core.data.scene import Scene
+from gsx.core.kept_code import FOLDER, Call, KeptFunction, file_of, recorded
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import rasterizer_path
+from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import start
-from gsx.experiments.runs.rasterizer_path import compile_beside, help_compiling, learn_little
+from gsx.experiments.runs.rasterizer_path import (
+    compile_beside,
+    compile_now,
+    help_at_once,
+    help_compiling,
+    learn_little,
+)
+from gsx.experiments.runs.settings import Settings
 
 CPU = torch.device("cpu")
 
@@ -89,7 +101,9 @@ def test_the_first_step_needs_nothing_that_is_not_compiled_before(
     assert further == ({"select"} if backbone in ("octree_gs3d", "scaffold") else set())  # of anchors, and of parts
 
 
-def test_the_helper_makes_the_same_from_the_other_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_helper_makes_from_the_other_end_what_no_backbone_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = []
     monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
     monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
@@ -99,5 +113,87 @@ def test_the_helper_makes_the_same_from_the_other_end(tmp_path: Path, monkeypatc
     with recorded() as calls:
         learn_little(rules, CPU)
     help_compiling(json.dumps({"settings": asdict(rules), "threads": torch.get_num_threads()}))
-    assert made == list(dict.fromkeys(list(files_of(calls[::-1]).values())))
-    assert len(made) == len(files_of(calls)) >= 9
+    expected = {file: name for name, file in files_of(calls[::-1]).items() if not name.startswith("geometry")}
+    assert made == list(expected)
+    assert len(made) == len(files_of(calls)) - 1 >= 8
+
+
+@pytest.fixture
+def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """What becomes of helpers; this process has two threads, and an empty place for what is compiled."""
+    told: list[str] = []
+
+    @contextmanager
+    def noted(settings: RasterSettings) -> Iterator[None]:
+        told.append(f"begins {settings.path}")
+        yield
+        told.append("ends")
+
+    monkeypatch.setattr(rasterizer_path, "helper", noted)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "code"))
+    return told
+
+
+@pytest.mark.parametrize(
+    ("settings", "steps", "device"),
+    [
+        ({"path": "compiled"}, 1, "cpu"),
+        ({"path": "auto", "auto_steps": 300}, 300, "cpu"),
+    ],
+)
+def test_help_begins_at_once_where_nothing_was_ever_compiled(
+    settings: dict[str, Any], steps: int, device: str, helped: list[str], tmp_path: Path
+) -> None:
+    ways = RasterSettings(**settings)
+    with help_at_once(ways, steps, torch.device(device)):
+        assert helped == [f"begins {ways.path}"]
+    assert helped == [f"begins {ways.path}", "ends"]
+    (tmp_path / "code" / FOLDER).mkdir(parents=True)
+    with help_at_once(ways, steps, torch.device(device)):
+        assert len(helped) == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "steps", "device"),
+    [
+        ({"path": "compiled"}, 300, "cuda"),
+        ({"path": "auto", "auto_steps": 300}, 299, "cpu"),
+        ({"path": "eager"}, 300, "cpu"),
+    ],
+)
+def test_no_help_begins_for_what_is_not_compiled_here(
+    settings: dict[str, Any], steps: int, device: str, helped: list[str]
+) -> None:
+    with help_at_once(RasterSettings(**settings), steps, torch.device(device)):
+        assert helped == []
+
+
+def test_a_run_is_helped_from_before_its_scene_is_read_until_it_ends(
+    helped: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = load_scene
+
+    def noted(settings: Settings) -> Scene:
+        helped.append("scene")
+        return read(settings)
+
+    monkeypatch.setattr("gsx.experiments.runs.open.load_scene", noted)
+    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: False)  # nor is anything compiled here
+    settings = tiny_settings(tmp_path / "run", "rasterizer=compiled")
+    with ExitStack() as claims:
+        start(settings, plugins(), claims)
+        helped.append("training")
+    assert helped == ["begins compiled", "scene", "training", "ends"]
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_a_second_helper_does_not_join_the_first(
+    others: bool, helped: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+    monkeypatch.setattr(rasterizer_path, "learn_little", lambda *_: None)
+    monkeypatch.setattr(rasterizer_path, "lacking", lambda _: True)
+    monkeypatch.setattr(rasterizer_path, "others_make", lambda _: others)
+    compile_now(RasterSettings(path="compiled"), CPU, helped=True)
+    assert helped == ([] if others else ["begins compiled", "ends"])

@@ -324,10 +324,11 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"blend": 30, "gradients": 120}
+SHARING = {"blend": 30, "gradients": 25}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
-Found by trying: fewer cuts these loops into several that talk through memory, more multiplies compile times.
+Found by trying: others cut these loops into several that talk through memory (`gradients` by 30 or 36: ten times as
+slow), or multiply compile times (by 120: twice, for code that is no faster).
 """
 
 SHARED_AFTER = 50

@@ -94,6 +94,11 @@ def prepare_process(device: torch.device, training: bool) -> None:
         keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
+    prepare_compiling()
+
+
+def prepare_compiling() -> None:
+    """What torch's compiler reads from the environment of this process, and of those that it starts."""
     keep_compiled_code()
     hasten_compiling()
 

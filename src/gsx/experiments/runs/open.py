@@ -30,11 +30,12 @@ from gsx.experiments.run_folder.run_key import (
     trained_on,
 )
 from gsx.experiments.runs import warm_start
-from gsx.experiments.runs.build import build, choose_device, refuse_uneven
+from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.rasterizer_path import help_at_once
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
 from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
@@ -83,9 +84,12 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         ConfigError, InputError: something is wrong; no folder was made.
     """
     ranks = ranks_here()
-    choose_device(settings.general.device)
+    device = choose_device(settings.general.device)
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
+    if claims is not None and ranks.first:
+        prepare_compiling()
+        claims.enter_context(help_at_once(settings.raster, settings.general.iterations, device))
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
     if settings.general.viewer:

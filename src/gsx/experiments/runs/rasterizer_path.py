@@ -18,7 +18,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.kept_code import lacking, make_ahead, recorded
+from gsx.core.kept_code import Call, file_of, lacking, make_ahead, nothing_kept, others_make, recorded
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.path import compiles
@@ -33,12 +33,26 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     """Settings for a training run of `steps`: path=auto becomes eager or compiled, with a word about why."""
     if settings.path != "auto":
         return settings
-    long_enough = steps >= settings.auto_steps
+    long_enough = asks_for_code(settings, steps)
     compiled = long_enough and available(device.type)
     reason = f"{steps} steps" if compiled or not long_enough else "no working compiler"
     path = "compiled" if compiled else "eager"
     logger.info("rasterizer: %s path (%s; rasterizer=eager or rasterizer=compiled decides otherwise)", path, reason)
     return replace(settings, path=path)
+
+
+def asks_for_code(settings: RasterSettings, steps: int) -> bool:
+    """Whether a training run of `steps` is to be drawn by the compiled path, if that works here."""
+    return settings.path == "compiled" or (settings.path == "auto" and steps >= settings.auto_steps)
+
+
+@contextmanager
+def help_at_once(settings: RasterSettings, steps: int, device: torch.device) -> Iterator[None]:
+    """Where nothing was ever compiled a second process begins with that, as long as the context lasts, while the first
+    one starts; elsewhere it is known later what is lacking."""
+    wanted = device.type == "cpu" and torch.get_num_threads() > 1 and asks_for_code(settings, steps) and nothing_kept()
+    with helper(settings) if wanted else nullcontext():
+        yield
 
 
 def warm(settings: RasterSettings, device: torch.device, helped: bool = True) -> None:
@@ -51,13 +65,20 @@ def warm(settings: RasterSettings, device: torch.device, helped: bool = True) ->
 def compile_now(settings: RasterSettings, device: torch.device, helped: bool = False) -> float:
     """Learn from a small picture, so that all loops get compiled, unless all are kept; returns the seconds it took."""
     begun = time.perf_counter()
-    with recorded() as calls:
-        learn_little(settings, device)
+    calls = needed(settings, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
-        with helper(settings) if helped and torch.get_num_threads() > 1 else nullcontext():
+        alone = helped and torch.get_num_threads() > 1 and not others_make(calls)
+        with helper(settings) if alone else nullcontext():
             make_ahead(calls)
             learn_little(settings, device)
     return time.perf_counter() - begun
+
+
+def needed(settings: RasterSettings, device: torch.device) -> list[Call]:
+    """Calls of all that a step compiles."""
+    with recorded() as calls:
+        learn_little(settings, device)
+    return calls
 
 
 def learn_little(settings: RasterSettings, device: torch.device) -> None:
@@ -72,8 +93,8 @@ def learn_little(settings: RasterSettings, device: torch.device) -> None:
 
 @contextmanager
 def helper(settings: RasterSettings) -> Iterator[None]:
-    """A process that compiles the same from the other end, as long as the context lasts."""
-    words = json.dumps({"settings": asdict(settings), "threads": torch.get_num_threads()})
+    """A process that compiles from the other end what no backbone changes, as long as the context lasts."""
+    words = json.dumps({"settings": asdict(replace(settings, path="compiled")), "threads": torch.get_num_threads()})
     code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
     process = subprocess.Popen(
         [sys.executable, "-P", "-c", code, words],
@@ -92,9 +113,15 @@ def help_compiling(words: str) -> None:
     """What that process does."""
     given = json.loads(words)
     torch.set_num_threads(given["threads"])
-    with recorded() as calls:
-        learn_little(RasterSettings(**given["settings"]), torch.device("cpu"))
-    make_ahead(calls[::-1])
+    make_ahead(of_any_filter(RasterSettings(**given["settings"]))[::-1])
+
+
+def of_any_filter(settings: RasterSettings) -> list[Call]:
+    """Calls of what is the same by any screen filter, which the backbone chooses."""
+    other = replace(settings, dilation=settings.dilation + 1, compensate=not settings.compensate)
+    calls, others = (needed(rules, torch.device("cpu")) for rules in (settings, other))
+    files = set(map(file_of, others))
+    return [call for call in calls if file_of(call) in files]
 
 
 def compile_beside(settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]) -> Thread:
