@@ -190,7 +190,8 @@ def slopes(
     the block.
 
     `behind` is the picture behind the block as seen from there, weighted by the gradient; with it the slope is weight
-    (channels . gradient - behind): no division, and no difference of large sums.
+    (channels . gradient - behind): no division, and no difference of large sums. Multiplied front to back, last: the
+    compiler makes faster code of that order.
     """
     kept, t = [], before
     for row in entries(rows):
@@ -198,17 +199,17 @@ def slopes(
         alpha = clamped(raw, row)
         following = t - alpha * t
         going = following >= rules.stop
-        raw, alpha = torch.where(going, raw, 0.0), torch.where(going, alpha, 0.0)
-        kept.append((row, raw * t, alpha, alpha * t))
+        kept.append((row, torch.where(going, raw, 0.0), torch.where(going, alpha, 0.0), t))
         t = following
-    out, rest = [], behind
-    for row, raw_weight, alpha, _ in reversed(kept):
+    gains, rest = [], behind
+    for row, _, alpha, _ in reversed(kept):
         shade = gradient[-1]
         for c in range(rules.channels):
             shade = shade + row[ROW + c] * gradient[c]
-        out.append(raw_weight * (shade - rest))
-        rest = rest + alpha * (shade - rest)
-    return out[::-1], [weight for *_, weight in kept], rest
+        gains.append(shade - rest)
+        rest = rest + alpha * gains[-1]
+    out = [raw * t * gain for (_, raw, _, t), gain in zip(kept, reversed(gains), strict=True)]
+    return out, [alpha * t for *_, alpha, t in kept], rest
 
 
 def sums_of(
