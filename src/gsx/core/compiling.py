@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
 """Of the compiler: what is looked up by number is looked up by numbers of ours, in lists that have them all."""
 CONTRACTED: dict[str, Any] = {"cpp.enable_floating_point_contract_flag": "fast"}
-"""Of the compiler, for all functions: products and sums contract. It prepares its headers anew for other flags."""
+"""Of the compiler, for all functions on a CPU: products and sums contract. Other flags want headers of their own."""
 IN_VECTORS: dict[str, Any] = {"cpp.enable_tiling_heuristics": False}
 """Of the compiler: rows whose numbers lie side by side are taken by vectors as well, which it else leaves to scalars
 where many are read; found by trying."""

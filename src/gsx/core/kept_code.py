@@ -71,9 +71,9 @@ def place() -> Path | None:
 
 
 def nothing_kept() -> bool:
-    """Whether there is a place in which no function was ever kept."""
+    """Whether there is a place, and no code of any function in it."""
     own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
-    return own is not None and not (Path(own) / FOLDER).exists()
+    return bool(own) and not any((Path(str(own)) / FOLDER).glob("*.bin"))
 
 
 @functools.cache
@@ -478,13 +478,3 @@ def make_ahead(calls: Sequence[Call]) -> None:
 def lacking(calls: Sequence[Call]) -> bool:
     """Whether code for one of these calls is not kept yet."""
     return any(file is None or not file.exists() for file in map(file_of, calls))
-
-
-def others_make(calls: Sequence[Call]) -> bool:
-    """Whether somebody else is making code for one of these calls."""
-    for file in map(file_of, calls):
-        if file is not None and not file.exists():
-            with made_by_one(file) as alone:
-                if not alone:
-                    return True
-    return False

@@ -1,10 +1,10 @@
 """What is compiled before the first step, and beside what is drawn: there the settings are handed over when that is
 done, and only then."""
 
-import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -22,10 +22,12 @@ from gsx.experiments.runs import rasterizer_path
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.rasterizer_path import (
+    HELPED,
     compile_beside,
     compile_now,
     help_at_once,
     help_compiling,
+    helper,
     learn_little,
 )
 from gsx.experiments.runs.settings import Settings
@@ -101,21 +103,62 @@ def test_the_first_step_needs_nothing_that_is_not_compiled_before(
     assert further == ({"select"} if backbone in ("octree_gs3d", "scaffold") else set())  # of anchors, and of parts
 
 
+class Begun:
+    """A process that was begun, and what becomes of it."""
+
+    def __init__(self, words: list[str], **_: object) -> None:
+        self.words, self.ended = words, list[str]()
+
+    def kill(self) -> None:
+        self.ended.append("killed")
+
+    def communicate(self) -> None:
+        self.ended.append("waited for")
+
+
+@pytest.mark.parametrize("zoomed", ["plain", "magnified"])
 def test_the_helper_makes_from_the_other_end_what_no_backbone_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    zoomed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = []
+    made, begun = [], list[Begun]()
     monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
     monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
     monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
     monkeypatch.setattr(KeptFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
-    rules = RasterSettings(path="compiled", dilation=0.2)
+    monkeypatch.setattr("subprocess.Popen", lambda *given, **how: begun.append(Begun(*given, **how)) or begun[-1])
+    monkeypatch.setattr(rasterizer_path, "end_with", lambda _: None)
+    rules = RasterSettings(path="compiled", dilation=0.2, zoomed=zoomed)
     with recorded() as calls:
         learn_little(rules, CPU)
-    help_compiling(json.dumps({"settings": asdict(rules), "threads": torch.get_num_threads()}))
+    with helper(rules):
+        (process,) = begun
+        assert process.ended == []
+        help_compiling(process.words[-1])
+    assert process.ended == ["killed", "waited for"]
     expected = {file: name for name, file in files_of(calls[::-1]).items() if not name.startswith("geometry")}
     assert made == list(expected)
     assert len(made) == len(files_of(calls)) - 1 >= 8
+
+
+def test_a_process_that_cannot_be_begun_is_done_without(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError("no memory for another")
+
+    monkeypatch.setattr("subprocess.Popen", refuse)
+    with caplog.at_level("INFO"), helper(RasterSettings()):
+        assert not HELPED.get()
+    assert "compiles alone (no memory for another)" in caplog.text
+
+
+def test_a_helper_ends_with_who_began_it() -> None:
+    code = "import sys; from gsx.experiments.runs.rasterizer_path import end_with; end_with(sys.stdin.buffer); print(1)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.5)
+    assert process.communicate()[0] == b""  # closes its input
+    assert process.returncode == 0
 
 
 @pytest.fixture
@@ -126,7 +169,9 @@ def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     @contextmanager
     def noted(settings: RasterSettings) -> Iterator[None]:
         told.append(f"begins {settings.path}")
+        token = HELPED.set(True)
         yield
+        HELPED.reset(token)
         told.append("ends")
 
     monkeypatch.setattr(rasterizer_path, "helper", noted)
@@ -136,22 +181,29 @@ def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("settings", "steps", "device"),
+    ("settings", "steps"),
     [
-        ({"path": "compiled"}, 1, "cpu"),
-        ({"path": "auto", "auto_steps": 300}, 300, "cpu"),
+        ({"path": "compiled"}, 1),
+        ({"path": "auto", "auto_steps": 300}, 300),
     ],
 )
 def test_help_begins_at_once_where_nothing_was_ever_compiled(
-    settings: dict[str, Any], steps: int, device: str, helped: list[str], tmp_path: Path
+    settings: dict[str, Any], steps: int, helped: list[str], tmp_path: Path
 ) -> None:
     ways = RasterSettings(**settings)
-    with help_at_once(ways, steps, torch.device(device)):
+    with help_at_once(ways, steps, CPU):
         assert helped == [f"begins {ways.path}"]
     assert helped == [f"begins {ways.path}", "ends"]
     (tmp_path / "code" / FOLDER).mkdir(parents=True)
-    with help_at_once(ways, steps, torch.device(device)):
+    (tmp_path / "code" / FOLDER / "blend-0.bin").touch()
+    with help_at_once(ways, steps, CPU):
         assert len(helped) == 2
+
+
+def test_a_process_of_one_thread_is_not_helped(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: 1)
+    with help_at_once(RasterSettings(path="compiled"), 300, CPU):
+        assert helped == []
 
 
 @pytest.mark.parametrize(
@@ -187,13 +239,12 @@ def test_a_run_is_helped_from_before_its_scene_is_read_until_it_ends(
     assert helped == ["begins compiled", "scene", "training", "ends"]
 
 
-@pytest.mark.parametrize("others", [False, True])
-def test_a_second_helper_does_not_join_the_first(
-    others: bool, helped: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+def test_a_second_helper_does_not_join_the_first(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizer_path, "learn_little", lambda *_: None)
     monkeypatch.setattr(rasterizer_path, "lacking", lambda _: True)
-    monkeypatch.setattr(rasterizer_path, "others_make", lambda _: others)
-    compile_now(RasterSettings(path="compiled"), CPU, helped=True)
-    assert helped == ([] if others else ["begins compiled", "ends"])
+    rules = RasterSettings(path="compiled")
+    with help_at_once(rules, 300, CPU):
+        compile_now(rules, CPU, helped=True)
+        assert helped == ["begins compiled"]
+    compile_now(rules, CPU, helped=True)
+    assert helped == ["begins compiled", "ends"] * 2

@@ -328,8 +328,8 @@ def entry_gradients(
 SHARING = {"blend": 30, "gradients": 25}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
-Found by trying: others cut these loops into several that talk through memory (`gradients` by 30 or 36: ten times as
-slow), or multiply compile times (by 120: twice, for code that is no faster).
+Found by trying: other numbers cut a loop into several that talk through memory (`gradients` at 30 or 36: ten times as
+slow) or take longer to compile (at 120: twice as long, for code that is no faster).
 """
 
 SHARED_AFTER = 50

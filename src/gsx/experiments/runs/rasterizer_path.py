@@ -2,13 +2,16 @@
 
 import json
 import logging
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import asdict, replace
 from threading import Thread
+from typing import IO
 
 import torch
 from torch.nn import Parameter
@@ -18,7 +21,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.kept_code import Call, file_of, lacking, make_ahead, nothing_kept, others_make, recorded
+from gsx.core.kept_code import Call, file_of, lacking, make_ahead, nothing_kept, recorded
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.path import compiles
@@ -27,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
 """Of the picture that has everything compiled: lists of several chunks in several groups."""
+HELPED: ContextVar[bool] = ContextVar("HELPED", default=False)
+"""Whether a second process was begun, which compiles or has done so."""
 
 
 def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
@@ -67,8 +72,8 @@ def compile_now(settings: RasterSettings, device: torch.device, helped: bool = F
     begun = time.perf_counter()
     calls = needed(settings, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
-        alone = helped and torch.get_num_threads() > 1 and not others_make(calls)
-        with helper(settings) if alone else nullcontext():
+        wanted = helped and torch.get_num_threads() > 1 and not HELPED.get()
+        with helper(settings) if wanted else nullcontext():
             make_ahead(calls)
             learn_little(settings, device)
     return time.perf_counter() - begun
@@ -96,29 +101,43 @@ def helper(settings: RasterSettings) -> Iterator[None]:
     """A process that compiles from the other end what no backbone changes, as long as the context lasts."""
     words = json.dumps({"settings": asdict(replace(settings, path="compiled")), "threads": torch.get_num_threads()})
     code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-c", code, words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", code, words],
+            stdin=subprocess.PIPE,  # by its end the process knows that this one is gone
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    except OSError as error:
+        logger.info("this process compiles alone (%s)", first_line(error))
+        yield
+        return
+    token = HELPED.set(True)
     try:
         yield
     finally:
+        HELPED.reset(token)
         process.kill()
-        process.wait()
+        process.communicate()
 
 
 def help_compiling(words: str) -> None:
-    """What that process does."""
+    """What that process does, as long as the one is there that began it."""
+    Thread(target=end_with, args=[sys.stdin.buffer], daemon=True).start()
     given = json.loads(words)
     torch.set_num_threads(given["threads"])
     make_ahead(of_any_filter(RasterSettings(**given["settings"]))[::-1])
 
 
+def end_with(stream: IO[bytes]) -> None:
+    """End this process when nobody can write to a stream any more."""
+    stream.read()
+    os._exit(0)
+
+
 def of_any_filter(settings: RasterSettings) -> list[Call]:
     """Calls of what is the same by any screen filter, which the backbone chooses."""
-    other = replace(settings, dilation=settings.dilation + 1, compensate=not settings.compensate)
+    other = replace(settings, dilation=settings.dilation + 1, compensate=not settings.compensate, zoomed="plain")
     calls, others = (needed(rules, torch.device("cpu")) for rules in (settings, other))
     files = set(map(file_of, others))
     return [call for call in calls if file_of(call) in files]
