@@ -66,14 +66,20 @@ class Code:
 def place() -> Path | None:
     """Where compiled functions are kept: beside torch's own code; None where nobody said where that is, or torch has
     not what is needed."""
+    folder = folder_beside_torch()
+    return folder if folder is not None and as_expected() else None
+
+
+def folder_beside_torch() -> Path | None:
+    """The folder beside torch's own code, whatever torch has; None where nobody said where that is."""
     own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
-    return Path(own) / FOLDER if own and as_expected() else None
+    return Path(own) / FOLDER if own else None
 
 
 def nothing_kept() -> bool:
     """Whether there is a place, and no code of any function in it."""
-    own = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
-    return bool(own) and not any((Path(str(own)) / FOLDER).glob("*.bin"))
+    folder = folder_beside_torch()
+    return folder is not None and not any(folder.glob("*.bin"))
 
 
 @functools.cache

@@ -3,8 +3,7 @@ done, and only then."""
 
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -106,8 +105,8 @@ def test_the_first_step_needs_nothing_that_is_not_compiled_before(
 class Begun:
     """A process that was begun, and what becomes of it."""
 
-    def __init__(self, words: list[str], **_: object) -> None:
-        self.words, self.ended = words, list[str]()
+    def __init__(self, words: list[str], ended: list[str]) -> None:
+        self.words, self.ended = words, ended
 
     def kill(self) -> None:
         self.ended.append("killed")
@@ -125,7 +124,9 @@ def test_the_helper_makes_from_the_other_end_what_no_backbone_changes(
     monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
     monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
     monkeypatch.setattr(KeptFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
-    monkeypatch.setattr("subprocess.Popen", lambda *given, **how: begun.append(Begun(*given, **how)) or begun[-1])
+    monkeypatch.setattr("subprocess.Popen", lambda words, **_: begun.append(Begun(words, [])) or begun[-1])
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    monkeypatch.setattr("torch.set_num_threads", lambda _: None)
     monkeypatch.setattr(rasterizer_path, "end_with", lambda _: None)
     rules = RasterSettings(path="compiled", dilation=0.2, zoomed=zoomed)
     with recorded() as calls:
@@ -147,6 +148,7 @@ def test_a_process_that_cannot_be_begun_is_done_without(
         raise OSError("no memory for another")
 
     monkeypatch.setattr("subprocess.Popen", refuse)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     with caplog.at_level("INFO"), helper(RasterSettings()):
         assert not HELPED.get()
     assert "compiles alone (no memory for another)" in caplog.text
@@ -166,15 +168,11 @@ def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """What becomes of helpers; this process has two threads, and an empty place for what is compiled."""
     told: list[str] = []
 
-    @contextmanager
-    def noted(settings: RasterSettings) -> Iterator[None]:
+    def noted(settings: RasterSettings) -> Begun:
         told.append(f"begins {settings.path}")
-        token = HELPED.set(True)
-        yield
-        HELPED.reset(token)
-        told.append("ends")
+        return Begun([], told)
 
-    monkeypatch.setattr(rasterizer_path, "helper", noted)
+    monkeypatch.setattr(rasterizer_path, "begun", noted)
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "code"))
     return told
@@ -193,11 +191,11 @@ def test_help_begins_at_once_where_nothing_was_ever_compiled(
     ways = RasterSettings(**settings)
     with help_at_once(ways, steps, CPU):
         assert helped == [f"begins {ways.path}"]
-    assert helped == [f"begins {ways.path}", "ends"]
+    assert helped == [f"begins {ways.path}", "killed", "waited for"]
     (tmp_path / "code" / FOLDER).mkdir(parents=True)
     (tmp_path / "code" / FOLDER / "blend-0.bin").touch()
     with help_at_once(ways, steps, CPU):
-        assert len(helped) == 2
+        assert len(helped) == 3
 
 
 def test_a_process_of_one_thread_is_not_helped(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +234,7 @@ def test_a_run_is_helped_from_before_its_scene_is_read_until_it_ends(
     with ExitStack() as claims:
         start(settings, plugins(), claims)
         helped.append("training")
-    assert helped == ["begins compiled", "scene", "training", "ends"]
+    assert helped == ["begins compiled", "scene", "training", "killed", "waited for"]
 
 
 def test_a_second_helper_does_not_join_the_first(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,4 +245,4 @@ def test_a_second_helper_does_not_join_the_first(helped: list[str], monkeypatch:
         compile_now(rules, CPU, helped=True)
         assert helped == ["begins compiled"]
     compile_now(rules, CPU, helped=True)
-    assert helped == ["begins compiled", "ends"] * 2
+    assert helped == ["begins compiled", "killed", "waited for"] * 2

@@ -55,7 +55,7 @@ def asks_for_code(settings: RasterSettings, steps: int) -> bool:
 def help_at_once(settings: RasterSettings, steps: int, device: torch.device) -> Iterator[None]:
     """Where nothing was ever compiled a second process begins with that, as long as the context lasts, while the first
     one starts; elsewhere it is known later what is lacking."""
-    wanted = device.type == "cpu" and torch.get_num_threads() > 1 and asks_for_code(settings, steps) and nothing_kept()
+    wanted = device.type == "cpu" and asks_for_code(settings, steps) and nothing_kept()
     with helper(settings) if wanted else nullcontext():
         yield
 
@@ -72,8 +72,7 @@ def compile_now(settings: RasterSettings, device: torch.device, helped: bool = F
     begun = time.perf_counter()
     calls = needed(settings, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
-        wanted = helped and torch.get_num_threads() > 1 and not HELPED.get()
-        with helper(settings) if wanted else nullcontext():
+        with helper(settings) if helped else nullcontext():
             make_ahead(calls)
             learn_little(settings, device)
     return time.perf_counter() - begun
@@ -98,18 +97,10 @@ def learn_little(settings: RasterSettings, device: torch.device) -> None:
 
 @contextmanager
 def helper(settings: RasterSettings) -> Iterator[None]:
-    """A process that compiles from the other end what no backbone changes, as long as the context lasts."""
-    words = json.dumps({"settings": asdict(replace(settings, path="compiled")), "threads": torch.get_num_threads()})
-    code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-c", code, words],
-            stdin=subprocess.PIPE,  # by its end the process knows that this one is gone
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-    except OSError as error:
-        logger.info("this process compiles alone (%s)", first_line(error))
+    """A process that compiles from the other end what no backbone changes, as long as the context lasts; none where
+    this process has a single thread, or was given one before."""
+    process = begun(settings) if torch.get_num_threads() > 1 and not HELPED.get() else None
+    if process is None:
         yield
         return
     token = HELPED.set(True)
@@ -119,6 +110,22 @@ def helper(settings: RasterSettings) -> Iterator[None]:
         HELPED.reset(token)
         process.kill()
         process.communicate()
+
+
+def begun(settings: RasterSettings) -> subprocess.Popen[bytes] | None:
+    """That process; None where there can be none, which is said."""
+    words = json.dumps({"settings": asdict(replace(settings, path="compiled")), "threads": torch.get_num_threads()})
+    code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", code, words],
+            stdin=subprocess.PIPE,  # by its end the process knows that this one is gone
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    except OSError as error:
+        logger.info("this process compiles alone (%s)", first_line(error))
+        return None
 
 
 def help_compiling(words: str) -> None:
