@@ -6,6 +6,7 @@ shapes, and checking each of them took as long as the steps. What checks it is m
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from functools import cache, wraps
 from itertools import count
 from types import FunctionType
@@ -25,11 +26,14 @@ always = jaxtyping.jaxtyped
 
 
 def sometimes(*, typechecker: Any) -> Callable[[Any], Any]:
-    """`jaxtyping.jaxtyped` for the import hook: functions are checked at some of their calls, classes at all."""
+    """`jaxtyping.jaxtyped` for the import hook: functions are checked at some of their calls, and so are data classes
+    when they are made."""
 
     def decorated(target: Any) -> Any:
+        if is_dataclass(target):
+            target.__init__ = decorated(target.__init__)
         if not isinstance(target, FunctionType):
-            return always(typechecker=typechecker)(target)
+            return target
         checked, number = cache(lambda: always(typechecker=typechecker)(target)), next(numbers)
 
         @wraps(target)
