@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -20,11 +21,14 @@ from gsx.core.rasterizer import (
     RasterSettings,
     Rendering,
     checked_lens,
+    compiled,
+    lanes,
     rasterize,
     rasterize_fixed,
 )
 from gsx.core.rasterizer.compiled import Chunks, Rows, Stage, available, room_for_gradients, takes
 from gsx.core.rasterizer.kernels import EXP_TOP, Kernels, Rules, exp_polynomial, kernels, thresholds
+from gsx.core.rasterizer.lanes import Lanes
 from gsx.core.rasterizer.segment_kernels import segment_kernels
 from gsx.core.rasterizer.segments import parts
 
@@ -66,7 +70,40 @@ def test_small_batches_draw_the_truth(size: tuple[int, int], monkeypatch: pytest
     assert set(groups) <= {2, 3}
 
 
-def test_the_shipped_number_of_unrolled_splats() -> None:
+@pytest.mark.parametrize("scene", ["mixed", "opaque"])
+@pytest.mark.parametrize("values", [0, 1])
+def test_lists_in_pieces_draw_the_truth(scene: str, values: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    found, own = list[Lanes](), compiled.lay_out
+
+    def watched(*given: Any, **named: Any) -> Lanes:
+        found.append(own(*given, **named))
+        return found[-1]
+
+    monkeypatch.setattr(compiled, "lay_out", watched)
+    monkeypatch.setattr(lanes, "most_at_once", lambda lengths, chunk: 3)
+    splats = {"mixed": random_splats(300, seed=4), "opaque": opaque(400, 5)}[scene]
+    rules, camera = replace(QUICK, compiled_values=values), front_camera()
+    errors = errors_of(splats, camera, rules, truth_of(splats, camera, rules))
+    assert errors.largest <= 1e-5
+    assert errors.gradient <= 1e-4
+    assert len(found[-1].follows) > 4
+    assert len(found[-1].active) == 3
+    with torch.no_grad():  # bits of a picture that nothing is learnt from do not depend on what is cut
+        drawn = rasterize(splats, camera, rules).image
+        monkeypatch.undo()
+        assert torch.equal(drawn, rasterize(splats, camera, rules).image)
+
+
+def test_lists_are_cut_where_a_few_are_much_longer() -> None:
+    usual = torch.arange(1, 71)
+    assert lanes.most_at_once(usual, 2) == 35  # 31 would do for all but an eighth
+    assert lanes.most_at_once(torch.cat([usual, torch.tensor([0, 0, 93])]), 2) == 47  # not more than half as many again
+    assert lanes.most_at_once(torch.cat([usual, torch.tensor([0, 0, 97])]), 2) == 32
+    assert lanes.most_at_once(torch.tensor([0, 5]), 2) == 3
+
+
+def test_the_shipped_number_of_unrolled_splats(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lanes, "most_at_once", lambda lengths, chunk: 2)
     rules = replace(QUICK, unrolled=RasterSettings().unrolled, cull="published")
     splats = random_splats(300, seed=7)
     errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
@@ -75,7 +112,7 @@ def test_the_shipped_number_of_unrolled_splats() -> None:
     with recorded() as calls:
         render_with_gradients(splats, front_camera(), rules)
     loops = {call[0].function.__name__: file_of(call).read_bytes().count(b"#pragma omp for") for call in calls}
-    assert loops["blend"] == 1
+    assert loops["blend"] == loops["dim"] == 1
     assert loops["gradients"] == 9  # slopes, two of sums, and six that lay columns out: more would talk through memory
 
 
@@ -173,7 +210,7 @@ def test_room_for_gradients_is_zero_where_no_slice_was_blended() -> None:
     rows = torch.rand(9, 2, 12, 16)
     picked = torch.tensor([4, 6])
     stages = [Stage(range(7, 8), range(2), None), Stage(picked, picked, None), Stage(range(2, 4), range(2), None)]
-    kept = Chunks(stages, Rows(rows), Rows(rows), Rows(rows))
+    kept = Chunks(stages, Rows(rows), Rows(rows), Rows(rows), rows[:, 0], [])
     torch.use_deterministic_algorithms(True)  # what is not written is not a number
     try:
         found = room_for_gradients(kept, 9)
@@ -205,7 +242,7 @@ def test_nothing_compiles_anew_in_steady_state() -> None:
     with new_code() as first:
         for schedule in ("chunks", "segments"):
             draw(400, 5, schedule)
-    assert {"blend", "gradients", "entry_slopes"} <= set(first)
+    assert {"dim", "blend", "gradients", "entry_slopes"} <= set(first)
     with new_code() as later:
         for count in (1, 40, 397, 1100):
             for schedule in ("chunks", "segments"):

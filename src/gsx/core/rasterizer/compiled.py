@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import available, settled
+from gsx.core.gaussians.bands import sum_of_products
 from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
@@ -119,9 +120,13 @@ class Chunks:
     rows: Rows
     """What blending reads of every entry, [S K F L]."""
     inside: Rows
-    """1 at pixels of the raster, 0 at those of border tiles beyond it, [G P L]."""
+    """Transmittance in front of every list, 0 at pixels of border tiles beyond the raster, [G P L]."""
     after: Rows
     """Transmittance behind every block, [S P L]."""
+    passed: Float[Tensor, "G P L"]
+    """Share of the light that passes each list, where another piece of its tile's list follows."""
+    lights: list[Float[Tensor, "G P L"]]
+    """What every list adds to the channels and the coverage."""
 
     def before(self, stage: Stage) -> Float[Tensor, "B P L"]:
         """Transmittance in front of a stage's blocks."""
@@ -165,12 +170,48 @@ def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated:
             channel.values[stage.groups] = value
 
 
+def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
+    """Share of the light that passes each list which another piece follows, and some others; 1 elsewhere."""
+    lanes, dim, passed = job.lanes, settled(job.loops.dim), Rows(torch.ones_like(like))
+    for part in parts(lanes.cut, job.batch):
+        for base in lanes.bases:
+            blocks = range(base + part.start, base + part.stop)
+            dim(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
+    return passed.values
+
+
+def in_front(lanes: Lanes, passed: Float[Tensor, "G P L"], inside: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
+    """Transmittance in front of every list: that behind the piece before it."""
+    found = inside.clone()
+    left, passing = found.mT, passed.mT
+    for later, earlier in lanes.follows:
+        left[later] = left[earlier] * passing[earlier]
+    return found
+
+
+def behind_lists(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "G P L"]:
+    """The picture behind every list as seen from there, weighted by the gradient: what the pieces that follow show, by
+    the transmittance in front of them."""
+    found = torch.zeros_like(gradient[0])
+    behind, left = found.mT, kept.inside.values.mT
+    for later, earlier in reversed(job.lanes.follows):
+        before = left[later]
+        shine = sum_of_products([light.mT[later] for light in kept.lights], [seen.mT[later] for seen in gradient])
+        shown = torch.where(before >= max(job.rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
+        behind[earlier] = shown + kept.passed.mT[later] * behind[later]
+    return found
+
+
 def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
     """Channels and coverage, front to back."""
+    held = Rows(rows)
+    passed = shares(job, held, inside) if job.lanes.follows else inside
+    inside = in_front(job.lanes, passed, inside) if job.lanes.follows else inside
     accumulated = [Rows(torch.zeros_like(inside)) for _ in range(job.rules.channels + 1)]
-    kept = Chunks([], Rows(rows), Rows(inside), Rows(inside.new_empty(len(rows), *inside.shape[1:])))
+    after = Rows(inside.new_empty(len(rows), *inside.shape[1:]))
+    kept = Chunks([], held, Rows(inside), after, passed, [channel.values for channel in accumulated])
     blend = settled(job.loops.blend)
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
@@ -181,7 +222,7 @@ def blend_chunks(
             if number % CHECK_EVERY == 0:
                 fewer = leave(job, stage, kept)
                 left = left if fewer is None else fewer
-    return [channel.values for channel in accumulated], kept
+    return kept.lights, kept
 
 
 def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
@@ -199,7 +240,7 @@ def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
 
 def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "S K L V"]:
     """Gradient of every entry, back to front; zero for blocks that were not blended."""
-    seen, behind, basis = [Rows(channel) for channel in gradient], Rows(torch.zeros_like(gradient[0])), job.basis
+    seen, behind, basis = [Rows(channel) for channel in gradient], Rows(behind_lists(job, kept, gradient)), job.basis
     found = Rows(room_for_gradients(kept, TABLE + job.rules.channels + 2 * job.rules.absolute))
     gradients = settled(job.loops.gradients)
     for stage in reversed(kept.stages):
@@ -264,7 +305,9 @@ def composite_compiled(
         work = segment_job(segments, grid, rules, precision, values, means.device)
         return SegmentComposite.apply(table, absgrad, intersections, work), needed
     batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
-    lanes = lay_out(intersections, len(means), settings.unrolled, batch)
+    learnt = means, conic_factors, log_opacities, channels
+    learning = torch.is_grad_enabled() and (absgrad is not None or any(value.requires_grad for value in learnt))
+    lanes = lay_out(intersections, len(means), settings.unrolled, batch, cut_long=learning)
     exact = means.detach().to(precision.exact)
     job = Job(
         lanes=lanes,

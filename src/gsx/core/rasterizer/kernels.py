@@ -177,6 +177,17 @@ def fade(
     return passed
 
 
+def dim(
+    rows: Float[Tensor, "B K F *L"],
+    x: Float[Tensor, "P *one"],
+    y: Float[Tensor, "P *one"],
+    passed: Float[Tensor, "B P *L"],
+    rules: Rules,
+) -> None:
+    """Leave of `passed` what passes one more block of every group."""
+    passed.copy_(passed * fade(rows, x, y, rules))
+
+
 def slopes(
     rows: Float[Tensor, "B K F *L"],
     x: Float[Tensor, "P *one"],
@@ -325,7 +336,7 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"blend": 30, "gradients": 25}
+SHARING = {"dim": 30, "blend": 30, "gradients": 25}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: other numbers cut a loop into several that talk through memory (`gradients` at 30 or 36: ten times as
@@ -348,6 +359,7 @@ def thresholds() -> list[str]:
 class Kernels:
     """The compiled loops of one set of rules."""
 
+    dim: Callable[..., None]
     blend: Callable[..., None]
     gradients: Callable[..., None]
     make_rows: Callable[..., Tensor]
@@ -356,7 +368,7 @@ class Kernels:
 @functools.lru_cache
 def kernels(rules: Rules) -> Kernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (blend, gradients, make_rows)
+    loops = (dim, blend, gradients, make_rows)
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 

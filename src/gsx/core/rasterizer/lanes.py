@@ -1,12 +1,16 @@
-"""Tile lists laid out for compiled loops: 16 tiles of similar length side by side, one in each lane of a register.
+"""Tile lists laid out for compiled loops: 16 lists of similar length side by side, one in each lane of a register.
 
-A group is L tiles; a block is K list entries of every tile of a group. Blocks lie chunk after chunk: first the first
+A group is L lists; a block is K entries of every list of a group. Blocks lie chunk after chunk: first the first
 K entries of all groups, then the next K of those groups that have more, and so on. Groups are sorted by list length,
 so each chunk is a contiguous slice that begins at the first group. A pixel of a group is a vector of L values, and
 sums over a tile's pixels need no shuffling between lanes.
+
+Chunks follow each other, and each is a call, which costs as much as a dozen groups: where a few tiles have much longer
+lists than all others, those are cut into pieces that lie beside the lists of other tiles.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -18,7 +22,16 @@ from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.shapes import Float, Int
 
 LANES = 16
-"""Tiles of a group: a 512-bit register of float32."""
+"""Lists of a group: a 512-bit register of float32."""
+LONG = 8
+"""One in so many lists may be longer than where they are cut."""
+WORTH_CUTTING = 1.5
+"""Long lists are cut where the longest has more than so many times the chunks at which they would be: all light must be
+found twice in what is cut, but for the last pieces."""
+
+
+Places: TypeAlias = tuple[Int[Tensor, "_"], Int[Tensor, "_"]]
+"""Groups of some lists, and their lanes there."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,7 +39,7 @@ class Lanes:
     """G groups of L tiles and their S blocks."""
 
     tiles: Int[Tensor, "G L"]
-    """Tile of each lane; T, one past the last, fills the last group up."""
+    """Tile of each lane's list; T, one past the last, fills the last group up."""
     pairs: Int[Tensor, "S K L"]
     """Pair of each entry, pairs sorted by tile; P, one past the last, behind the end of a list."""
     entries: Int[Tensor, "S K L"]
@@ -37,56 +50,110 @@ class Lanes:
     """Groups that have each chunk."""
     bases: list[int]
     """First block of each chunk."""
+    follows: list[tuple[Places, Places]]
+    """(places of second pieces of tiles, of the first ones), then of third pieces and the second ones, and so on;
+    nothing where no list was cut."""
+    cut: int
+    """The first so many groups hold all pieces that another one follows."""
 
 
-def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int) -> Lanes:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lists:
+    """N lists of pairs, in the order of their tiles: one of each tile that has any, or pieces of it."""
+
+    tiles: Int[Tensor, "N"]
+    number: Int[Tensor, "N"]
+    """Which piece of its tile's list each is, from 0."""
+    begin: Int[Tensor, "N"]
+    """Its first pair."""
+    end: Int[Tensor, "N"]
+    """One past its last."""
+
+
+def lists_of(starts: Int[Tensor, "T_1"], chunk: int, cut_long: bool) -> Lists:
+    """Lists of all tiles; long ones are cut at whole chunks, or none."""
+    lengths = starts.diff()
+    size = most_at_once(lengths, chunk) * chunk if cut_long else int(lengths.max())
+    pieces = torch.div(lengths + (size - 1), size, rounding_mode="floor")
+    tiles = torch.repeat_interleave(pieces)
+    number = torch.arange(len(tiles), device=tiles.device) - (pieces.cumsum(0) - pieces)[tiles]
+    begin = starts[tiles] + number * size
+    return Lists(tiles=tiles, number=number, begin=begin, end=torch.minimum(begin + size, starts[tiles + 1]))
+
+
+def most_at_once(lengths: Int[Tensor, "T"], chunk: int) -> int:
+    """Chunks at which lists are cut: as many as the longest has where that is not worth it. One list is not empty."""
+    ranked = lengths[lengths > 0].sort(descending=True).values
+    longest, usual = (-(-ranked[[0, len(ranked) // LONG]] // chunk)).tolist()
+    return usual if longest > WORTH_CUTTING * usual else longest
+
+
+def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int, *, cut_long: bool) -> Lanes:
     """Lay the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
+
+    Sums over pieces of a list differ from those over the whole by their rounding, and what is cut depends on all lists
+    of a picture: where a crop is to show the bits of the whole, lists are not cut.
 
     The first two groups of every `batch` groups get equally many chunks, and no batch has a single group: torch
     specialises on sizes of one.
     """
-    tiles, longest = by_length(intersections.starts.diff())
+    lists, last = lists_of(intersections.starts, chunk, cut_long), len(intersections.starts) - 1
+    lanes, longest = by_length(lists.end - lists.begin)
     counts = (longest.cpu() + (chunk - 1)) // chunk  # of each group: those of its first, longest list
-    counts = counts[: max(2, int((counts > 0).sum()))]
     counts[1::batch] = counts[::batch][: len(counts[1::batch])]
     active = (len(counts) - counts.bincount().cumsum(0))[:-1]
     bases, blocks = active.cumsum(0) - active, int(active.sum())
-    tiles, table = tiles[: len(counts)], uploaded(torch.stack([active, bases]), tiles.device)
+    table = uploaded(torch.stack([active, bases]), lanes.device)
     chunks = torch.repeat_interleave(table[0], output_size=blocks)
     groups = torch.arange(blocks, device=chunks.device) - table[1][chunks]
-    pairs = pairs_in_blocks(intersections, tiles, groups, chunks, chunk)
+    pairs = pairs_in_blocks(lists, len(intersections.splats), lanes, groups, chunks, chunk)
     rows = pad(intersections.splats, (0, 1), value=splats)
+    follows = pieces_of(lists, lanes)
     return Lanes(
-        tiles=tiles,
+        tiles=pad(lists.tiles, (0, 1), value=last)[lanes],
         pairs=pairs,
         entries=rows.index_select(0, pairs.view(-1)).view(pairs.shape),
         groups=groups,
         active=active.tolist(),
         bases=bases.tolist(),
+        follows=follows,
+        cut=max(2, *(int(groups.max()) + 1 for _, (groups, _) in follows)) if follows else 0,
     )
 
 
-def by_length(lengths: Int[Tensor, "T"]) -> tuple[Int[Tensor, "G L"], Int[Tensor, "G"]]:
-    """Tiles in groups, longest lists first, T where a list is empty; and the longest list of each group. At least two
+def by_length(lengths: Int[Tensor, "N"]) -> tuple[Int[Tensor, "G L"], Int[Tensor, "G"]]:
+    """Lists in groups, longest first, N where there is none; and the longest list of each group. At least two
     groups."""
     lengths, order = torch.sort(lengths, descending=True, stable=True)
     count = max(2, -(-len(order) // LANES)) * LANES
-    tiles = pad(torch.where(lengths > 0, order, len(order)), (0, count - len(order)), value=len(order))
-    return tiles.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES]
+    lanes = pad(order, (0, count - len(order)), value=len(order))
+    return lanes.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES]
+
+
+def pieces_of(lists: Lists, lanes: Int[Tensor, "G L"]) -> list[tuple[Places, Places]]:
+    """`Lanes.follows`."""
+    rank = torch.empty_like(lists.tiles)
+    rank[lanes.view(-1)[: len(rank)]] = torch.arange(len(rank), device=rank.device)
+
+    def places(lists: Int[Tensor, "M"]) -> Places:
+        return rank[lists] // LANES, rank[lists] % LANES
+
+    numbered = [(lists.number == number).nonzero()[:, 0] for number in range(1, int(lists.number.max()) + 1)]
+    return [(places(later), places(later - 1)) for later in numbered]
 
 
 def pairs_in_blocks(
-    intersections: TileIntersections,
-    tiles: Int[Tensor, "G L"],
+    lists: Lists,
+    count: int,
+    lanes: Int[Tensor, "G L"],
     groups: Int[Tensor, "S"],
     chunks: Int[Tensor, "S"],
     chunk: int,
 ) -> Int[Tensor, "S K L"]:
-    """Pair of every entry: those of a list follow each other. With what fills blocks up they stay below 2^31, since
-    max_pairs is at most 2^30."""
-    count = len(intersections.splats)
-    edges = pad(intersections.starts.int(), (0, 1), value=count)
-    begin, end = (edges[number].index_select(0, groups) for number in (tiles, tiles + 1))
+    """Pair of every entry: those of a list follow each other; `count`, one past the last, behind its end. With what
+    fills blocks up they stay below 2^31, since max_pairs is at most 2^30."""
+    edges = (pad(side.int(), (0, 1), value=count) for side in (lists.begin, lists.end))
+    begin, end = (side[lanes].index_select(0, groups) for side in edges)
     first = begin + (chunks * chunk).int()[:, None]
     pairs = first[:, None] + torch.arange(chunk, device=first.device, dtype=torch.int32)[:, None]
     return torch.where(pairs < end[:, None], pairs, count)
@@ -113,8 +180,14 @@ def to_lanes(tiles: Float[Tensor, "T C P"], lanes: Lanes) -> list[Float[Tensor, 
 
 
 def from_lanes(channels: list[Float[Tensor, "G P L"]], lanes: Lanes, count: int) -> Float[Tensor, "T P C"]:
-    """Tiles of a picture from channels in lanes; tiles without a list are zero."""
+    """Tiles of a picture from channels in lanes, pieces of a list added up; tiles without a list are zero."""
     picture = channels[0].new_zeros(len(channels), count + 1, channels[0].shape[1])
+    tiles = lanes.tiles.clone() if lanes.follows else lanes.tiles
+    for later, _ in lanes.follows:
+        tiles[later] = count
     for plane, channel in zip(picture, channels, strict=True):
-        plane.index_copy_(0, lanes.tiles.view(-1), channel.mT.flatten(0, 1))
+        lists = channel.mT.contiguous()
+        for later, earlier in reversed(lanes.follows):
+            lists[earlier] += lists[later]
+        plane.index_copy_(0, tiles.view(-1), lists.flatten(0, 1))
     return picture[:, :count].permute(1, 2, 0)
