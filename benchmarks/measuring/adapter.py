@@ -19,8 +19,8 @@ from gsx.core.shapes import Float
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
 
-LOOPS = {"forward": "blend", "backward": "gradients"}
-"""The compiled loop over blocks of each phase, on a CPU."""
+LOOPS = {"forward": ("dim", "blend"), "backward": ("gradients",)}
+"""The compiled loops over blocks of each phase, on a CPU."""
 
 
 def settings_of(path: str, *overrides: str) -> RasterSettings:
