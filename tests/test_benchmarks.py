@@ -585,7 +585,8 @@ def test_loops_are_timed_by_the_names_they_have() -> None:
     with loops_timed() as spent:
         picture, _ = blend_screen(screen, camera_of(CASE), settings)
         picture.sum().backward()
-    assert set(spent) == set(LOOPS.values())
+    assert set(spent) <= {name for names in LOOPS.values() for name in names}
+    assert {"blend", "gradients"} <= set(spent)
     assert min(spent.values()) > 0
     assert compiled.settled is own
 

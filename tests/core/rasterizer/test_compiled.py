@@ -112,7 +112,8 @@ def test_the_shipped_number_of_unrolled_splats(monkeypatch: pytest.MonkeyPatch) 
     with recorded() as calls:
         render_with_gradients(splats, front_camera(), rules)
     loops = {call[0].function.__name__: file_of(call).read_bytes().count(b"#pragma omp for") for call in calls}
-    assert loops["blend"] == loops["dim"] == 1
+    assert loops["blend"] == 1
+    assert loops["dim"] <= 3  # a product, and twice its factor
     assert loops["gradients"] == 9  # slopes, two of sums, and six that lay columns out: more would talk through memory
 
 
