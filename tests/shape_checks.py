@@ -1,7 +1,8 @@
 """Shape annotations are checked by jaxtyping and beartype; an int is accepted where a float is asked for.
 
-A function is checked at its first call in every test and at some of those that follow: steps of a run repeat the same
-shapes, and checking each of them took as long as the steps. What checks it is made when it is first called.
+A function is checked at its first call in every test and at some of those that follow, and so is a data class when it
+is made: steps of a run repeat the same shapes, and checking each of them took as long as the steps. What checks it is
+made when it is first called.
 """
 
 from collections import Counter
@@ -30,7 +31,7 @@ def sometimes(*, typechecker: Any) -> Callable[[Any], Any]:
     when they are made."""
 
     def decorated(target: Any) -> Any:
-        if is_dataclass(target):
+        if is_dataclass(target) and "__init__" in vars(target):
             target.__init__ = decorated(target.__init__)
         if not isinstance(target, FunctionType):
             return target

@@ -19,7 +19,7 @@ from gsx.core.shapes import Float
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
 
-LOOPS = {"forward": ("dim", "blend"), "backward": ("gradients",)}
+LOOPS = {"forward": ("transmit", "blend"), "backward": ("gradients",)}
 """The compiled loops over blocks of each phase, on a CPU."""
 
 

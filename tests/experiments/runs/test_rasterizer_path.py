@@ -97,7 +97,7 @@ def test_the_first_step_needs_nothing_that_is_not_compiled_before(
         learn_little(run.raster, CPU)
     with recorded() as taken:
         train_step(run, plugins())
-    assert "dim" in {call[0].function.__name__ for call in ahead}  # later steps may need it
+    assert "transmit" in {call[0].function.__name__ for call in ahead}  # later steps may need it
     assert {call[0].function.__name__ for call in taken} >= {"blend", "gradients", "make_rows", "geometry"}
     further = {name.split()[0] for name in set(files_of(taken)) - set(files_of(ahead))}
     assert further == ({"select"} if backbone in ("octree_gs3d", "scaffold") else set())  # of anchors, and of parts

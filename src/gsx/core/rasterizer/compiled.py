@@ -1,7 +1,8 @@
 """The compiled path: the picture and gradient of composite.py through loops that are compiled once (kernels.py).
 
-Two schedules of the same mathematics. `chunks`: front to back, one chunk of all groups of tiles at a time, and groups
-whose pixels have all ended leave. `segments`: all blocks of all tiles at once (segments.py).
+Two schedules of the same mathematics. `chunks`: front to back, one chunk of all groups of lists at a time, and groups
+whose pixels have all ended leave; light is found first in lists that are cut into pieces (lanes.py). `segments`: all
+blocks of all tiles at once (segments.py).
 """
 
 import math
@@ -13,11 +14,11 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import available, settled
-from gsx.core.gaussians.bands import sum_of_products
+from gsx.core.kept_code import recording
 from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
-from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels
+from gsx.core.rasterizer.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels, seen_from_front
 from gsx.core.rasterizer.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
 from gsx.core.rasterizer.path import warn_once
 from gsx.core.rasterizer.precision import Precision
@@ -119,18 +120,17 @@ class Chunks:
     stages: list[Stage]
     rows: Rows
     """What blending reads of every entry, [S K F L]."""
-    inside: Rows
+    front: Rows
     """Transmittance in front of every list, 0 at pixels of border tiles beyond the raster, [G P L]."""
     after: Rows
     """Transmittance behind every block, [S P L]."""
-    passed: Float[Tensor, "G P L"]
-    """Share of the light that passes each list, where another piece of its tile's list follows."""
-    lights: list[Float[Tensor, "G P L"]]
-    """What every list adds to the channels and the coverage."""
+    pieces: tuple[Float[Tensor, "G P L"], list[Float[Tensor, "G P L"]]] | None
+    """(share of the light that passes each list which another piece follows, what every list adds to the channels and
+    the coverage); None where no list is cut."""
 
     def before(self, stage: Stage) -> Float[Tensor, "B P L"]:
         """Transmittance in front of a stage's blocks."""
-        return self.inside.take(stage.groups) if stage.previous is None else self.after.take(stage.previous)
+        return self.front.take(stage.groups) if stage.previous is None else self.after.take(stage.previous)
 
 
 def stage_of(job: Job, number: int, batch: slice, left: Int[Tensor, "B"] | None) -> Stage | None:
@@ -172,46 +172,48 @@ def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated:
 
 def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
     """Share of the light that passes each list which another piece follows, and some others; 1 elsewhere."""
-    lanes, dim, passed = job.lanes, settled(job.loops.dim), Rows(torch.ones_like(like))
-    for part in parts(lanes.cut, job.batch):
+    lanes, transmit, passed = job.lanes, settled(job.loops.transmit), Rows(torch.ones_like(like))
+    for part in parts(lanes.groups_cut, job.batch):
         for base in lanes.bases:
             blocks = range(base + part.start, base + part.stop)
-            dim(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
+            transmit(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
     return passed.values
 
 
 def in_front(lanes: Lanes, passed: Float[Tensor, "G P L"], inside: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
     """Transmittance in front of every list: that behind the piece before it."""
-    found = inside.clone()
-    left, passing = found.mT, passed.mT
+    front = inside.clone()
+    before, passing = front.mT, passed.mT
     for later, earlier in lanes.follows:
-        left[later] = left[earlier] * passing[earlier]
-    return found
+        before[later] = before[earlier] * passing[earlier]
+    return front
 
 
 def behind_lists(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "G P L"]:
     """The picture behind every list as seen from there, weighted by the gradient: what the pieces that follow show, by
     the transmittance in front of them."""
     found = torch.zeros_like(gradient[0])
-    behind, left = found.mT, kept.inside.values.mT
+    if kept.pieces is None:
+        return found
+    behind, front, (passed, lights) = found.mT, kept.front.values.mT, kept.pieces
     for later, earlier in reversed(job.lanes.follows):
-        before = left[later]
-        shine = sum_of_products([light.mT[later] for light in kept.lights], [seen.mT[later] for seen in gradient])
-        shown = torch.where(before >= max(job.rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
-        behind[earlier] = shown + kept.passed.mT[later] * behind[later]
+        shown, seen = ([channel.mT[later] for channel in channels] for channels in (lights, gradient))
+        own = seen_from_front(shown, seen, front[later], job.rules)
+        behind[earlier] = own + passed.mT[later] * behind[later]
     return found
 
 
 def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
-    """Channels and coverage, front to back."""
-    held = Rows(rows)
-    passed = shares(job, held, inside) if job.lanes.follows else inside
-    inside = in_front(job.lanes, passed, inside) if job.lanes.follows else inside
+    """What every list adds to the channels and the coverage, front to back."""
+    held, front, pieces = Rows(rows), inside, None
     accumulated = [Rows(torch.zeros_like(inside)) for _ in range(job.rules.channels + 1)]
-    after = Rows(inside.new_empty(len(rows), *inside.shape[1:]))
-    kept = Chunks([], held, Rows(inside), after, passed, [channel.values for channel in accumulated])
+    lights = [channel.values for channel in accumulated]
+    if job.lanes.follows:
+        passed = shares(job, held, inside)
+        front, pieces = in_front(job.lanes, passed, inside), (passed, lights)
+    kept = Chunks([], held, Rows(front), Rows(inside.new_empty(len(rows), *inside.shape[1:])), pieces)
     blend = settled(job.loops.blend)
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
@@ -222,7 +224,7 @@ def blend_chunks(
             if number % CHECK_EVERY == 0:
                 fewer = leave(job, stage, kept)
                 left = left if fewer is None else fewer
-    return kept.lights, kept
+    return lights, kept
 
 
 def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
@@ -265,6 +267,8 @@ class CompiledComposite(torch.autograd.Function):
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         inside = to_lanes(inside_of(job.grid, job.precision.accumulation, means.device), job.lanes)[0].clone()
+        if learning and recording():  # later pictures may have lists that are cut
+            job.loops.transmit(rows[:2], job.basis.x, job.basis.y, inside.clone()[:2])
         accumulated, kept = blend_chunks(job, rows, inside)
         if learning:
             ctx.kept = (job, intersections, places, len(means), kept, absgrad is not None, means.dtype)
@@ -306,8 +310,9 @@ def composite_compiled(
         return SegmentComposite.apply(table, absgrad, intersections, work), needed
     batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
     learnt = means, conic_factors, log_opacities, channels
-    learning = torch.is_grad_enabled() and (absgrad is not None or any(value.requires_grad for value in learnt))
-    lanes = lay_out(intersections, len(means), settings.unrolled, batch, cut_long=learning)
+    learning = torch.is_grad_enabled() and any(value.requires_grad for value in learnt)
+    cut_long = learning and means.device.type == "cpu"  # elsewhere the host would wait for sizes
+    lanes = lay_out(intersections, len(means), settings.unrolled, batch, cut_long=cut_long)
     exact = means.detach().to(precision.exact)
     job = Job(
         lanes=lanes,

@@ -1,8 +1,8 @@
 """The loops of the compiled path, in plain torch: what `torch.compile` turns into one fused loop each.
 
 Every function works on B blocks of K entries and the P pixels of a tile: front to back in L lanes (see lanes.py), by
-segments without, where pixels lie side by side. The loop over the K entries is unrolled; sums over a tile's pixels are
-the only reductions. Rules are constants of the compiled code.
+segments without, where pixels lie side by side. The loop over the K entries is unrolled, but where light is found
+alone; sums over a tile's pixels are the only reductions in the others. Rules are constants of the compiled code.
 """
 
 import functools
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.compiling import WHOLE_LOOPS, compiled_once, with_last
+from gsx.core.gaussians.bands import sum_of_products
 from gsx.core.kept_code import flat
 from gsx.core.shapes import Float, Int
 
@@ -177,17 +178,29 @@ def fade(
     return passed
 
 
-def dim(
-    rows: Float[Tensor, "B K F *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
-    passed: Float[Tensor, "B P *L"],
+def transmit(
+    rows: Float[Tensor, "B K F L"],
+    x: Float[Tensor, "P one"],
+    y: Float[Tensor, "P one"],
+    passed: Float[Tensor, "B P L"],
     rules: Rules,
 ) -> None:
     """Leave of `passed` what passes one more block of every group. Its entries are not unrolled: the light alone hangs
     on no order, and code for one of them compiles sooner."""
-    row = rows.movedim(2, 0)[..., None, :]
+    row = rows.movedim(2, 0)[..., None, :]  # [F B K 1 L], where others have [F B 1 L] of each entry
     passed.copy_(passed * (1 - clamped(gaussian(row, x, y, rules), row).to(rows.dtype)).prod(1))
+
+
+def seen_from_front(
+    lights: Sequence[Float[Tensor, "*B P"]],
+    gradient: Sequence[Float[Tensor, "*B P"]],
+    before: Float[Tensor, "*B P"],
+    rules: Rules,
+) -> Float[Tensor, "*B P"]:
+    """What shows by `lights`, channels and coverage, as seen from where the transmittance is `before`, weighted by the
+    gradient of the picture."""
+    shine = sum_of_products(lights, gradient)
+    return torch.where(before >= max(rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
 
 
 def slopes(
@@ -338,7 +351,7 @@ def entry_gradients(
 
 # -- compilation ---------------------------------------------------------------------------------------------------
 
-SHARING = {"dim": 30, "blend": 30, "gradients": 25}
+SHARING = {"transmit": 30, "blend": 30, "gradients": 25}
 """Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
 
 Found by trying: other numbers cut a loop into several that talk through memory (`gradients` at 30 or 36: ten times as
@@ -361,7 +374,7 @@ def thresholds() -> list[str]:
 class Kernels:
     """The compiled loops of one set of rules."""
 
-    dim: Callable[..., None]
+    transmit: Callable[..., None]
     blend: Callable[..., None]
     gradients: Callable[..., None]
     make_rows: Callable[..., Tensor]
@@ -370,7 +383,7 @@ class Kernels:
 @functools.lru_cache
 def kernels(rules: Rules) -> Kernels:
     """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (dim, blend, gradients, make_rows)
+    loops = (transmit, blend, gradients, make_rows)
     return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
 
 

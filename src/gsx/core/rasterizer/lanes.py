@@ -28,6 +28,8 @@ LONG = 8
 WORTH_CUTTING = 1.5
 """Long lists are cut where the longest has more than so many times the chunks at which they would be: all light must be
 found twice in what is cut, but for the last pieces."""
+MOST_PIECES = 8
+"""Of a list: each is an operation of its own where light is handed from piece to piece."""
 
 
 Places: TypeAlias = tuple[Int[Tensor, "_"], Int[Tensor, "_"]]
@@ -53,7 +55,7 @@ class Lanes:
     follows: list[tuple[Places, Places]]
     """(places of second pieces of tiles, of the first ones), then of third pieces and the second ones, and so on;
     nothing where no list was cut."""
-    cut: int
+    groups_cut: int
     """The first so many groups hold all pieces that another one follows."""
 
 
@@ -73,7 +75,7 @@ class Lists:
 def lists_of(starts: Int[Tensor, "T_1"], chunk: int, cut_long: bool) -> Lists:
     """Lists of all tiles; long ones are cut at whole chunks, or none."""
     lengths = starts.diff()
-    size = most_at_once(lengths, chunk) * chunk if cut_long else int(lengths.max())
+    size = chunks_at_most(lengths, chunk) * chunk if cut_long else int(lengths.max())
     pieces = torch.div(lengths + (size - 1), size, rounding_mode="floor")
     tiles = torch.repeat_interleave(pieces)
     number = torch.arange(len(tiles), device=tiles.device) - (pieces.cumsum(0) - pieces)[tiles]
@@ -81,10 +83,11 @@ def lists_of(starts: Int[Tensor, "T_1"], chunk: int, cut_long: bool) -> Lists:
     return Lists(tiles=tiles, number=number, begin=begin, end=torch.minimum(begin + size, starts[tiles + 1]))
 
 
-def most_at_once(lengths: Int[Tensor, "T"], chunk: int) -> int:
-    """Chunks at which lists are cut: as many as the longest has where that is not worth it. One list is not empty."""
+def chunks_at_most(lengths: Int[Tensor, "T"], chunk: int) -> int:
+    """Chunks of a piece: as many as the longest list has where cutting is not worth it. One list is not empty."""
     ranked = lengths[lengths > 0].sort(descending=True).values
     longest, usual = (-(-ranked[[0, len(ranked) // LONG]] // chunk)).tolist()
+    usual = max(usual, -(-longest // MOST_PIECES))
     return usual if longest > WORTH_CUTTING * usual else longest
 
 
@@ -117,7 +120,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
         active=active.tolist(),
         bases=bases.tolist(),
         follows=follows,
-        cut=max(2, *(int(groups.max()) + 1 for _, (groups, _) in follows)) if follows else 0,
+        groups_cut=max(2, *(int(groups.max()) + 1 for _, (groups, _) in follows)) if follows else 0,
     )
 
 
@@ -135,8 +138,8 @@ def pieces_of(lists: Lists, lanes: Int[Tensor, "G L"]) -> list[tuple[Places, Pla
     rank = torch.empty_like(lists.tiles)
     rank[lanes.view(-1)[: len(rank)]] = torch.arange(len(rank), device=rank.device)
 
-    def places(lists: Int[Tensor, "M"]) -> Places:
-        return rank[lists] // LANES, rank[lists] % LANES
+    def places(numbers: Int[Tensor, "M"]) -> Places:
+        return rank[numbers] // LANES, rank[numbers] % LANES
 
     numbered = [(lists.number == number).nonzero()[:, 0] for number in range(1, int(lists.number.max()) + 1)]
     return [(places(later), places(later - 1)) for later in numbered]
@@ -186,7 +189,7 @@ def from_lanes(channels: list[Float[Tensor, "G P L"]], lanes: Lanes, count: int)
     for later, _ in lanes.follows:
         tiles[later] = count
     for plane, channel in zip(picture, channels, strict=True):
-        lists = channel.mT.contiguous()
+        lists = channel.mT.clone(memory_format=torch.contiguous_format)
         for later, earlier in reversed(lanes.follows):
             lists[earlier] += lists[later]
         plane.index_copy_(0, tiles.view(-1), lists.flatten(0, 1))

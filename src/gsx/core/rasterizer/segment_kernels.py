@@ -11,8 +11,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.gaussians.bands import sum_of_products
-from gsx.core.rasterizer.kernels import Rules, blended, compiled, entry_gradients, fade, make_rows, slopes, sums_of
+from gsx.core.rasterizer.kernels import (
+    Rules,
+    blended,
+    compiled,
+    entry_gradients,
+    fade,
+    make_rows,
+    seen_from_front,
+    slopes,
+    sums_of,
+)
 from gsx.core.shapes import Float, Int
 
 
@@ -35,8 +44,7 @@ def own_picture(
     rules: Rules,
 ) -> Float[Tensor, "B P"]:
     """What each block shows by itself, as seen from before it, weighted by the gradient of the picture."""
-    shine = sum_of_products(lights, gradient[tiles].unbind(1))
-    return torch.where(before >= max(rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
+    return seen_from_front(lights, gradient[tiles].unbind(1), before, rules)
 
 
 def entry_slopes(

@@ -29,8 +29,7 @@ from gsx.core.rasterizer.path import compiles
 logger = logging.getLogger(__name__)
 
 WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
-"""Of the picture that has everything compiled: lists of several chunks in several groups, a few of them so long that
-they are cut."""
+"""Of the picture that has everything compiled: lists of several chunks in several groups."""
 HELPED: ContextVar[bool] = ContextVar("HELPED", default=False)
 """Whether a second process was begun, which compiles or has done so."""
 
@@ -182,7 +181,6 @@ def warm_splats(device: torch.device) -> Splats:
     """Faint splats before the camera; their own generator, so that a run's randomness is not touched."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(WARM_SPLATS, 3, generator=generator) * 2 - 1
-    means[::5] *= 0.05
     fields = {
         "means": means,
         "scales": torch.full_like(means, 0.05),
