@@ -185,8 +185,8 @@ def transmit(
     passed: Float[Tensor, "B P L"],
     rules: Rules,
 ) -> None:
-    """Leave of `passed` what passes one more block of every group. Its entries are not unrolled: the light alone hangs
-    on no order, and code for one of them compiles sooner."""
+    """Leave of `passed` what passes one more block of every group. Its entries are not unrolled: light alone depends on
+    no order, and code for one of them compiles sooner."""
     row = rows.movedim(2, 0)[..., None, :]  # [F B K 1 L], where others have [F B 1 L] of each entry
     passed.copy_(passed * (1 - clamped(gaussian(row, x, y, rules), row).to(rows.dtype)).prod(1))
 
