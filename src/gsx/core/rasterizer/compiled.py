@@ -49,6 +49,8 @@ class Job:
     precision: Precision
     batch: int
     """Groups worked on at once."""
+    learning: bool
+    """Whether there will be a way back."""
 
 
 def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation: torch.dtype, device: str) -> Rules:
@@ -172,9 +174,10 @@ def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated:
 
 def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
     """Share of the light that passes each list which another piece follows, and some others; 1 elsewhere."""
-    lanes, transmit, passed = job.lanes, settled(job.loops.transmit), Rows(torch.ones_like(like))
-    for part in parts(lanes.groups_cut, job.batch):
-        for base in lanes.bases:
+    transmit, passed = settled(job.loops.transmit), Rows(torch.ones_like(like))
+    followed = max(int(groups.max()) + 1 for _, (groups, _) in job.lanes.follows)  # the longest lists, hence first
+    for part in parts(max(2, followed), job.batch):
+        for base in job.lanes.bases:
             blocks = range(base + part.start, base + part.stop)
             transmit(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
     return passed.values
@@ -262,15 +265,14 @@ class CompiledComposite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, intersections, job):
-        learning = any(ctx.needs_input_grad)
-        places = places_of(job.lanes, intersections) if learning else None  # while the lists are in the cache
+        places = places_of(job.lanes, intersections) if job.learning else None  # while the lists are in the cache
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
         rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
         inside = to_lanes(inside_of(job.grid, job.precision.accumulation, means.device), job.lanes)[0].clone()
-        if learning and recording():  # later pictures may have lists that are cut
+        if job.learning and recording():  # later pictures may have lists that are cut
             job.loops.transmit(rows[:2], job.basis.x, job.basis.y, inside.clone()[:2])
         accumulated, kept = blend_chunks(job, rows, inside)
-        if learning:
+        if job.learning:
             ctx.kept = (job, intersections, places, len(means), kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
@@ -309,8 +311,8 @@ def composite_compiled(
         work = segment_job(segments, grid, rules, precision, values, means.device)
         return SegmentComposite.apply(table, absgrad, intersections, work), needed
     batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
-    learnt = means, conic_factors, log_opacities, channels
-    learning = torch.is_grad_enabled() and any(value.requires_grad for value in learnt)
+    given = means, conic_factors, log_opacities, channels, absgrad
+    learning = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in given)
     cut_long = learning and means.device.type == "cpu"  # elsewhere the host would wait for sizes
     lanes = lay_out(intersections, len(means), settings.unrolled, batch, cut_long=cut_long)
     exact = means.detach().to(precision.exact)
@@ -323,6 +325,7 @@ def composite_compiled(
         rules=rules,
         precision=precision,
         batch=batch,
+        learning=learning,
     )
     return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job), None
 

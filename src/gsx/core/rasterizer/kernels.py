@@ -116,6 +116,13 @@ def clamped(value: Tensor, row: Float[Tensor, "F B 1 *L"]) -> Tensor:
     return torch.where(value > highest, highest, value)
 
 
+def passing(
+    row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], rules: Rules
+) -> Tensor:
+    """1 - alpha of one entry at every pixel, [B P *L]."""
+    return 1 - clamped(gaussian(row, x, y, rules), row).to(row.dtype)
+
+
 def entries(rows: Float[Tensor, "B K F *L"]) -> list[Float[Tensor, "F B 1 *L"]]:
     """The rows of each of the K entries."""
     return list(rows.movedim(0, 2)[:, :, :, None].unbind(0))
@@ -172,8 +179,8 @@ def fade(
     """Share of the light that passes each block, without regard to where pixels end."""
     passed = None
     for row in entries(rows):
-        passing = 1 - clamped(gaussian(row, x, y, rules), row).to(rows.dtype)
-        passed = passing if passed is None else passed * passing
+        share = passing(row, x, y, rules)
+        passed = share if passed is None else passed * share
     assert passed is not None
     return passed
 
@@ -188,7 +195,7 @@ def transmit(
     """Leave of `passed` what passes one more block of every group. Its entries are not unrolled: light alone depends on
     no order, and code for one of them compiles sooner."""
     row = rows.movedim(2, 0)[..., None, :]  # [F B K 1 L], where others have [F B 1 L] of each entry
-    passed.copy_(passed * (1 - clamped(gaussian(row, x, y, rules), row).to(rows.dtype)).prod(1))
+    passed.copy_(passed * passing(row, x, y, rules).prod(1))
 
 
 def seen_from_front(

@@ -38,7 +38,7 @@ Places: TypeAlias = tuple[Int[Tensor, "_"], Int[Tensor, "_"]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lanes:
-    """G groups of L tiles and their S blocks."""
+    """G groups of L lists and their S blocks."""
 
     tiles: Int[Tensor, "G L"]
     """Tile of each lane's list; T, one past the last, fills the last group up."""
@@ -55,8 +55,6 @@ class Lanes:
     follows: list[tuple[Places, Places]]
     """(places of second pieces of tiles, of the first ones), then of third pieces and the second ones, and so on;
     nothing where no list was cut."""
-    groups_cut: int
-    """The first so many groups hold all pieces that another one follows."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,7 +109,6 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
     groups = torch.arange(blocks, device=chunks.device) - table[1][chunks]
     pairs = pairs_in_blocks(lists, len(intersections.splats), lanes, groups, chunks, chunk)
     rows = pad(intersections.splats, (0, 1), value=splats)
-    follows = pieces_of(lists, lanes)
     return Lanes(
         tiles=pad(lists.tiles, (0, 1), value=last)[lanes],
         pairs=pairs,
@@ -119,8 +116,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
         groups=groups,
         active=active.tolist(),
         bases=bases.tolist(),
-        follows=follows,
-        groups_cut=max(2, *(int(groups.max()) + 1 for _, (groups, _) in follows)) if follows else 0,
+        follows=pieces_of(lists, lanes),
     )
 
 
