@@ -28,6 +28,7 @@ from gsx.core.kept_code import (
     make_ahead,
     nothing_kept,
     recorded,
+    waiting_counted,
     without_layers,
 )
 from gsx.core.quality.similarity import compiled_correlate, correlate
@@ -94,8 +95,12 @@ def agrees(function: Callable[..., Tensor], x: Tensor, y: Tensor) -> bool:
 def test_code_is_made_once_and_then_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with made(monkeypatch) as names:
         first = compile_rows(weighted, 2)
-        assert all(agrees(first, *rows(count)) for count in (5, 9, 2, 400))
+        with waiting_counted() as waited:
+            agrees(first, *rows(5))
+            once = waited.seconds
+            assert all(agrees(first, *rows(count)) for count in (9, 2, 400))
         assert names == ["weighted"]
+        assert 0 < once == waited.seconds, "code that is known is not waited for"
         assert [file.suffix for file in sorted(folder.iterdir())] == [".bin", ".lock"]
         assert all(agrees(compile_rows(weighted, 2), *rows(count)) for count in (7, 5))
         assert names == ["weighted"]

@@ -14,6 +14,7 @@ import os
 import platform
 import shutil
 import threading
+import time
 import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -258,8 +259,10 @@ class KeptFunction:
         if file is None:
             return None
         try:
-            with made_by_one(file, wait=True):
+            with counted(), made_by_one(file, wait=True):
                 found, free = self.found(file, arguments)
+                if found is None:
+                    logger.info("compiling %s once; later runs find it on disk ...", self.function.__name__)
                 code = found or self.make(free, arguments)
         except Exception as error:  # of an interface that may change: torch.compile says what is really wrong
             logger.info("%s is compiled without being kept (%s)", self.function.__name__, first_line(error))
@@ -429,6 +432,42 @@ def watched(run: Callable[..., Any], arguments: Sequence[Any]) -> tuple[list[Met
             return calls, run(*arguments)
         finally:
             graphs.__call__ = through
+
+
+# -- time ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Waited:
+    """For code, in seconds."""
+
+    seconds: float = 0.0
+
+
+WAITED: ContextVar[Waited | None] = ContextVar("WAITED", default=None)
+"""Where waiting for code is counted; None where nobody wants to know."""
+
+
+@contextmanager
+def waiting_counted() -> Iterator[Waited]:
+    """How long is waited in this thread for code that is compiled, or read: once in a process, or on a machine."""
+    waited = Waited()
+    token = WAITED.set(waited)
+    try:
+        yield waited
+    finally:
+        WAITED.reset(token)
+
+
+@contextmanager
+def counted() -> Iterator[None]:
+    """Counts as waiting for code."""
+    begun, waited = time.perf_counter(), WAITED.get()
+    try:
+        yield
+    finally:
+        if waited is not None:
+            waited.seconds += time.perf_counter() - begun
 
 
 # -- ahead -------------------------------------------------------------------------------------------------------------

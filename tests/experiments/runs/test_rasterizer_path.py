@@ -3,7 +3,10 @@ done, and only then."""
 
 import subprocess
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -14,7 +17,7 @@ from tiny import tiny_settings
 
 from gsx.builtin import plugins
 from gsx.core.data.scene import Scene
-from gsx.core.kept_code import FOLDER, Call, KeptFunction, file_of, recorded
+from gsx.core.kept_code import FOLDER, Call, KeptFunction, file_of, recorded, recording
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import rasterizer_path
@@ -22,12 +25,15 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.rasterizer_path import (
     HELPED,
+    Learnt,
     compile_beside,
     compile_now,
     help_at_once,
     help_compiling,
     helper,
     learn_little,
+    needed,
+    warm,
 )
 from gsx.experiments.runs.settings import Settings
 
@@ -85,22 +91,38 @@ def files_of(calls: list[Call]) -> dict[str, Path]:
     return found
 
 
-@pytest.mark.parametrize("backbone", ["gs3d", "gs3d_zoom", "mip_splatting", "octree_gs3d", "scaffold"])
-def test_the_first_step_needs_nothing_that_is_not_compiled_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backbone: str
-) -> None:
+@pytest.mark.parametrize(
+    "given",
+    [
+        "backbone=gs3d",
+        "backbone=gs3d backbone.sh_degree=1",
+        "backbone=gs3d backbone.capacity=adaptive",
+        "backbone=gs3d_zoom",
+        "backbone=mip_splatting",
+        "backbone=octree_gs3d",
+        "backbone=scaffold",
+    ],
+)
+def test_no_step_needs_what_is_not_compiled_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str) -> None:
     monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
     monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
     monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
-    run = start(tiny_settings(tmp_path / "run", f"backbone={backbone}", "rasterizer=compiled"), plugins())
-    with recorded() as ahead:
-        learn_little(run.raster, CPU)
+    ahead = list[Call]()
+    monkeypatch.setattr(rasterizer_path, "make_ahead", ahead.extend)
+    monkeypatch.setattr(rasterizer_path, "helper", lambda *_: nullcontext())
+    settings = tiny_settings(tmp_path / "run", *given.split(), "rasterizer=compiled")
+    run = start(settings, plugins())
+    with recorded():
+        warm(run, settings)
     with recorded() as taken:
         train_step(run, plugins())
-    assert "transmit" in {call[0].function.__name__ for call in ahead}  # later steps may need it
+        run.step = run.iterations - 1  # with all bands of colours
+        train_step(run, plugins())
+    names = {call[0].function.__name__ for call in ahead}
+    assert "transmit" in names  # later steps may need it
+    assert ("harmonics_along" in names) == (given != "backbone=scaffold")
     assert {call[0].function.__name__ for call in taken} >= {"blend", "gradients", "make_rows", "geometry"}
-    further = {name.split()[0] for name in set(files_of(taken)) - set(files_of(ahead))}
-    assert further == ({"select"} if backbone in ("octree_gs3d", "scaffold") else set())  # of anchors, and of parts
+    assert set(files_of(taken)) <= set(files_of(ahead))
 
 
 class Begun:
@@ -117,7 +139,7 @@ class Begun:
 
 
 @pytest.mark.parametrize("zoomed", ["plain", "magnified"])
-def test_the_helper_makes_from_the_other_end_what_no_backbone_changes(
+def test_the_helper_makes_from_the_other_end_what_no_backbone_changes_and_the_others_come_first(
     zoomed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, begun = [], list[Begun]()
@@ -130,16 +152,29 @@ def test_the_helper_makes_from_the_other_end_what_no_backbone_changes(
     monkeypatch.setattr("torch.set_num_threads", lambda _: None)
     monkeypatch.setattr(rasterizer_path, "end_with", lambda _: None)
     rules = RasterSettings(path="compiled", dilation=0.2, zoomed=zoomed)
-    with recorded() as calls:
-        learn_little(rules, CPU)
-    with helper(rules):
+    learnt = Learnt(sh_degree=2)
+    calls = needed(rules, learnt, CPU)
+    with helper(rules, 2):
         (process,) = begun
         assert process.ended == []
         help_compiling(process.words[-1])
     assert process.ended == ["killed", "waited for"]
-    expected = {file: name for name, file in files_of(calls[::-1]).items() if not name.startswith("geometry")}
+    own = ("geometry", "gradients")
+    expected = {file: name for name, file in files_of(calls[::-1]).items() if not name.startswith(own)}
     assert made == list(expected)
-    assert len(made) == len(files_of(calls)) - 1 >= 8
+    assert len(made) == len(files_of(calls)) - 2 >= 8
+    for file in made[:3]:
+        file.unlink()
+    monkeypatch.setattr(rasterizer_path, "learn_little", partial(recording_only, learn_little))
+    compile_now(rules, learnt, CPU)
+    assert [file.stem.split("-")[0] for file in made[len(expected) :][:2]] == [*own]
+    assert set(made[len(expected) + 2 :]) == set(made[:3])
+
+
+def recording_only(function: Callable[..., None], *given: Any) -> None:
+    """A function that would compile, where calls are only to be known."""
+    if recording():
+        function(*given)
 
 
 def test_a_process_that_cannot_be_begun_is_done_without(
@@ -150,7 +185,7 @@ def test_a_process_that_cannot_be_begun_is_done_without(
 
     monkeypatch.setattr("subprocess.Popen", refuse)
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
-    with caplog.at_level("INFO"), helper(RasterSettings()):
+    with caplog.at_level("INFO"), helper(RasterSettings(), 3):
         assert not HELPED.get()
     assert "compiles alone (no memory for another)" in caplog.text
 
@@ -169,7 +204,8 @@ def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """What becomes of helpers; this process has two threads, and an empty place for what is compiled."""
     told: list[str] = []
 
-    def noted(settings: RasterSettings) -> Begun:
+    def noted(settings: RasterSettings, sh_degree: int) -> Begun:
+        assert sh_degree == 3
         told.append(f"begins {settings.path}")
         return Begun([], told)
 
@@ -189,19 +225,25 @@ def helped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 def test_help_begins_at_once_where_nothing_was_ever_compiled(
     settings: dict[str, Any], steps: int, helped: list[str], tmp_path: Path
 ) -> None:
-    ways = RasterSettings(**settings)
-    with help_at_once(ways, steps, CPU):
-        assert helped == [f"begins {ways.path}"]
-    assert helped == [f"begins {ways.path}", "killed", "waited for"]
+    path, asked = settings["path"], with_rules(steps, **settings)
+    with help_at_once(asked, CPU):
+        assert helped == [f"begins {path}"]
+    assert helped == [f"begins {path}", "killed", "waited for"]
     (tmp_path / "code" / FOLDER).mkdir(parents=True)
     (tmp_path / "code" / FOLDER / "blend-0.bin").touch()
-    with help_at_once(ways, steps, CPU):
+    with help_at_once(asked, CPU):
         assert len(helped) == 3
+
+
+def with_rules(steps: int, **rules: Any) -> Settings:
+    """The tiny experiment of so many steps, drawn by these rules."""
+    settings = tiny_settings(Path("later"))
+    return replace(settings, raster=RasterSettings(**rules), general=replace(settings.general, iterations=steps))
 
 
 def test_a_process_of_one_thread_is_not_helped(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 1)
-    with help_at_once(RasterSettings(path="compiled"), 300, CPU):
+    with help_at_once(with_rules(300, path="compiled"), CPU):
         assert helped == []
 
 
@@ -216,7 +258,7 @@ def test_a_process_of_one_thread_is_not_helped(helped: list[str], monkeypatch: p
 def test_no_help_begins_for_what_is_not_compiled_here(
     settings: dict[str, Any], steps: int, device: str, helped: list[str]
 ) -> None:
-    with help_at_once(RasterSettings(**settings), steps, torch.device(device)):
+    with help_at_once(with_rules(steps, **settings), torch.device(device)):
         assert helped == []
 
 
@@ -241,9 +283,9 @@ def test_a_run_is_helped_from_before_its_scene_is_read_until_it_ends(
 def test_a_second_helper_does_not_join_the_first(helped: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizer_path, "learn_little", lambda *_: None)
     monkeypatch.setattr(rasterizer_path, "lacking", lambda _: True)
-    rules = RasterSettings(path="compiled")
-    with help_at_once(rules, 300, CPU):
-        compile_now(rules, CPU, helped=True)
+    settings, learnt = with_rules(300, path="compiled"), Learnt(sh_degree=3)
+    with help_at_once(settings, CPU):
+        compile_now(settings.raster, learnt, CPU, helped=True)
         assert helped == ["begins compiled"]
-    compile_now(rules, CPU, helped=True)
+    compile_now(settings.raster, learnt, CPU, helped=True)
     assert helped == ["begins compiled", "killed", "waited for"] * 2

@@ -24,14 +24,15 @@ class Contraction(torch.autograd.Function):
     def forward(ctx, basis, rest, compiled):
         ctx.save_for_backward(basis, rest)
         ctx.compiled = compiled
-        return (compiled_contraction(len(basis))[0] if compiled else spread_contraction)(rest, basis)
+        contract = compiled_contraction(len(basis))[0] if compiled else spread_contraction
+        return contract(rest[:], basis)  # a view, or torch would compile once more where others are none
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
         basis, rest = ctx.saved_tensors
         slopes_of = compiled_contraction(len(basis))[1] if ctx.compiled else spread_slopes
-        by_rest, by_basis = slopes_of(gradient.contiguous(), rest, basis)
+        by_rest, by_basis = slopes_of(gradient.contiguous(), rest[:], basis)
         return by_basis, by_rest, None
 
 

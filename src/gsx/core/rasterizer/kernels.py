@@ -8,7 +8,7 @@ alone; sums over a tile's pixels are the only reductions in the others. Rules ar
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import signature
 from typing import Any
 
@@ -367,6 +367,8 @@ slow) or take longer to compile (at 120: twice as long, for code that is no fast
 
 SHARED_AFTER = 50
 """The same of all others: with more of them slopes by segments find weights twice."""
+SUMMING = {"gradients", "entry_sums"}
+"""Loops whose code is another one with absolute gradients."""
 OF_A_TILE = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 
@@ -395,7 +397,9 @@ def kernels(rules: Rules) -> Kernels:
 
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
-    """`loop` of these rules through torch.compile."""
+    """`loop` of these rules through torch.compile; what sums nothing is one with and without absolute gradients."""
+    if loop.__name__ not in SUMMING:
+        rules = replace(rules, absolute=False)
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
     # loops over blocks: no conditions on symbols, which are the number of blocks, the same in all arguments, and where
     # in storage a view begins, which enters no code; every other size, dtypes, strides and devices are checked one by

@@ -144,9 +144,10 @@ def compiled_select() -> Callable[..., tuple[Tensor, Tensor]]:
 def selected(
     splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], compiled: bool
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """What `select` says of splats."""
-    fields = (splats.means, splats.scales, splats.quats, splats.log_opacities, splats.colours)
-    points, means, scales, quats, log_opacities, colours = (value.detach() for value in (points, *fields))
+    """What `select` says of splats. The same code serves those without colours, and fields with gaps."""
+    colours = splats.colours if splats.colours.shape[1] else splats.means
+    fields = (points, splats.means, splats.scales, splats.quats, splats.log_opacities, colours)
+    points, means, scales, quats, log_opacities, colours = (value.detach().contiguous() for value in fields)
     choose = compiled_select() if compiled else select
     return choose(points, means, scales, quats, log_opacities, colours, numbers.detach())
 

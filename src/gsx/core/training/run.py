@@ -184,7 +184,7 @@ class Run:
     warm_starts: Path | None = None
     """Where states are kept that other runs may branch from; None: nowhere, as for all runs that were resumed."""
     seconds: float = 0.0
-    """Time spent in training steps, without evaluation and files."""
+    """Time spent in training steps, without evaluation, files and waiting for code to be compiled."""
     stopping: bool = False
     """Set to end after the current step, or within it where that takes long (`refuse_if_stopping`)."""
     changing: bool = False

@@ -65,7 +65,7 @@ def compact(
     refuse_used(str(to))
     run, settings = opened(target, overrides, plugins)
     with claimed_anew(to):
-        warm(run.raster, run.device)
+        warm(run, settings)
         steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
         generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
         shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)

@@ -54,12 +54,12 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     All ranks but the first only train.
     """
     if not run.ranks.first:
-        follow(run, plugins)
+        follow(run, settings, plugins)
         return
     trackers = build_trackers(settings.trackers)
     remove_partial(cache_root())
     announce(run, plugins)
-    warm(run.raster, run.device)
+    warm(run, settings)
     status(run, "running")
     log = MetricsLog(settings.evaluation)
     listeners: list[object] = [
@@ -138,9 +138,9 @@ def told_of(what: str) -> Iterator[None]:
         logger.warning("after this error %s could not be kept (%s)", what, first_line(problem))
 
 
-def follow(run: Run, plugins: Plugins) -> None:
+def follow(run: Run, settings: Settings, plugins: Plugins) -> None:
     """Train as another process does, and write nothing."""
-    warm(run.raster, run.device, helped=False)
+    warm(run, settings, helped=False)
     with plugins.listening([Guard(), Agreement()]):
         train(run, plugins)
 

@@ -89,7 +89,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     refuse_uneven(settings.training.batch, ranks)
     if claims is not None and ranks.first:
         prepare_compiling()
-        claims.enter_context(help_at_once(settings.raster, settings.general.iterations, device))
+        claims.enter_context(help_at_once(settings, device))
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
     if settings.general.viewer:

@@ -44,7 +44,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
     with claimed(folder):
         run, settings = open_run(folder, plugins, overrides)
         run.raster = as_trained(run)
-        warm(run.raster, run.device)
+        warm(run, settings)
         findings = findings_of(run, settings.evaluation.tile_pixels)
         write_findings(run, findings, worst, settings.evaluation.tile_pixels)
         write_report(folder)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from threading import Thread
 from typing import IO
 
@@ -25,6 +25,8 @@ from gsx.core.kept_code import Call, file_of, lacking, make_ahead, nothing_kept,
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
 from gsx.core.rasterizer.path import compiles
+from gsx.core.training.run import Run
+from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +34,16 @@ WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
 """Of the picture that has everything compiled: lists of several chunks in several groups."""
 HELPED: ContextVar[bool] = ContextVar("HELPED", default=False)
 """Whether a second process was begun, which compiles or has done so."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learnt:
+    """What code for a step depends on beside the rules of the rasterizer."""
+
+    sh_degree: int = 0
+    """Up to which colours change with direction."""
+    absolute_gradient: bool = False
+    """Whether the backbone asks for absolute gradients of screen means."""
 
 
 def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
@@ -52,54 +64,61 @@ def asks_for_code(settings: RasterSettings, steps: int) -> bool:
 
 
 @contextmanager
-def help_at_once(settings: RasterSettings, steps: int, device: torch.device) -> Iterator[None]:
+def help_at_once(settings: Settings, device: torch.device) -> Iterator[None]:
     """Where nothing was ever compiled a second process begins with that, as long as the context lasts, while the first
     one starts; elsewhere it is known later what is lacking."""
-    wanted = device.type == "cpu" and asks_for_code(settings, steps) and nothing_kept()
-    with helper(settings) if wanted else nullcontext():
+    wanted = device.type == "cpu" and asks_for_code(settings.raster, settings.general.iterations) and nothing_kept()
+    with helper(settings.raster, sh_degree(settings)) if wanted else nullcontext():
         yield
 
 
-def warm(settings: RasterSettings, device: torch.device, helped: bool = True) -> None:
+def sh_degree(settings: Settings) -> int:
+    """Degree of a backbone's spherical harmonics; 0 of one that has no such option."""
+    return getattr(settings.backbone.options, "sh_degree", 0)
+
+
+def warm(run: Run, settings: Settings, helped: bool = True) -> None:
     """Have the rasterizer and the loss compiled before the first step, and say so; `helped`: by a second process."""
-    if compiles(settings, device.type):
+    if compiles(run.raster, run.device.type):
         logger.info("compiling the rasterizer once; later runs find it on disk ...")
-        logger.info("compiled in %.0f s", compile_now(settings, device, helped))
+        learnt = Learnt(sh_degree=sh_degree(settings), absolute_gradient=run.backbone.absolute_gradient)
+        logger.info("compiled in %.0f s", compile_now(run.raster, learnt, run.device, helped))
 
 
-def compile_now(settings: RasterSettings, device: torch.device, helped: bool = False) -> float:
+def compile_now(settings: RasterSettings, learnt: Learnt, device: torch.device, helped: bool = False) -> float:
     """Learn from a small picture, so that all loops get compiled, unless all are kept; returns the seconds it took."""
     begun = time.perf_counter()
-    calls = needed(settings, device)
+    calls = needed(settings, learnt, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
-        with helper(settings) if helped else nullcontext():
-            make_ahead(calls)
-            learn_little(settings, device)
+        with helper(settings, learnt.sh_degree) if helped else nullcontext():
+            common = set(map(file_of, of_any_backbone(settings, learnt.sh_degree)))
+            make_ahead(sorted(calls, key=lambda call: file_of(call) in common))  # first what nobody helps with
+            learn_little(settings, learnt, device)
     return time.perf_counter() - begun
 
 
-def needed(settings: RasterSettings, device: torch.device) -> list[Call]:
+def needed(settings: RasterSettings, learnt: Learnt, device: torch.device) -> list[Call]:
     """Calls of all that a step compiles."""
     with recorded() as calls:
-        learn_little(settings, device)
+        learn_little(settings, learnt, device)
     return calls
 
 
-def learn_little(settings: RasterSettings, device: torch.device) -> None:
+def learn_little(settings: RasterSettings, learnt: Learnt, device: torch.device) -> None:
     """All that a step compiles, on a small picture."""
-    splats = warm_splats(device)
-    rest = Parameter(torch.zeros(len(splats), 15, 3, device=device))
-    colours = colours_of(splats.colours[:, None], rest, splats.means, degree=3, compiled=True)
-    as_training = replace(settings, training_focal=0.0)
-    image = rasterize(replace(splats, colours=colours), warm_camera(), as_training).image
+    splats, degree = warm_splats(device), learnt.sh_degree
+    rest = Parameter(torch.zeros(len(splats), (degree + 1) ** 2 - 1, 3, device=device))
+    colours = colours_of(splats.colours[:, None], rest, splats.means, degree, compiled=True)
+    as_training, absolute = replace(settings, training_focal=0.0), learnt.absolute_gradient
+    image = rasterize(replace(splats, colours=colours), warm_camera(), as_training, absolute_gradient=absolute).image
     photometric(image, torch.zeros(image.shape, device=device), 0.2, compiled=True).backward()
 
 
 @contextmanager
-def helper(settings: RasterSettings) -> Iterator[None]:
-    """A process that compiles from the other end what no backbone changes, as long as the context lasts; none where
-    this process has a single thread, or was given one before."""
-    process = begun(settings) if torch.get_num_threads() > 1 and not HELPED.get() else None
+def helper(settings: RasterSettings, sh_degree: int) -> Iterator[None]:
+    """A process that compiles from the other end what backbones of this degree have in common, as long as the context
+    lasts; none where this process has a single thread, or was given one before."""
+    process = begun(settings, sh_degree) if torch.get_num_threads() > 1 and not HELPED.get() else None
     if process is None:
         yield
         return
@@ -112,9 +131,10 @@ def helper(settings: RasterSettings) -> Iterator[None]:
         process.communicate()
 
 
-def begun(settings: RasterSettings) -> subprocess.Popen[bytes] | None:
+def begun(settings: RasterSettings, sh_degree: int) -> subprocess.Popen[bytes] | None:
     """That process; None where there can be none, which is said."""
-    words = json.dumps({"settings": asdict(replace(settings, path="compiled")), "threads": torch.get_num_threads()})
+    given = {"settings": asdict(replace(settings, path="compiled")), "sh_degree": sh_degree}
+    words = json.dumps(given | {"threads": torch.get_num_threads()})
     code = "import sys; from gsx.experiments.runs.rasterizer_path import help_compiling; help_compiling(sys.argv[1])"
     try:
         return subprocess.Popen(
@@ -133,7 +153,7 @@ def help_compiling(words: str) -> None:
     Thread(target=end_with, args=[sys.stdin.buffer], daemon=True).start()
     given = json.loads(words)
     torch.set_num_threads(given["threads"])
-    make_ahead(of_any_filter(RasterSettings(**given["settings"]))[::-1])
+    make_ahead(of_any_backbone(RasterSettings(**given["settings"]), given["sh_degree"])[::-1])
 
 
 def end_with(stream: IO[bytes]) -> None:
@@ -142,10 +162,13 @@ def end_with(stream: IO[bytes]) -> None:
     os._exit(0)
 
 
-def of_any_filter(settings: RasterSettings) -> list[Call]:
-    """Calls of what is the same by any screen filter, which the backbone chooses."""
+def of_any_backbone(settings: RasterSettings, sh_degree: int) -> list[Call]:
+    """Calls of what is the same by any screen filter and any gradients, which the backbone chooses."""
     other = replace(settings, dilation=settings.dilation + 1, compensate=not settings.compensate, zoomed="plain")
-    calls, others = (needed(rules, torch.device("cpu")) for rules in (settings, other))
+    calls, others = (
+        needed(rules, Learnt(sh_degree=sh_degree, absolute_gradient=absolute), torch.device("cpu"))
+        for rules, absolute in ((settings, False), (other, True))
+    )
     files = set(map(file_of, others))
     return [call for call in calls if file_of(call) in files]
 

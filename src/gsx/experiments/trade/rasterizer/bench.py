@@ -17,7 +17,7 @@ from gsx.core.rasterizer.compiled import takes
 from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
-from gsx.experiments.runs.rasterizer_path import compile_now
+from gsx.experiments.runs.rasterizer_path import Learnt, compile_now
 from gsx.experiments.trade.rasterizer.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
 from gsx.experiments.trade.rasterizer.subject import Shot, Subject
 
@@ -168,7 +168,7 @@ class Bench:
         try:
             settings = replace(self.base, **trial.changes)
             if self.subject.device.type == "cpu" and compiles(settings, "cpu"):
-                compile_now(settings, self.subject.device, helped=True)
+                compile_now(settings, Learnt(), self.subject.device, helped=True)
             for shot in self.subject.shots:
                 self.render(shot, settings, torch.float32)
             figures = self.figures(self.draw(settings, torch.float32))
