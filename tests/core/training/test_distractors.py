@@ -11,10 +11,13 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
+from gsx.core.data.coarser import coarser
 from gsx.core.data.disturbed import patch_of
+from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
-from gsx.core.training.captures import differences, forget_distractors
-from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed
+from gsx.core.errors import Stopped
+from gsx.core.training.captures import differences, forget, judge_distractors, showing_distractors
+from gsx.core.training.distractors import DistractorOptions, Distractors, Obstructed, obstructed, without_marked
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
@@ -60,6 +63,22 @@ def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> N
     assert torch.equal(cut.counted(), expected[3:11, 6:16])
     assert torch.equal(view.image(), views()[0].image())
     assert obstructed(views()[1], marks()[1]).counted() is None
+
+
+@pytest.mark.parametrize("times", [2, 4, 8, 16])
+def test_a_coarse_pixel_counts_where_nothing_of_it_is_marked(times: int) -> None:
+    """Also where it is larger than a block, of 4 px; of pictures that it does not divide."""
+    view = View("a", views()[0].camera.resize(650, 523), Grey())
+    marked = torch.zeros(523 // 4, 650 // 4, dtype=torch.bool)
+    marked[40:60, 60:81] = True  # rows 160 to 240, columns 240 to 324
+    coarse = coarser(view, Reduction(), times)
+    assert coarse.camera.size == (650 // times, 523 // times)
+    found, picture = obstructed(coarse, marked), coarse.source.image(coarse.camera)
+    expected = torch.ones(523 // times, 650 // times, dtype=torch.bool)
+    expected[160 // times : 240 // times, 240 // times : -(-324 // times)] = False
+    assert torch.equal(found.counted(), expected)
+    assert found.source.image(found.camera) is picture, "it is made once"
+    assert coarse.counted() is None
 
 
 @pytest.mark.parametrize(("width", "height"), [(67, 71), (131, 97)])
@@ -207,8 +226,7 @@ def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_
     blocks = [torch.zeros(9, 12, dtype=torch.bool) for _ in run.scene.train]
     blocks[0][:, :6] = True
     before = run.backbone.table["means"].clone()
-    run.distractors.mark(blocks, run.step)
-    gone = forget_distractors(run)
+    gone = forget(run, showing_distractors(run, without_marked(run.scene.train, blocks)))
     left = {tuple(mean) for mean in run.backbone.table["means"].tolist()}
     removed = torch.tensor([mean for mean in before.tolist() if tuple(mean) not in left])
     assert 0 < gone == len(removed) < len(before) / 4
@@ -216,5 +234,23 @@ def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_
     assert float(sees.float().mean()) < 3  # of six: others would show them where they count
     pixels, _ = run.scene.train[0].camera.project(removed)
     assert float((pixels[:, 0] < 24).float().mean()) > 0.9
-    run.distractors.mark([torch.ones_like(one) for one in blocks], run.step)
-    assert forget_distractors(run) == 0  # a model of nothing is none
+    nothing = without_marked(run.scene.train, [torch.ones_like(one) for one in blocks])
+    assert forget(run, showing_distractors(run, nothing)) == 0  # a model of nothing is none
+
+
+def test_a_stop_while_distractors_are_found_leaves_all_to_be_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Marks without what they tell to remove would stay so."""
+    run = tiny_run(tmp_path, ["iterations=4", "eval.zoom=[1]", "training.distractors.when=always"])
+    before = run.distractors.marked, run.distractors.looked
+
+    def stop(*_: object) -> None:
+        raise Stopped
+
+    blocks = [torch.ones(9, 12, dtype=torch.bool) for _ in run.scene.train]
+    monkeypatch.setattr("gsx.core.training.captures.distractors_in", lambda _: blocks)
+    monkeypatch.setattr("gsx.core.training.captures.shown_weights", stop)
+    with pytest.raises(Stopped):
+        judge_distractors(run)
+    assert (run.distractors.marked, run.distractors.looked) == before

@@ -13,11 +13,12 @@ from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Growing
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.coarser import coarser
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.plugins import hookimpl
-from gsx.core.training.resolution import Resolution, coarser
+from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Step
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start

@@ -9,19 +9,19 @@ from statistics import median
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.quality.alignment import aligned, usual_depth
 from gsx.core.quality.distractors import Difference, difference_of, distractors_in
 from gsx.core.quality.motion_blur import Movement, movement_between
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.distractors import share_of
+from gsx.core.training.distractors import share_of, without_marked
 from gsx.core.training.evidence import looked_at, shown_weights
 from gsx.core.training.exposure import LIGHT, Pair, log_gains
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.poses import CORRELATED_PIXELS, shifts_by_half, spread_of_shifts, usual_shift
 from gsx.core.training.render import render
-from gsx.core.training.resolution import coarser
 from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -158,7 +158,7 @@ def movement_of(run: Run, view: View) -> Movement:
     photograph, counted = small.image(), small.counted()
     shown = render(run, small.camera, supersample=1).image
     image = at_exposure(run.exposures.applied(shown, view.name).detach().cpu(), photograph, counted)
-    return movement_between(image, photograph, counted).times(view.camera.width / small.camera.width)
+    return movement_between(image, photograph, counted).times(view.camera.focal / small.camera.focal)
 
 
 def judge_distractors(run: Run) -> dict[str, float]:
@@ -174,9 +174,10 @@ def judge_distractors(run: Run) -> dict[str, float]:
     if wanted:
         seen |= differences(run, [view for view in views if view not in seen])
     marked = distractors_in([seen[view] for view in views]) if wanted else None
-    told["distractors"] = distractors.mark(marked, run.step + 1)
-    if wanted:
-        told["forgotten"] = forget_distractors(run)
+    doomed = showing_distractors(run, without_marked(views, marked)) if marked is not None else None
+    told["distractors"] = distractors.mark(marked, run.step + 1)  # with their primitives, or neither
+    if doomed is not None:
+        told["forgotten"] = forget(run, doomed)
         logger.info(
             "step %d: %.1f %% of photographs do not count; %d primitives that show these are removed",
             *(run.step + 1, 100 * told["distractors"], told["forgotten"]),
@@ -184,21 +185,25 @@ def judge_distractors(run: Run) -> dict[str, float]:
     return told | {"distractor_seconds": round(time.perf_counter() - begun, 3)}
 
 
-def forget_distractors(run: Run) -> int:
-    """Remove the primitives that are mostly shown where pixels of training photographs do not count; returns how many.
-    What they show was learnt before these were found."""
+def showing_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
+    """Which primitives are mostly shown where pixels of photographs do not count. What they show was learnt before
+    these were found."""
     model, form, step = run.backbone, run.resolution.forming(run.model_step), run.model_step
     hidden, shown = run.background.new_zeros(2, len(model.table))
-    for view in run.photographed:
+    for view in views:
         run.refuse_if_stopping()
         small = coarser(view, run.scene.reduction, SMALLER)
         drawn, seen = looked_at(model, small.camera, form, run.background, step)
         own, all_over = shown_weights(drawn, seen, small.counted(), len(model.table))
         hidden, shown = hidden + own, shown + all_over
-    doomed = hidden > shown / 2
+    return hidden > shown / 2
+
+
+def forget(run: Run, doomed: Bool[Tensor, "N"]) -> int:
+    """Remove primitives, unless they are all; returns how many."""
     if bool(doomed.all()):
         return 0
-    keep_rows(model.table, ~doomed)
+    keep_rows(run.backbone.table, ~doomed)
     return int(doomed.sum())
 
 

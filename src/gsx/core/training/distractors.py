@@ -2,7 +2,8 @@
 
 Whether there are any is judged once, from some photographs (`core.quality.distractors`). If so, those of all
 photographs are found, and again a few times as the model learns more; pixels that show one count in no loss, no
-growth and no figure from there on, as if a mask had left them out. Test photographs play no part.
+growth and no figure from there on, as if a mask had left them out, but in pseudo views that were made before. Test
+photographs play no part.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.coarser import CoarseSource
 from gsx.core.data.scene import CutOut, FromFile, ImageSource, Masked, View
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Int, UInt8
@@ -91,10 +93,17 @@ def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[
     return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
 
 
+def without_marked(views: Sequence[View], marked: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
+    """Views without what is marked in their photographs."""
+    return [obstructed(view, one) for view, one in zip(views, marked, strict=True)]
+
+
 def obstructed(view: View, marked: Bool[Tensor, "h w"]) -> View:
-    """The view without what is marked; itself where nothing is."""
+    """The view without what is marked in its photograph; itself where nothing is. Of a coarse pixel nothing may be."""
     if not bool(marked.any()):
         return view
+    if isinstance(view.source, CoarseSource):
+        return replace(view, source=view.source.of(obstructed(view.source.view, marked)))
     frame = view.camera.frame
     kind = ObstructedFile if isinstance(view.source, FromFile) else Obstructed
     return replace(view, source=kind(source=view.source, marked=marked, size=(frame.width, frame.height)))
@@ -138,8 +147,8 @@ class Distractors:
         """The training views, in order, without their distractors; the same ones until others are found."""
         if self.marked is None:
             return views
-        pairs = zip(views, self.marked, strict=True)
-        return self.seen.views(views, lambda: [obstructed(view, marked) for view, marked in pairs])
+        marked = self.marked
+        return self.seen.views(views, lambda: without_marked(views, marked))
 
     def mark(self, marked: Sequence[Bool[Tensor, "h w"]] | None, number: int) -> float:
         """These from a step on; returns their share of the pictures."""

@@ -1,0 +1,60 @@
+"""Views at a fraction of their size."""
+
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import View
+from gsx.core.shapes import Bool, UInt8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CoarseSource:
+    """The picture of a view, reduced by the scene's own filter (implements `gsx.core.data.scene.ImageSource`)."""
+
+    view: View
+    reduction: Reduction
+    times: int
+    kept: list[UInt8[Tensor, "3 h w"]] = field(default_factory=list)
+    """The picture, once it was asked for."""
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 h w"]:
+        """The whole picture: that is all that training asks for."""
+        if not self.kept:
+            width, height = (side * self.times for side in camera.size)
+            fine = self.view.image()[:, :height, :width]
+            self.kept.append((self.reduction.reduce(fine, self.times) * 255).round().byte())
+        return self.kept[0]
+
+    def max_zoom(self, camera: Camera) -> float:
+        """There is this picture alone."""
+        return 1.0
+
+    def of(self, view: View) -> "CoarseSource":
+        """The same picture of a view of which other pixels count."""
+        return replace(self, view=view)
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
+        """Pixels that are made of nothing but pixels that count."""
+        fine = self.view.counted()
+        if fine is None:
+            return None
+        width, height = camera.size
+        blocks = fine[: height * self.times, : width * self.times].reshape(height, self.times, width, self.times)
+        return blocks.all(3).all(1)
+
+
+LEAST = 32
+"""Pixels that the shorter side of a picture keeps: smaller ones say little, and SSIM looks at windows of 11."""
+
+
+def coarser(view: View, reduction: Reduction, times: int) -> View:
+    """A view, so many times as coarse; what is left over at its right and lower borders does not show. It stays as it
+    is where too few pixels would be left."""
+    if times == 1 or min(view.camera.size) < LEAST * times:
+        return view
+    across, down = (side // times for side in view.camera.size)
+    camera = replace(view.camera, width=across * times, height=down * times).resize(across, down)
+    return replace(view, camera=camera, source=CoarseSource(view=view, reduction=reduction, times=times))
