@@ -186,6 +186,16 @@ def test_trust_weighs_pixels() -> None:
     assert float(pseudo_loss(torch.full((3, 2, 2), 0.5), replace(view, pixel_weight=None))) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("strength", [[0.1, 0.0], [0.0, 0.1]])
+def test_strengths_are_measured_by_the_largest(strength: list[float], tmp_path: Path) -> None:
+    """Also where the first is none."""
+    run = run_at(tmp_path / "run", 44, "augmenter=upscale")
+    augmenter = by_options(run, strength=strength)
+    (spec, *_) = augmenter.planner.specs(run, augmenter.events[0], {0})
+    request = augmenter.redrawer.request(run, augmenter.events[0], spec)
+    assert (request.strength, request.strongest) == (strength[0], 0.1)
+
+
 @pytest.mark.parametrize("background", ["false", "true"])
 def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """0.32 / 2 times the mean squares, by hand; the photograph's own scale is drawn once, unless backgrounds differ."""

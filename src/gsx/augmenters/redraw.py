@@ -86,7 +86,7 @@ class Redrawer:
             photo=spec.outer is not None,
             seed=spec.seed,
             strength=ramp(self.options.strength, event, self.options.timing, self.schedule),
-            strongest=self.options.strength[0],
+            strongest=max(self.options.strength),
             prompt=self.options.prompt.replace("{scene}", run.scene.name),
             step=event,
         )
@@ -116,6 +116,7 @@ class Redrawer:
             reduction=request.reduction,
             provenance={
                 "event": event,
+                "model_step": run.step,
                 "view": request.view.name,
                 "kind": spec.kind,
                 "scale": a,
@@ -144,6 +145,7 @@ class Redrawer:
             parent=parent,
             provenance={
                 "event": event,
+                "model_step": run.step,
                 "view": view.name,
                 "kind": "coarser",
                 "scale": 1 / factor,

@@ -147,7 +147,7 @@ class SceneRestorer:
         return [self.restored(request) for request in requests]
 
     def restored(self, request: Request) -> Float[Tensor, "3 h w"]:
-        """One picture; the whole correction at the first event's strength, half of it at half of that."""
+        """One picture; the whole correction at the largest strength of any event, half of it at half of that."""
         fold = (request.number + 1) % FOLDS
         if not self.useful[fold] or request.strength == 0:
             return request.image

@@ -15,6 +15,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
+from gsx.core.training.pseudo_views import PseudoView, pseudo_loss
 from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
 from gsx.experiments.runs.build import build
@@ -144,7 +145,20 @@ def test_steps_are_judged_when_all_else_is_settled(more: tuple[str, ...], first:
     assert run.plateau.first == first
 
 
-def test_pseudo_details_whose_event_was_left_out_begin_late(tmp_path: Path) -> None:
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[PseudoView]:
+    """Pseudo views that steps learn from."""
+    learnt = list[PseudoView]()
+
+    def noted(image: Tensor, view: PseudoView, squared: bool) -> Tensor:
+        learnt.append(view)
+        return pseudo_loss(image, view, squared)
+
+    monkeypatch.setattr("gsx.core.training.trainer.pseudo_loss", noted)
+    return learnt
+
+
+def test_pseudo_details_whose_event_was_left_out_begin_late(tmp_path: Path, seen: list[PseudoView]) -> None:
     """Windows of eight steps begin after steps 21, 28 and 36: of the second, step 32 is the first that is taken."""
     timing = [f"augmenter.upscale.timing.{word}" for word in ("start=21000", "every=7500", "span=7500")]
     words = (*LEAVES_OUT, "augmenter=upscale", "regenerator/upscale=lanczos", *timing)
@@ -153,6 +167,10 @@ def test_pseudo_details_whose_event_was_left_out_begin_late(tmp_path: Path) -> N
     events = {line["step"]: line["pseudo"]["upscale"]["event"] for line in run.curves if "pseudo" in line}
     assert events == {32: 31, 37: 36}
     assert all("upscale" in line["terms"] for line in run.curves if line["step"] >= 32)
+    late = [view for view in seen if view.provenance["event"] == 28]
+    assert {view.provenance["model_step"] for view in late} == {31}
+    run.resolution.closer["upscale"] = late
+    assert [len(run.resolution.closer_after(step)) for step in (29, 31, 32, 33)] == [0, 0, len(late), 0]
 
 
 def test_every_step_is_taken_that_gains_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,6 +205,37 @@ def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.M
     parameters = [name for name in plain_end if name.startswith("parameters.")]
     assert all(torch.equal(plain_end[name], white[name]) for name in parameters)
     assert not all(torch.equal(later[name], longer[name]) for name in parameters)
+
+
+def test_pseudo_details_do_not_show_the_windows(tmp_path: Path, seen: list[PseudoView]) -> None:
+    """Of photographs at their own and at twice their scale, while the windows that began after step 10 are there."""
+    timing = [f"augmenter.upscale.timing.{word}" for word in ("start=8000", "every=28000", "span=28000")]
+    more = ("augmenter=upscale", "regenerator/upscale=lanczos", "augmenter.upscale.scales=[1,2]", *timing)
+    run = tiny_run(tmp_path, (*WORDS, "training.plateau.price=1e-6", *more), stop_after=15)
+    before, since = seen[: 2 * 2], seen[2 * 2 :]  # steps 9 and 10, two scales each
+    windows = list(run.plateau.windows(run.scene.train, 10).items())
+    assert {view.camera.width > 48 for view in since} >= {False}
+    assert all(view.pixel_weight is None for view in before)
+    hidden = 0
+    for pseudo in since:
+        (parent, window), camera = windows_by_parent(windows, run)[pseudo.parent], pseudo.camera
+        rows, columns = (torch.arange(side) + 0.5 for side in (camera.height, camera.width))
+        x = (columns - camera.cx) / camera.fx * parent.camera.fx + parent.camera.cx
+        y = (rows - camera.cy) / camera.fy * parent.camera.fy + parent.camera.cy
+        across = (x > window.left) & (x < window.left + window.width)
+        down = (y > window.top) & (y < window.top + window.height)
+        inside = down[:, None] & across
+        weight = torch.full(inside.shape, 255) if pseudo.pixel_weight is None else pseudo.pixel_weight
+        assert not bool(weight[inside].any())
+        assert bool((weight[~inside] == 255).all())
+        assert pseudo.coarse is None or not bool(inside.any())
+        hidden += int(inside.sum())
+    assert hidden > 0
+
+
+def windows_by_parent(windows: list[tuple[View, Window]], run: Run) -> dict[int, tuple[View, Window]]:
+    """By the number of the training view."""
+    return {list(run.scene.train).index(view): (view, window) for view, window in windows}
 
 
 @pytest.mark.parametrize("stop", [15, 16, 33])

@@ -1,5 +1,6 @@
 """Parts of rasters."""
 
+import math
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -30,6 +31,17 @@ class Window:
         """The camera through this window."""
         return camera.crop(self.left, self.top, self.width, self.height)
 
+    def seen_by(self, other: Camera, camera: Camera) -> "Window":
+        """The pixels of another raster that show a part of this one of `camera`'s, from the same place; maybe none."""
+        left, right = (
+            (edge - camera.cx) / camera.fx * other.fx + other.cx for edge in (self.left, self.left + self.width)
+        )
+        top, bottom = (
+            (edge - camera.cy) / camera.fy * other.fy + other.cy for edge in (self.top, self.top + self.height)
+        )
+        columns, rows = covered(left, right, other.width), covered(top, bottom, other.height)
+        return Window(columns.start, rows.start, len(columns), len(rows))
+
     def shares(self, width: int, height: int) -> tuple[float, float, float, float]:
         """Left, top, right and bottom edge, as shares of a raster of that size."""
         right, bottom = self.left + self.width, self.top + self.height
@@ -49,3 +61,13 @@ class Window:
             return Window(self.left, self.top, cut, self.height), beyond
         below = Window(self.left, self.top + cut, self.width, self.height - cut)
         return Window(self.left, self.top, self.width, cut), below
+
+
+ROUNDING = 1e-6
+"""Px that edges of a window may lie beside whole pixels without touching the next."""
+
+
+def covered(begin: float, end: float, size: int) -> range:
+    """Those of so many pixels in a row that lie between two places, in part or whole."""
+    first, last = math.floor(begin + ROUNDING), math.ceil(end - ROUNDING)
+    return range(min(max(first, 0), size), min(max(last, 0), size))

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.data.reduction import Reduction
+from gsx.core.data.window import Window
 from gsx.core.files import replace_file
 from gsx.core.shapes import Float, UInt8
 
@@ -65,6 +66,26 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool =
     reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])
     off = view.reduction.inner(reduced - view.coarse.to(image.device).float() / 255)
     return difference.mean() + view.coarse_weight * size(off).mean()
+
+
+def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> PseudoView:
+    """A pseudo view without what it shows of windows of a training camera, where it stands at that or was made from its
+    photograph: what counts in no loss must not come back as a pseudo detail. A pixel that shows a part of a window does
+    not count; nor does what is known of a view at a lower resolution, if it shows any."""
+    if not (view.provenance.get("source") == "photo" or stands_at(view.camera, camera)):
+        return view
+    weight = torch.full(view.target.shape[1:], 255, dtype=torch.uint8)
+    weight = weight if view.pixel_weight is None else view.pixel_weight.clone()
+    seen = [window.seen_by(view.camera, camera) for window in windows]
+    seen = [part for part in seen if part.width and part.height]
+    for part in seen:
+        weight[part.pixels] = 0
+    return replace(view, pixel_weight=weight, coarse=None) if seen else view
+
+
+def stands_at(camera: Camera, other: Camera) -> bool:
+    """Whether two cameras have one pose."""
+    return torch.equal(camera.rotation, other.rotation) and torch.equal(camera.translation, other.translation)
 
 
 def picture_name(augmenter: str, view: PseudoView) -> str:

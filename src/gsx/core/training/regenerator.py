@@ -36,7 +36,7 @@ class Request:
     strength: float
     """How much may change, 0 to 1, for regenerators that know such a thing."""
     strongest: float
-    """The strength at the first event."""
+    """The largest strength of any event."""
     prompt: str
     step: int
 

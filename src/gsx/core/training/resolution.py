@@ -6,15 +6,15 @@ What a view shows at a fraction of its size is learnt in a fraction of the time 
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.reduction import Reduction
+from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
-from gsx.core.shapes import Bool, Float, UInt8
+from gsx.core.shapes import Float
 from gsx.core.training.bilateral_grid import WHOLE
 from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
@@ -22,52 +22,6 @@ from gsx.core.training.exposure import Exposures, saturated
 from gsx.core.training.poses import Poses
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.supersampling import FinerRaster, raster_at
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CoarseSource:
-    """The picture of a view, reduced by the scene's own filter (implements `gsx.core.data.scene.ImageSource`)."""
-
-    view: View
-    reduction: Reduction
-    times: int
-    kept: list[UInt8[Tensor, "3 h w"]] = field(default_factory=list)
-    """The picture, once it was asked for."""
-
-    def image(self, camera: Camera) -> UInt8[Tensor, "3 h w"]:
-        """The whole picture: that is all that training asks for."""
-        if not self.kept:
-            width, height = (side * self.times for side in camera.size)
-            fine = self.view.image()[:, :height, :width]
-            self.kept.append((self.reduction.reduce(fine, self.times) * 255).round().byte())
-        return self.kept[0]
-
-    def max_zoom(self, camera: Camera) -> float:
-        """There is this picture alone."""
-        return 1.0
-
-    def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Pixels that are made of nothing but pixels that count."""
-        fine = self.view.counted()
-        if fine is None:
-            return None
-        width, height = camera.size
-        blocks = fine[: height * self.times, : width * self.times].reshape(height, self.times, width, self.times)
-        return blocks.all(3).all(1)
-
-
-LEAST = 32
-"""Pixels that the shorter side of a picture keeps: smaller ones say little, and SSIM looks at windows of 11."""
-
-
-def coarser(view: View, reduction: Reduction, times: int) -> View:
-    """A view, so many times as coarse; what is left over at its right and lower borders does not show. It stays as it
-    is where too few pixels would be left."""
-    if times == 1 or min(view.camera.size) < LEAST * times:
-        return view
-    across, down = (side // times for side in view.camera.size)
-    camera = replace(view.camera, width=across * times, height=down * times).resize(across, down)
-    return replace(view, camera=camera, source=CoarseSource(view=view, reduction=reduction, times=times))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,5 +106,10 @@ class Resolution:
         return step > 0 and (finer or self.coarse_at(step) != self.coarse_at(step + 1))
 
     def closer_after(self, step: int) -> list[PseudoView]:
-        """Pseudo views that were made for this step."""
-        return [view for views in self.closer.values() for view in views if view.provenance.get("event") == step - 1]
+        """Pseudo views that were made for this step: late, where steps were left out after their event."""
+        return [view for views in self.closer.values() for view in views if made_after(view) == step - 1]
+
+
+def made_after(view: PseudoView) -> int | None:
+    """The last step of the model that a pseudo view was made from; None where nobody noted that."""
+    return view.provenance.get("model_step", view.provenance.get("event"))

@@ -15,6 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
+from gsx.core.kept_code import waiting_counted
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
@@ -25,7 +26,7 @@ from gsx.core.training.evidence import window_errors
 from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.photographs import numbers_of
-from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
+from gsx.core.training.pseudo_views import PseudoView, Term, kept_out, pseudo_loss
 from gsx.core.training.recorded import ToLearn
 from gsx.core.training.run import Run, Step
 
@@ -38,10 +39,11 @@ def train(run: Run, plugins: Plugins) -> None:
     while not (run.complete or any(run.ranks.all_gather(run.stopping))):
         begun = time.perf_counter()
         try:
-            step = train_step(run, plugins)
+            with waiting_counted() as waited:
+                step = train_step(run, plugins)
         except Stopped:
             break
-        run.seconds += time.perf_counter() - begun
+        run.seconds += time.perf_counter() - begun - waited.seconds
         plugins.emit.gsx_step_finished(run=run, step=step)
     if run.recorder is not None:
         run.recorder.forget()
@@ -148,13 +150,14 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     gathered from them is forgotten before anything else adds to it. Those that see what the training view sees are
     compared with its own render.
     """
-    counted, seen = counted_in_loss(run, view, number), list[Observation]()
+    windows, seen = withheld_windows(run, view, number), list[Observation]()
+    counted = counted_in_loss(view, windows)
     if counted is None and not terms and may_be_recorded(run, number, view):
         step = recorded_step(run, number, view, colour)
         if step is not None:
             return step
     target = blacked(run.photographs.of(view), counted)
-    divided = [served_by_view(run, term, view.camera) for term in terms]
+    divided = [served_by_view(run, without(term, view.camera, windows), view.camera) for term in terms]
     ordered = sorted(divided, key=lambda pair: pair[0].shared)
     parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
     own = 1 - sum(term.replaces for term in terms)
@@ -224,13 +227,23 @@ def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"])
     )
 
 
-def counted_in_loss(run: Run, view: View, number: int) -> Bool[Tensor, "H W"] | None:
-    """Pixels that count: all but those masked, and those of windows that are kept to judge by: the backbone's own, and
-    those that judge the steps."""
-    counted = view.counted()
+def withheld_windows(run: Run, view: View, number: int) -> list[Window]:
+    """Windows of a view that are kept to judge by at a step: the backbone's own, and those that judge the steps."""
     withheld = [run.backbone.validation_window(view, number)] if isinstance(run.backbone, Validating) else []
     withheld.append(run.plateau.window(run.resolution.views(number), view, number))
-    windows = [window for window in withheld if window is not None]
+    return [window for window in withheld if window is not None]
+
+
+def without(term: Term, camera: Camera, windows: Sequence[Window]) -> Term:
+    """An augmenter's term without what its pseudo views show of windows of the training camera."""
+    if not windows:
+        return term
+    return replace(term, parts=[(kept_out(view, camera, windows), weight) for view, weight in term.parts])
+
+
+def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"] | None:
+    """Pixels that count: all but those masked, and those of windows that are kept to judge by."""
+    counted = view.counted()
     if not windows:
         return counted
     left = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
