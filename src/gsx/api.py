@@ -10,7 +10,6 @@ What the command line tells while it works goes to the logger `gsx`; `gsx.show_m
 """
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gsx.builtin import plugins
+from gsx.cli.arguments import ZOOMS, refuse_beyond
 from gsx.cli.messages import set_up_logging as show_messages
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
@@ -79,10 +79,11 @@ class TrainedRun:
         zoom: times the raster and the focal length.
 
         Raises:
-            InputError: there is no view of that name, the nearest is told; or zoom is not above 0.
+            InputError: there is no view of that name, the nearest is told; or zoom is none of `ZOOMS`.
         """
-        if not 0 < zoom < math.inf:
-            raise InputError(f"zoom is {zoom}; give a number above 0")
+        if not isinstance(zoom, int | float):
+            raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
+        refuse_beyond("zoom", zoom, ZOOMS)
         view = view_named(self.run, seen) if isinstance(seen, str) else seen
         camera = view.camera if isinstance(view, View) else view
         return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image

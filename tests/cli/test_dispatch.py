@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from io import TextIOWrapper
 from pathlib import Path
 
@@ -439,6 +440,80 @@ def test_bad_input_ends_in_one_sentence_and_exit_code_2(
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("gsx: ")
     assert "Traceback" not in "".join(lines)
+    assert sorted(tmp_path.rglob("*")) == before, "something half-written is left"
+
+
+def run_at_step(folder: Path, step: int) -> Path:
+    """An interrupted tiny run of four steps."""
+    logging.getLogger("gsx").handlers.clear()
+    tiny_run(folder, [*FEW, "iterations=4"], stop_after=step)
+    return folder
+
+
+def without_checkpoints(folder: Path) -> Path:
+    """As a run is that was killed before its first."""
+    shutil.rmtree(folder / "checkpoints")
+    return folder
+
+
+TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
+    "a value for a group": (
+        lambda t: words(t / "run", "eval=3"),
+        "eval is 3, but it is a group of settings",
+    ),
+    "nothing for a group": (lambda t: words(t / "run", "training=null"), "training is null, but it is a group"),
+    "a value for a group in a group": (
+        lambda t: words(t / "run", "training.exposure=3"),
+        "training.exposure is no value but a group of settings: give training.exposure.NAME=VALUE",
+    ),
+    "a word for a list": (lambda t: words(t / "run", "eval.zoom=abc"), "eval.zoom takes a list: give eval.zoom=[...]"),
+    "a value for hydra": (lambda t: words(t / "run", "hydra=3"), "give hydra.NAME=VALUE or hydra/GROUP=NAME"),
+    "several values for one run": (
+        lambda t: words(t / "run", "scene.split=files:a.txt,b.txt"),
+        "gsx -m runs one after the other; 'scene.split=\"files:a.txt,b.txt\"' is one text",
+    ),
+    "a wrong choice among others": (
+        lambda t: ["-m", "backbone=gs3d,nope", f"output={t / 'out'}"],
+        "backbone=nope: there is no such backbone; choose from",
+    ),
+    "a key that not all choices have": (
+        lambda t: ["-m", "backbone=gs3d,scaffold", "backbone.sh_degree=2", f"output={t / 'out'}"],
+        "'backbone.sh_degree' is no configuration key",
+    ),
+    "a report of nothing, elsewhere": (lambda t: ["report", str(t / "no"), "--to", str(t / "page")], "is no folder"),
+    "fewer steps than taken": (
+        lambda t: ["resume", str(run_at_step(t / "run", 3)), "iterations=2"],
+        "has come to step 3, and iterations=2 is less",
+    ),
+    "a key without a value": (
+        lambda t: ["resume", str(run_at_step(t / "run", 1)), "iterations"],
+        "'iterations' is given no value: write iterations=VALUE",
+    ),
+    "a run without a checkpoint": (
+        lambda t: ["resume", str(without_checkpoints(run_at_step(t / "run", 1)))],
+        "its run ended before the first one; train anew",
+    ),
+    "a folder that is a file": (
+        lambda t: ["compact", str(run_at_step(t / "run", 1)), "--to", str(broken_ply(t / "x.ply"))],
+        "is a file, no folder for a run",
+    ),
+    "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
+    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "is of .spz files"),
+    "no trades": (lambda t: ["trade", "training", "--trades", "", "--to", str(t / "t")], "--trades names none"),
+    "trade with a place of its own": (
+        lambda t: ["trade", "training", f"output={t / 'o'}", "--to", str(t / "t")],
+        "runs go below --to FOLDER",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TOLD)
+def test_what_is_wrong_is_told_with_what_to_do(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given, told = TOLD[case]
+    arguments = given(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert main([*arguments]) == 2
+    assert told in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before, "something half-written is left"
 
 

@@ -73,6 +73,10 @@ def different_numbers(word: str) -> list[int]:
     return [int(part) for part in parts]
 
 
+ZOOMS = Range(1 / 64, 64)
+"""Times a resolution, as eval.zoom."""
+
+
 def refuse_beyond(flag: str, value: float, bounds: Range) -> None:
     """Raise InputError for a number of the command line that is outside of its range."""
     if value not in bounds:

@@ -1,6 +1,7 @@
 """gsx FOLDER: find out what it is, say what is done with it, and do it."""
 
 import logging
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def train_from(arguments: list[str]) -> int:
         raise ConfigError(f"gsx {arguments[0]}: '{odd}' does not go with it: it says itself what scene it is")
     words = scene_words(path, overrides, plugins())
     logger.info("%s is %s", path, told(words, path))
-    logger.info("gsx %s", " ".join([*words, *overrides]))
+    logger.info("gsx %s", shlex.join([*words, *overrides]))
     return verb_train([*words, *overrides])
 
 
@@ -37,7 +38,7 @@ def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[s
     Raises:
         InputError: it is none; a splat file gets told what can be done with it.
     """
-    from gsx.experiments.runs.compose import quoted
+    from gsx.experiments.runs.compose import word_of
     from gsx.experiments.runs.inspect import readable, unknown
     from gsx.experiments.runs.video import is_video, photos_of
 
@@ -50,13 +51,13 @@ def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[s
         )
     if is_video(path):
         output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")
-        return ["scene=photos", f"scene.path={quoted(str(photos_of(path, Path(output))))}"]
+        return ["scene=photos", word_of("scene.path", str(photos_of(path, Path(output))))]
     loaders = readable(path, loaded)
     if not loaders:
         raise unknown(path, loaded)
     loader, its = loaders[0]
-    more = [f"scene.{key}={quoted(value)}" for key, value in its.overrides(path).items()]
-    return [f"scene={loader.name}", f"scene.path={quoted(str(path))}", *more]
+    more = [word_of(f"scene.{key}", value) for key, value in its.overrides(path).items()]
+    return [f"scene={loader.name}", word_of("scene.path", str(path)), *more]
 
 
 def told(words: Sequence[str], path: Path) -> str:

@@ -16,7 +16,9 @@ def verb_report(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     from gsx.experiments.reports.report import report_on
 
-    sys.stdout.write(f"{report_on(given.folders, new_folder(given.to) if given.to else None)}\n")
+    if given.to and given.to.exists():
+        new_folder(given.to)  # or it is a file
+    sys.stdout.write(f"{report_on(given.folders, given.to)}\n")
     return 0
 
 

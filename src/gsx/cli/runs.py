@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, positive, refuse_beyond, run_arguments, whole
+from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
@@ -16,8 +16,6 @@ from gsx.experiments.runs.job import train
 
 logger = logging.getLogger("gsx.cli")
 
-ZOOMS = Range(1 / 64, 64)
-"""Times a resolution, as eval.zoom."""
 MOST_FRAMES = 100_000
 """Of an orbit, whose cameras are held in memory."""
 
@@ -85,6 +83,8 @@ def verb_render(arguments: list[str]) -> int:
     refuse_beyond("gsx render --zoom", given.zoom, ZOOMS)
     refuse_beyond("gsx render --frames", given.frames, Range(1, MOST_FRAMES))
     refuse_beyond("gsx render --fps", given.fps, Range(0.1, 240))
+    if not given.orbit and (given.frames, given.fps) != (parser.get_default("frames"), parser.get_default("fps")):
+        raise InputError("gsx render: --frames and --fps go with --orbit FILE")
     if (given.movie and not given.path) or (given.orbit and given.path):
         raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
     sys.stdout.write(f"{rendered(given)}\n")
@@ -174,6 +174,8 @@ def verb_export(arguments: list[str]) -> int:
         refuse_export(given.file)
     if given.bake:
         refuse_beyond("gsx export --bake", given.bake, ZOOMS)
+    if given.axes != "rub" and (given.file is None or given.file.suffix.lower() != ".spz"):
+        raise InputError(f"gsx export: --axes {given.axes} is of .spz files: give one, for example model.spz")
     if given.view and given.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
     run, settings = open_run(given.run, plugins())

@@ -70,7 +70,14 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
     add("--seeds", type=different_numbers, default=[0], metavar="A,B,...", help="of the runs of each setting (0)")
     add("--combinations", type=whole, default=2, metavar="N", help="most combinations of good settings to try (2)")
     add("--to", type=Path, default=Path("trade"), metavar="FOLDER", help="for trade.html, trade.json, runs (./trade)")
-    return parser.parse_intermixed_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
+    if given.trades == "":
+        raise ConfigError("--trades names none: give some, or leave it out for all of them")
+    for word in given.overrides:
+        if word.startswith(("output=", "folder=", "reuse=", "seed=")):
+            remedy = "--seeds A,B,... says which" if word.startswith("seed=") else "runs go below --to FOLDER"
+            raise ConfigError(f"gsx trade training does not take '{word}': {remedy}")
+    return given
 
 
 def verb_trade(arguments: list[str]) -> int:
@@ -100,7 +107,7 @@ def trade_training(arguments: list[str]) -> int:
     from gsx.experiments.trade.training.settings import settings_of
     from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, table
 
-    loaded, wanted = plugins(), given.trades.split(",") if given.trades else []
+    loaded, wanted = plugins(), given.trades.split(",") if given.trades is not None else []
     with Compositions(loaded) as compositions:
         settings = settings_of(compositions.node([f"+trade={given.settings}"], "trade"), wanted)
         device = choose_device(compositions.settings(given.overrides).general.device)

@@ -166,6 +166,9 @@ def verb_resume(arguments: list[str]) -> int:
     refuse_other(folder)
     with in_use(), claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
+        if run.step > run.iterations:
+            less = f"iterations={run.iterations} is less: give iterations=N with N above that"
+            raise InputError(f"{folder} has come to step {run.step}, and {less}")
         if run.complete and reported(folder) and state_of(read_run(folder))[0] == "ok":
             remedy = "give iterations=N with N above that to lengthen it"
             raise InputError(f"{folder} is complete at step {run.step}: {remedy}")

@@ -1,6 +1,7 @@
 """What `gsx scenes` says about whole, broken and foreign folders; it must never raise."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
 from gsx.core.data.images import write_image
-from gsx.experiments.runs.inspect import describe, readable
+from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.inspect import command, describe, readable
 from gsx.scenes import colmap, photos
 
 POSE = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
@@ -52,6 +54,17 @@ def test_colmap_scene(tmp_path: Path) -> None:
     assert any("undistorted" in note for note in labelled(lines, "note"))
     assert labelled(lines, "problem") == []
     assert labelled(lines, "train") == [f"gsx scene=colmap 'scene.path={folder}'"]
+
+
+@pytest.mark.parametrize("name", ["plain", "my scene", "fö 'x", "p=q/fox", "a,b", "-lead", "{x}: $y", "back\\slash'"])
+def test_the_command_can_be_pasted_whatever_the_folder_is_called(name: str, tmp_path: Path) -> None:
+    told = command(plugins().registry.find("scene", "colmap"), tmp_path / name, {"images": name})
+    program, *words = shlex.split(told)
+    with hydra_session(plugins()):
+        composed = compose_raw(words)
+    assert program == "gsx"
+    assert (composed.scene.name, composed.scene.path) == ("colmap", str(tmp_path / name))
+    assert composed.scene.images == name
 
 
 def test_photos_elsewhere_are_found_and_part_of_the_command(tmp_path: Path) -> None:

@@ -115,7 +115,8 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
             if not buffer.write(name, fileformat=path.suffix[1:].lower()):
                 raise InputError(f"Image '{path}' cannot be written ({buffer.geterror()}), check the folder's space.")
     except OSError as problem:
-        remedy = "free some space" if problem.errno in (errno.ENOSPC, errno.EDQUOT) else "remove what is in its way"
+        full = dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space")
+        remedy = (full | {errno.ENOENT: "make its folder"}).get(problem.errno or 0, "remove what is in its way")
         raise InputError(f"Image '{path}' cannot be written ({problem.strerror}), {remedy}.") from None
 
 

@@ -177,6 +177,8 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]
             damaged.append(sidecar)
     if problems:
         raise CheckpointError(f"no checkpoint in {folder / 'checkpoints'} is usable: {problems[0]}")
+    if (folder / "config.yaml").is_file():
+        raise CheckpointError(f"{folder} holds no checkpoint: its run ended before the first one; train anew")
     raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
 
 

@@ -71,9 +71,10 @@ def report_on(folders: Sequence[Path], to: Path | None = None) -> Path:
         raise InputError(f"{to} is a run, whose report.html this would replace: choose another folder with --to FOLDER")
     place = to or (common_folder(folders) if len(folders) > 1 or folders == chosen else folders[0])
     try:
+        place.mkdir(parents=True, exist_ok=True)
         return write_overview(place, chosen)
-    except PermissionError as error:
-        raise InputError(f"{place} cannot be written: say where with --to FOLDER") from error
+    except (PermissionError, NotADirectoryError) as error:
+        raise InputError(f"{place} cannot be written ({error.strerror}): say where with --to FOLDER") from error
 
 
 def report_context(run: RunFiles) -> dict[str, Any]:

@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
+from itertools import islice, product
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -160,6 +161,11 @@ def quoted(text: str) -> str:
     return "'" + re.sub(r"(\\+)\Z", r"\1\1", escaped) + "'"
 
 
+def word_of(key: str, text: str) -> str:
+    """An override with a text for its value, quoted where that needs it."""
+    return f"{key}={text}" if re.fullmatch(r"[\w./-]+( [\w./-]+)*", text, re.ASCII) else f"{key}={quoted(text)}"
+
+
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
     """Compose and check an experiment.
 
@@ -190,16 +196,21 @@ def parse_overrides(overrides: Sequence[str]) -> list[Any]:
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise ConfigError(f"override cannot be read: {first_line(error)} (quote it for the shell)") from error
+        remedy = "odd characters want quotes within those for the shell, 'KEY=\"VALUE\"'"
+        raise ConfigError(f"override cannot be read: {first_line(error)}: {remedy}") from error
 
 
 def check_groups(overrides: Sequence[str]) -> None:
     """Refuse unknown groups and options with the nearest match before Hydra does so less helpfully."""
     groups = known_groups()
     for override in parse_overrides(overrides):
+        if override.key_or_group == "hydra":
+            raise ConfigError("'hydra' is a group of Hydra's own settings: give hydra.NAME=VALUE or hydra/GROUP=NAME")
+        if override.is_sweep_override():
+            refuse_sweep(override)
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
-        if override.key_or_group not in groups or override.is_sweep_override():
+        if override.key_or_group not in groups:
             continue
         options = listed(override.key_or_group)
         if not options:
@@ -212,6 +223,15 @@ def check_groups(overrides: Sequence[str]) -> None:
                     f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
                     f"choose from {', '.join(options)}.{nearest(str(name), options)}"
                 )
+
+
+def refuse_sweep(override: Any) -> NoReturn:
+    """Raise ConfigError for several values where there is to be one."""
+    key, _, values = str(override.input_line).partition("=")
+    raise ConfigError(
+        f"{key}={values} is several values: gsx -m runs one after the other; '{key}=\"{values}\"' is one text, "
+        f"'{key}=[{values}]' a list"
+    )
 
 
 def refuse_absent_launcher(name: str) -> None:
@@ -262,22 +282,32 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
     return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
 
 
+MOST_CHOICES = 64
+"""Combinations of a multirun's choices that are composed before it starts, at most."""
+
+
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
-    """Refuse wrong groups, keys and values of a multirun before Hydra starts it; of swept values the first is composed.
+    """Refuse wrong groups, keys and values of a multirun before Hydra starts it: all choices of groups that it sweeps
+    are composed, with the first of other values that are swept.
 
     Returns the folder that its runs go to.
     """
     with hydra_session(plugins):
-        parsed = parse_overrides(overrides)
-        composed = compose_raw([first_of(override) for override in parsed if override.input_line])
-        return Path(settings_from(composed, plugins).general.output)
+        parsed, groups = [one for one in parse_overrides(overrides) if one.input_line], known_groups()
+        words = [words_of(one, all_of=one.key_or_group in groups) for one in parsed]
+        first, *others = islice(product(*words), MOST_CHOICES)
+        output = Path(settings_from(compose_raw(first), plugins).general.output)
+        for other in others:
+            compose_raw(other)
+        return output
 
 
-def first_of(override: Any) -> str:
-    """An override with its first value where it is swept."""
+def words_of(override: Any, all_of: bool) -> list[str]:
+    """An override by each of the values that it sweeps, or by the first of them; itself where it sweeps none."""
     if not override.is_sweep_override():
-        return str(override.input_line)
-    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
+        return [str(override.input_line)]
+    words = [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+    return words if all_of else words[:1]
 
 
 def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:

@@ -15,7 +15,7 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError
 from gsx.core.plugins import Component, Plugins
 from gsx.experiments.runs.capture import capture_lines
-from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
 from gsx.experiments.runs.settings import typed
 
 logger = logging.getLogger(__name__)
@@ -118,8 +118,8 @@ def scene_lines(
 
 def command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
     """The command that trains a folder."""
-    more = [f"scene.{key}={value}" for key, value in overrides.items()]
-    return shlex.join(["gsx", f"scene={loader.name}", f"scene.path={path}", *more])
+    more = [word_of(f"scene.{key}", value) for key, value in overrides.items()]
+    return shlex.join(["gsx", f"scene={loader.name}", word_of("scene.path", str(path)), *more])
 
 
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:

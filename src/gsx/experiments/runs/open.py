@@ -47,7 +47,9 @@ logger = logging.getLogger(__name__)
 def refuse_used(folder: str) -> None:
     """Raise InputError if the run folder asked for exists and holds something."""
     path = Path(folder)
-    if folder and path.exists() and (not path.is_dir() or any(one.name != LOCK for one in path.iterdir())):
+    if folder and path.exists() and not path.is_dir():
+        raise InputError(f"'{folder}' is a file, no folder for a run: choose another place")
+    if folder and path.exists() and any(one.name != LOCK for one in path.iterdir()):
         raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
 
 

@@ -30,7 +30,8 @@ def view_named(run: Run, name: str) -> View:
     """
     views = {view.name: view for view in [*run.scene.test, *run.photographed]}
     if name not in views:
-        raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{nearest(name, list(views))}")
+        known = nearest(name, list(views)) or f" The first are {', '.join(list(views)[:3])}."
+        raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{known}")
     return views[name]
 
 

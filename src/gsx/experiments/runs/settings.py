@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -31,6 +32,8 @@ from gsx.experiments.run_folder.general_options import GeneralOptions, splat_fil
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
 
 COMPONENT_KINDS = ("scene", "backbone")
+GROUPS = ("training", "eval", "metrics", "rasterizer")
+"""Of settings that are no component's."""
 """Groups whose node names a registered component."""
 
 
@@ -136,8 +139,9 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         typed(Budget, budget, "budget")
     augmenters, regenerators = (named_nodes(values.pop(kind, None), kind) for kind in ("augmenter", "regenerator"))
     trackers = named_nodes(values.pop("tracker", None), "tracker")
-    parts = {key: values.pop(key, None) for key in ("training", "eval", "metrics", "rasterizer", *COMPONENT_KINDS)}
-    evaluation = dict(parts["eval"] or {}) | {"lpips": (parts["metrics"] or {}).get("lpips", {})}
+    parts = {key: values.pop(key, None) for key in COMPONENT_KINDS}
+    parts |= {key: group_of(values.pop(key, {}), key) for key in GROUPS}
+    evaluation = parts["eval"] | {"lpips": parts["metrics"].get("lpips", {})}
     single = {kind: chosen(kind, parts[kind], plugins) for kind in COMPONENT_KINDS}
     redrawing = {role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()}
     found = {name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()}
@@ -227,6 +231,18 @@ class Values:
         return cls(plain, repr(plain))
 
 
+def group_of(value: Any, key: str) -> dict[str, Any]:
+    """The values of a group of settings.
+
+    Raises:
+        ConfigError: it was given a value of its own.
+    """
+    if not isinstance(value, dict):
+        given = "null" if value is None else value
+        raise ConfigError(f"{key} is {given}, but it is a group of settings: give {key}.NAME=VALUE")
+    return value
+
+
 def typed(schema: type, values: Any, path: str) -> Any:
     """An instance of a dataclass from plain values; see `settings_from` for errors."""
     return copy.deepcopy(checked(schema, Values.of(values), path))
@@ -280,11 +296,29 @@ def writable(node: DictConfig, given: dict[str, Any]) -> DictConfig:
 def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
     """What is wrong at which key, in one sentence."""
     inner = str(error.full_key or "")
-    key = ".".join(part for part in (path, inner) if part)
+    key, text = ".".join(part for part in (path, inner) if part), first_line(error)
     if type(error).__name__ == "ConfigKeyError":
         options = [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)]
         return f"'{key}' is no configuration key.{right_key(key, options)}"
-    return f"{key}: {first_line(error)}"
+    if "is not a ListConfig" in text:
+        return f"{key} takes a list: give {key}=[...], with commas between its values"
+    if (group := re.search(r"is not a subclass of (\w+)", text)) is not None:
+        key = ".".join([part for part in (path, key_of_type(schema, group[1])) if part]) or key
+        return f"{key} is no value but a group of settings: give {key}.NAME=VALUE"
+    return f"{key}: {text}"
+
+
+def key_of_type(schema: type, name: str, prefix: str = "") -> str:
+    """Dotted name of the first field that is a dataclass of that name, or empty."""
+    for entry in dataclasses.fields(schema):
+        if not dataclasses.is_dataclass(entry.type):
+            continue
+        key = f"{prefix}{entry.name}"
+        if entry.type.__name__ == name:  # type: ignore[union-attr]
+            return key
+        if found := key_of_type(entry.type, name, f"{key}."):  # type: ignore[arg-type]
+            return found
+    return ""
 
 
 def right_key(key: str, known: Iterable[str]) -> str:
@@ -328,8 +362,11 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
     known = list(dict.fromkeys([*dotted(written), *newer]))
     for override in overrides:
         key, equals, value = override.partition("=")
-        if not equals or key not in known:
-            raise ConfigError(f"'{key}' is no key of {path}.{right_key(key, known)}")
+        if not equals:
+            raise ConfigError(f"'{override}' is given no value: write {override}=VALUE")
+        if key not in known:
+            near = right_key(key, known) or " All of them are in that file."
+            raise ConfigError(f"'{key}' is no key of {path}.{near}")
         try:
             OmegaConf.update(config, key, value_of(value), force_add=True)
         except Exception as error:  # the YAML parser has its own family of errors

@@ -92,7 +92,7 @@ def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
         if key_of(word) in OWN_KEYS:
             raise ConfigError(f"gsx eval {path} draws the file as it is: leave out '{word}', or train with init={path}")
     if not any(word.startswith(("scene=", "dataset=")) for word in overrides):
-        raise ConfigError(f"gsx eval {path} needs the photographs to compare with: scene=... scene.path=FOLDER")
+        raise ConfigError(f"{path} needs the photographs to compare with: give scene=... scene.path=FOLDER")
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
     words = ["backbone=gs3d", f"init={quoted(str(path))}", "iterations=0"]
