@@ -62,6 +62,10 @@ def test_a_splat_file_draws_what_its_run_does(run: gsx.TrainedRun, tmp_path: Pat
     splats = gsx.load(run.export(tmp_path / "model.ply"))
     assert isinstance(splats, gsx.SplatFile)
     torch.testing.assert_close(splats.render(camera, background), run.render(camera), rtol=0, atol=1e-5)
+    over = torch.tensor(background)
+    assert torch.equal(splats.render(run.scene.test[0], over), splats.render(run.scene.test[0].camera, over))
+    with pytest.raises(InputError, match="give three values"):
+        splats.render(camera, (1, 1))
     with pytest.raises(InputError, match=r"gsx writes .*\.ply"):
         run.export(tmp_path / "model.obj")
 

@@ -10,7 +10,7 @@ What the command line tells while it works goes to the logger `gsx`; `gsx.show_m
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,9 +121,18 @@ class SplatFile:
     raster: RasterSettings
     """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
 
-    def render(self, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> Float[Tensor, "3 H W"]:
-        """The splats seen by a camera, over a colour; colours in [0, 1]."""
-        over = torch.tensor(background, dtype=torch.float32)
+    def render(
+        self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
+    ) -> Float[Tensor, "3 H W"]:
+        """The splats seen by a camera, or by that of a view, over a colour; colours in [0, 1].
+
+        Raises:
+            InputError: the background is no colour.
+        """
+        over = torch.as_tensor(background, dtype=torch.float32)
+        if over.shape != (3,):
+            raise InputError(f"background has the shape {tuple(over.shape)}: give three values, red, green and blue")
+        camera = seen.camera if isinstance(seen, View) else seen
         return render_gaussians(self.gaussians, camera, self.raster, over)
 
 

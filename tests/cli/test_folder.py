@@ -1,6 +1,7 @@
 """gsx FOLDER: what it is taken for, and what it says of what it cannot train from."""
 
 import logging
+import shlex
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -26,16 +27,20 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return given
 
 
-def test_a_colmap_folder_and_photos_are_told_apart(tmp_path: Path, trained: list[list[str]]) -> None:
-    write_scene(synthesize(), tmp_path / "it's a model")
+def test_a_colmap_folder_and_photos_are_told_apart(
+    tmp_path: Path, trained: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(synthesize(), tmp_path / "it's a=model")
     write_photos(synthesize(), tmp_path / "photos")
-    assert main([str(tmp_path / "it's a model"), "iterations=7"]) == 0
+    assert main([str(tmp_path / "it's a=model"), "iterations=7"]) == 0
     assert main([str(tmp_path / "photos")]) == 0
     model, photos = (compose(words, plugins()) for words in trained)
     assert model.scene.component.name == "colmap"
-    assert Path(model.scene.options.path) == tmp_path / "it's a model"
+    assert Path(model.scene.options.path) == tmp_path / "it's a=model"
     assert model.general.iterations == 7
     assert photos.scene.component.name == "photos"
+    told = [shlex.split(line) for line in capsys.readouterr().err.splitlines() if line.startswith("gsx scene=")]
+    assert told == [["gsx", *words] for words in trained], "it can be pasted"
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def dispatch(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         sys.stdout.write(f"gsx {__version__}\n")
         return 0
-    if not arguments or arguments[0].startswith(("-", "+", "~")) or "=" in arguments[0]:
+    if not arguments or is_override(arguments[0]):
         return verb_train(arguments)
     if arguments[0] not in VERBS and is_given(arguments[0]):
         set_up_logging()
@@ -109,6 +109,11 @@ def dispatch(arguments: list[str]) -> int:
         raise ConfigError(f"{problem}{nearest(arguments[0], VERBS)} See gsx --help")
     set_up_logging()
     return VERBS[arguments[0]](arguments[1:])
+
+
+def is_override(word: str) -> bool:
+    """Whether a word is a flag or changes the configuration: a path that says so (./a=b/c) is none."""
+    return not word.startswith((".", "/", "~/")) and (word.startswith(("-", "+", "~")) or "=" in word)
 
 
 VERBS: dict[str, Callable[[list[str]], int]] = {

@@ -101,6 +101,8 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
     import OpenImageIO as oiio
 
     path = Path(path)
+    if image.dim() != 3:
+        raise InputError(f"Image '{path}' has the shape {tuple(image.shape)}, give channels, height and width.")
     suffixes = (".png", ".jpg", ".jpeg") if image.shape[0] == 3 else (".png",)
     if path.suffix.lower() not in suffixes:
         raise InputError(f"Image '{path}' has {image.shape[0]} channels, write it as {' or '.join(suffixes)}.")
