@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError
 from gsx.core.files import read_json
 from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.trade.training.measure import Outcome, Row, combinations, different
+from gsx.experiments.trade.training.measure import Outcome, Row, combinations, different, expected
 from gsx.experiments.trade.training.settings import GIVEN, Setting, settings_of, together
 from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, front, table
 
@@ -71,6 +72,13 @@ def test_fronts_and_drops_worked_by_hand() -> None:
     assert [found.setting.name for found in front(ROWS, "seconds", "1")] == ["short", "small", "as given", "long"]
     assert [found.setting.name for found in front(ROWS, "seconds", "4")] == ["short", "small", "long"]
     assert [found.setting.name for found in front(ROWS, "megabytes", "1")] == ["small", "long"]
+
+
+def test_the_time_to_come_worked_by_hand() -> None:
+    """Two seeds, of 100 s of training each; 30 and 50 s of evaluation."""
+    outcomes = [replace(one, evaluate_seconds=spent) for one, spent in zip(ROWS[0].outcomes, (30.0, 50.0), strict=True)]
+    given = replace(ROWS[0], outcomes=outcomes)
+    assert expected(given, [GIVEN, Setting(name="long", steps=2.0)]) == 2 * (3 * 100 + 2 * 40)
 
 
 WISHES: Mapping[str, tuple[Wish, list[str]]] = {

@@ -37,6 +37,7 @@ class Outcome:
     megabytes: float
     seconds: float
     """Of training."""
+    evaluate_seconds: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +83,7 @@ def outcome_of(folder: Path, beside: Path) -> Outcome:
         primitives=found["primitives"],
         megabytes=found["megabytes"],
         seconds=found["train_seconds"],
+        evaluate_seconds=found["evaluate_seconds"],
     )
 
 
@@ -131,11 +133,16 @@ def measured(trial: Trial, listed: Sequence[Setting], most_together: int) -> lis
     given = trial.tried(GIVEN, iterations)
     if given.failure:
         raise ConfigError(given.failure)
-    seconds = given.cost("seconds") * sum(setting.steps for setting in listed) * len(trial.seeds)
-    logger.info("%d settings, %d seed(s): about %s", len(listed), len(trial.seeds), duration(seconds))
+    logger.info("%d settings, %d seed(s): about %s", len(listed), len(trial.seeds), duration(expected(given, listed)))
     rows = [given, *(trial.tried(setting, iterations) for setting in listed)]
     rows = different(rows)
     return different(rows + [trial.tried(one, iterations) for one in combinations(rows, most_together)])
+
+
+def expected(given: Row, listed: Sequence[Setting]) -> float:
+    """Seconds that settings will take, to train and to evaluate, if they are as fast as what was given."""
+    steps, seeds = sum(setting.steps for setting in listed), len(given.outcomes)
+    return seeds * (steps * given.cost("seconds") + len(listed) * given.cost("evaluate_seconds"))
 
 
 def known(rows: Sequence[Row]) -> list[Row]:
