@@ -114,8 +114,9 @@ def test_on_training_views_true_pixels_help_the_more_the_closer_and_displaced_on
 
 
 def held_out(folder: Path, *words: str) -> dict[str, float]:
-    """PSNR of a run by zoom, dB."""
-    asked = ("training.test_points=0", "rasterizer=eager", "eval.zoom=[1,2,4]", f"folder={folder}")
+    """PSNR of a run by zoom, dB. Photographs of fewer samples differ so much from finer ones reduced that these are
+    dropped."""
+    asked = ("scene.samples=16", "training.test_points=0", "rasterizer=eager", "eval.zoom=[1,2,4]", f"folder={folder}")
     assert main([*CONTROL, *words, *asked]) == 0
     zooms = json.loads((folder / "evaluation.json").read_text())["zoom"]
     return {factor: figures["psnr"] for factor, figures in zooms.items()}
@@ -123,8 +124,8 @@ def held_out(folder: Path, *words: str) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_upscale_as_it_comes_gains_on_held_out_views(tmp_path: Path) -> None:
-    """By true pixels of training views, at x1, x2 and x4; measured: 0.18, 0.20, 0.19 dB from 18.97, 17.79, 16.93."""
+    """By true pixels of training views, at x1, x2 and x4; measured: 0.36, 0.46, 0.45 dB from 19.57, 18.16, 17.22."""
     control = held_out(tmp_path / "control")
     upscale = held_out(tmp_path / "upscale", "augmenter=upscale", "regenerator/upscale=oracle")
     for factor, quality in control.items():
-        assert upscale[factor] - quality > 0.1, factor
+        assert upscale[factor] - quality > 0.2, factor
