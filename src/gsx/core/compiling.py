@@ -15,8 +15,12 @@ from gsx.core.kept_code import KeptFunction, flat, record, recording
 Result = TypeVar("Result")
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
 """Of the compiler: what is looked up by number is looked up by numbers of ours, in lists that have them all."""
-CONTRACTED: dict[str, Any] = {"cpp.enable_floating_point_contract_flag": "fast"}
-"""Of the compiler, for all functions on a CPU: products and sums contract. Other flags want headers of their own."""
+CONTRACT = "cpp.enable_floating_point_contract_flag"
+CONTRACTED: dict[str, Any] = {CONTRACT: "fast"}
+"""Of the compiler, on a CPU: products and sums contract."""
+ROWS_ALIKE: dict[str, Any] = {CONTRACT: "off"}
+"""The same of functions of rows, where they do not: the last rows, too few for a vector, have code of their own, in
+which the C++ compiler contracts others, and what is computed of a splat may not depend on how many there are."""
 IN_VECTORS: dict[str, Any] = {"cpp.enable_tiling_heuristics": False}
 """Of the compiler: rows whose numbers lie side by side are taken by vectors as well, which it else leaves to scalars
 where many are read; found by trying."""
@@ -67,7 +71,7 @@ def compile_rows(function: Callable[..., Any], *last: Any, options: dict[str, An
         rows, tensors = len(arguments[0]), [a for a in arguments if isinstance(a, Tensor)]
         return [(a, axis) for a in tensors for axis in range(min(2, a.dim())) if a.shape[axis] == rows]
 
-    return compiled_once(with_last(function, *last), varying, options)
+    return compiled_once(with_last(function, *last), varying, ROWS_ALIKE | (options or {}))
 
 
 @functools.lru_cache

@@ -13,6 +13,7 @@ from compilations import new_code
 from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
 
 from gsx.core.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS
+from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.kept_code import TRACING, file_of, recorded
 from gsx.core.rasterizer import (
@@ -192,6 +193,23 @@ def test_lists_of_fixed_sizes_draw_the_same_bits(spare: int) -> None:
     for name in ("means2d_offset", "absgrad"):
         moved = getattr(drawn.screen, name).grad
         assert torch.equal(moved[usual.screen.ids], getattr(usual.screen, name).grad)
+
+
+@pytest.mark.parametrize("left", [61, 50, 17])
+def test_colours_do_not_depend_on_how_many_there_are(left: int) -> None:
+    """Of 70 Gaussians and the first ones of them: other rows lie in the last, incomplete vector."""
+    generator = torch.Generator().manual_seed(7)
+    constant, rest, offsets, weights = (
+        torch.randn(70, *sides, generator=generator) for sides in ((1, 3), (15, 3), (3,), (3,))
+    )
+
+    def learnt(count: int) -> list[torch.Tensor]:
+        given = [value[:count].clone().requires_grad_() for value in (constant, rest, offsets)]
+        colours = colours_of(*given, 3, compiled=True)
+        (colours * weights[:count]).sum().backward()
+        return [colours.detach(), *(value.grad for value in given)]
+
+    assert all(torch.equal(few, all_[:left]) for few, all_ in zip(learnt(left), learnt(70), strict=True))
 
 
 def test_the_compilers_options_are_those_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:

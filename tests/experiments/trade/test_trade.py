@@ -19,6 +19,7 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
 from gsx.experiments.reports.charts import Axis, Dot, scatter
+from gsx.experiments.runs.rasterizer_path import Learnt
 from gsx.experiments.trade.rasterizer.advice import advice_lines, front_of, most_exact, recommended, rounded_up, table
 from gsx.experiments.trade.rasterizer.bench import EXACT, Bench, Times, check_truth, fell_back
 from gsx.experiments.trade.rasterizer.knobs import (
@@ -329,7 +330,7 @@ def test_what_fails_is_a_row_with_its_reason() -> None:
 
 
 def test_what_is_tried_compiled_is_compiled_by_two_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(settings: RasterSettings, device: torch.device, helped: bool) -> None:
+    def refuse(settings: RasterSettings, learnt: Learnt, device: torch.device, helped: bool) -> None:
         raise RuntimeError(f"alpha_min {settings.alpha_min}, helped {helped}")
 
     monkeypatch.setattr("gsx.experiments.trade.rasterizer.bench.compiles", lambda settings, _: settings.path != "eager")

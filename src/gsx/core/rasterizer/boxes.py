@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import IN_VECTORS, OWN_INDICES, compile_rows, compiled_once, with_last
+from gsx.core.compiling import IN_VECTORS, OWN_INDICES, ROWS_ALIKE, compile_rows, compiled_once, with_last
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
 from gsx.core.shapes import Float, Int
 
@@ -157,4 +157,4 @@ def compiled_spans(tile: int, reach: float) -> Callable[..., tuple[Tensor, ...]]
     def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
         return [(tensor, 0) for tensor in arguments]
 
-    return compiled_once(with_last(spans, tile, reach), varying, OWN_INDICES)
+    return compiled_once(with_last(spans, tile, reach), varying, OWN_INDICES | ROWS_ALIKE)

@@ -367,8 +367,8 @@ slow) or take longer to compile (at 120: twice as long, for code that is no fast
 
 SHARED_AFTER = 50
 """The same of all others: with more of them slopes by segments find weights twice."""
-SUMMING = {"gradients", "entry_sums"}
-"""Loops whose code is another one with absolute gradients."""
+OF_ANY_GRADIENTS = {"transmit", "blend"}
+"""Loops whose code is one with and without absolute gradients."""
 OF_A_TILE = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 
@@ -397,8 +397,8 @@ def kernels(rules: Rules) -> Kernels:
 
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
-    """`loop` of these rules through torch.compile; what sums nothing is one with and without absolute gradients."""
-    if loop.__name__ not in SUMMING:
+    """`loop` of these rules through torch.compile."""
+    if loop.__name__ in OF_ANY_GRADIENTS:
         rules = replace(rules, absolute=False)
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
     # loops over blocks: no conditions on symbols, which are the number of blocks, the same in all arguments, and where
