@@ -81,9 +81,9 @@ class TrainedRun:
         Raises:
             InputError: there is no view of that name, the nearest is told; or zoom is none of `ZOOMS`.
         """
-        if not isinstance(zoom, int | float):
+        if isinstance(zoom, str):
             raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
-        refuse_beyond("zoom", zoom, ZOOMS)
+        refuse_beyond("zoom", zoom := float(zoom), ZOOMS)
         view = view_named(self.run, seen) if isinstance(seen, str) else seen
         camera = view.camera if isinstance(view, View) else view
         return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image
@@ -129,9 +129,10 @@ class SplatFile:
         Raises:
             InputError: the background is no colour.
         """
-        over = torch.as_tensor(background, dtype=torch.float32)
-        if over.shape != (3,):
-            raise InputError(f"background has the shape {tuple(over.shape)}: give three values, red, green and blue")
+        try:
+            over = torch.as_tensor(background, dtype=torch.float32).reshape(3)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InputError(f"background is {background!r}: give three values, red, green and blue") from error
         camera = seen.camera if isinstance(seen, View) else seen
         return render_gaussians(self.gaussians, camera, self.raster, over)
 

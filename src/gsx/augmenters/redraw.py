@@ -116,7 +116,7 @@ class Redrawer:
             reduction=request.reduction,
             provenance={
                 "event": event,
-                "model_step": run.step,
+                "made_after_step": run.step,
                 "view": request.view.name,
                 "kind": spec.kind,
                 "scale": a,
@@ -145,7 +145,7 @@ class Redrawer:
             parent=parent,
             provenance={
                 "event": event,
-                "model_step": run.step,
+                "made_after_step": run.step,
                 "view": view.name,
                 "kind": "coarser",
                 "scale": 1 / factor,

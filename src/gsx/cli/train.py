@@ -167,7 +167,7 @@ def verb_resume(arguments: list[str]) -> int:
     with in_use(), claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
         if run.step > run.iterations:
-            less = f"iterations={run.iterations} is less: give iterations=N with N above that"
+            less = f"iterations={run.iterations} is less: give iterations=N with N above {run.step}"
             raise InputError(f"{folder} has come to step {run.step}, and {less}")
         if run.complete and reported(folder) and state_of(read_run(folder))[0] == "ok":
             remedy = "give iterations=N with N above that to lengthen it"

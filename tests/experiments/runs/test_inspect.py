@@ -11,7 +11,7 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
 from gsx.core.data.images import write_image
-from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
 from gsx.experiments.runs.inspect import command, describe, readable
 from gsx.scenes import colmap, photos
 
@@ -64,6 +64,13 @@ def test_the_command_can_be_pasted_whatever_the_folder_is_called(name: str, tmp_
         composed = compose_raw(words)
     assert program == "gsx"
     assert (composed.scene.name, composed.scene.path) == ("colmap", str(tmp_path / name))
+    assert composed.scene.images == name
+
+
+@pytest.mark.parametrize("name", ["2024.10", "1_000", "1e3", "null", "True", "nan", ".5", "0x1F", "on"])
+def test_names_that_look_like_other_values_stay_names(name: str) -> None:
+    with hydra_session(plugins()):
+        composed = compose_raw(["scene=colmap", word_of("scene.images", name)])
     assert composed.scene.images == name
 
 

@@ -19,6 +19,8 @@ class CoarseSource:
     times: int
     kept: list[UInt8[Tensor, "3 h w"]] = field(default_factory=list)
     """The picture, once it was asked for."""
+    masks: list[Bool[Tensor, "h w"] | None] = field(default_factory=list)
+    """Which pixels count, once that was asked for."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 h w"]:
         """The whole picture: that is all that training asks for."""
@@ -34,16 +36,15 @@ class CoarseSource:
 
     def of(self, view: View) -> "CoarseSource":
         """The same picture of a view of which other pixels count."""
-        return replace(self, view=view)
+        return replace(self, view=view, masks=[])
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
         """Pixels that are made of nothing but pixels that count."""
-        fine = self.view.counted()
-        if fine is None:
-            return None
-        width, height = camera.size
-        blocks = fine[: height * self.times, : width * self.times].reshape(height, self.times, width, self.times)
-        return blocks.all(3).all(1)
+        if not self.masks:
+            fine, (width, height), times = self.view.counted(), camera.size, self.times
+            blocks = None if fine is None else fine[: height * times, : width * times]
+            self.masks.append(None if blocks is None else blocks.reshape(height, times, width, times).all(3).all(1))
+        return self.masks[0]
 
 
 LEAST = 32

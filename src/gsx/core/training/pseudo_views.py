@@ -74,13 +74,15 @@ def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> Pse
     not count; nor does what is known of a view at a lower resolution, if it shows any."""
     if not (view.provenance.get("source") == "photo" or stands_at(view.camera, camera)):
         return view
-    weight = torch.full(view.target.shape[1:], 255, dtype=torch.uint8)
-    weight = weight if view.pixel_weight is None else view.pixel_weight.clone()
     seen = [window.seen_by(view.camera, camera) for window in windows]
     seen = [part for part in seen if part.width and part.height]
+    if not seen:
+        return view
+    whole = torch.full(view.target.shape[1:], 255, dtype=torch.uint8)
+    weight = whole if view.pixel_weight is None else view.pixel_weight.clone()
     for part in seen:
         weight[part.pixels] = 0
-    return replace(view, pixel_weight=weight, coarse=None) if seen else view
+    return replace(view, pixel_weight=weight, coarse=None)
 
 
 def stands_at(camera: Camera, other: Camera) -> bool:

@@ -112,4 +112,4 @@ class Resolution:
 
 def made_after(view: PseudoView) -> int | None:
     """The last step of the model that a pseudo view was made from; None where nobody noted that."""
-    return view.provenance.get("model_step", view.provenance.get("event"))
+    return view.provenance.get("made_after_step", view.provenance.get("event"))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
-from itertools import islice, product
+from itertools import islice
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -162,8 +162,10 @@ def quoted(text: str) -> str:
 
 
 def word_of(key: str, text: str) -> str:
-    """An override with a text for its value, quoted where that needs it."""
-    return f"{key}={text}" if re.fullmatch(r"[\w./-]+( [\w./-]+)*", text, re.ASCII) else f"{key}={quoted(text)}"
+    """An override with a text for its value, quoted unless it would be read as that text anyway."""
+    plain = re.fullmatch(r"[A-Za-z/][\w./-]*( [\w./-]+)*", text, re.ASCII)
+    bare = plain and text.lower() not in ("null", "true", "false", "nan", "inf")
+    return f"{key}={text if bare else quoted(text)}"
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
@@ -207,7 +209,7 @@ def check_groups(overrides: Sequence[str]) -> None:
         if override.key_or_group == "hydra":
             raise ConfigError("'hydra' is a group of Hydra's own settings: give hydra.NAME=VALUE or hydra/GROUP=NAME")
         if override.is_sweep_override():
-            refuse_sweep(override)
+            refuse_sweep(override, override.key_or_group in groups)
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
         if override.key_or_group not in groups:
@@ -225,13 +227,12 @@ def check_groups(overrides: Sequence[str]) -> None:
                 )
 
 
-def refuse_sweep(override: Any) -> NoReturn:
-    """Raise ConfigError for several values where there is to be one."""
+def refuse_sweep(override: Any, group: bool) -> NoReturn:
+    """Raise ConfigError for several values where there is to be one; `group`: choices of a group."""
     key, _, values = str(override.input_line).partition("=")
-    raise ConfigError(
-        f"{key}={values} is several values: gsx -m runs one after the other; '{key}=\"{values}\"' is one text, "
-        f"'{key}=[{values}]' a list"
-    )
+    others = f"; '{key}=\"{values}\"' is one text, '{key}=[{values}]' a list"
+    asked = others if override.is_choice_sweep() and not group and not re.search(r"[()'\"]", values) else ""
+    raise ConfigError(f"{key}={values} is several values: gsx -m runs one after the other{asked}")
 
 
 def refuse_absent_launcher(name: str) -> None:
@@ -282,32 +283,38 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
     return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
 
 
-MOST_CHOICES = 64
-"""Combinations of a multirun's choices that are composed before it starts, at most."""
-
-
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
-    """Refuse wrong groups, keys and values of a multirun before Hydra starts it: all choices of groups that it sweeps
-    are composed, with the first of other values that are swept.
+    """Refuse wrong groups, keys and values of a multirun before Hydra starts it: each choice of a swept group is
+    composed with the first of all other values that are swept.
 
     Returns the folder that its runs go to.
     """
     with hydra_session(plugins):
-        parsed, groups = [one for one in parse_overrides(overrides) if one.input_line], known_groups()
-        words = [words_of(one, all_of=one.key_or_group in groups) for one in parsed]
-        first, *others = islice(product(*words), MOST_CHOICES)
+        groups = known_groups()
+        words = [words_of(one, one.key_or_group in groups) for one in parse_overrides(overrides) if one.input_line]
+        first = [values[0] for values in words]
         output = Path(settings_from(compose_raw(first), plugins).general.output)
-        for other in others:
-            compose_raw(other)
+        for place, values in enumerate(words):
+            for other in values[1:]:
+                compose_raw([*first[:place], other, *first[place + 1 :]])
         return output
 
 
 def words_of(override: Any, all_of: bool) -> list[str]:
-    """An override by each of the values that it sweeps, or by the first of them; itself where it sweeps none."""
+    """An override by each of the values that it sweeps, or by the first of them; itself where it sweeps none.
+
+    Raises:
+        ConfigError: it sweeps nothing that can be told.
+    """
+    from hydra.errors import HydraException
+
     if not override.is_sweep_override():
         return [str(override.input_line)]
-    words = [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
-    return words if all_of else words[:1]
+    try:
+        values = list(islice(override.sweep_string_iterator(), None if all_of else 1))
+    except HydraException as error:
+        raise ConfigError(f"{override.input_line} cannot be swept: {first_line(error)}") from error
+    return [f"{override.get_key_element()}={value}" for value in values]
 
 
 def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
