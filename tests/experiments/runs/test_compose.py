@@ -144,15 +144,6 @@ def test_compositions_share_nothing_that_can_be_changed() -> None:
         typed(EvalOptions, asdict(second.evaluation) | {"tile_pixels": 4096.0}, "eval")
 
 
-def test_a_run_that_was_written_without_metrics_is_read(tmp_path: Path) -> None:
-    """As older versions took `metrics: null`; who asks for it now hears that it is a group."""
-    resolved = compose([], plugins()).resolved
-    write_config(tmp_path / "config.yaml", resolved | {"metrics": None})
-    assert read_config(tmp_path / "config.yaml", plugins()).evaluation == compose([], plugins()).evaluation
-    with pytest.raises(ConfigError, match="metrics is null, but it is a group"):
-        compose(["metrics=null"], plugins())
-
-
 def test_a_run_folders_configuration_looks_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Written by somebody else it could ask for a secret of the machine that it is opened on."""
     monkeypatch.setenv("GSX_SECRET", "hush")

@@ -367,7 +367,7 @@ slow) or take longer to compile (at 120: twice as long, for code that is no fast
 
 SHARED_AFTER = 50
 """The same of all others: with more of them slopes by segments find weights twice."""
-OF_ANY_GRADIENTS = {"transmit", "blend"}
+OF_ANY_GRADIENTS = {"transmit", "blend", "make_rows"}
 """Loops whose code is one with and without absolute gradients."""
 OF_A_TILE = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""

@@ -356,9 +356,6 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
     if isinstance(config, DictConfig):
         config = OmegaConf.create(renamed(OmegaConf.to_container(config)))  # type: ignore[arg-type]
         refuse_interpolation(path, config)
-    for key in GROUPS:
-        if isinstance(config, DictConfig) and OmegaConf.select(config, key, default={}) is None:
-            config[key] = {}  # as older versions wrote and read it
     add_newer_settings(config)
     written = OmegaConf.to_container(config)
     newer = newer_keys(written, plugins) if overrides and isinstance(written, dict) else ()
