@@ -86,11 +86,15 @@ class Camera:
         """This camera where the other one stands, looking where that looks."""
         return replace(self, rotation=other.rotation, translation=other.translation)
 
+    def has_pose_of(self, other: "Camera") -> bool:
+        """Whether both have one pose, bit for bit."""
+        return torch.equal(self.rotation, other.rotation) and torch.equal(self.translation, other.translation)
+
     def draws_as(self, other: "Camera") -> bool:
         """Whether both draw the same picture, bit for bit."""
         numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")
         alike = all(getattr(self, name) == getattr(other, name) for name in numbers)
-        return alike and torch.equal(self.rotation, other.rotation) and torch.equal(self.translation, other.translation)
+        return alike and self.has_pose_of(other)
 
     def resize(self, width: int, height: int) -> "Camera":
         """The same field of view on another raster; intrinsics scale per axis."""

@@ -72,7 +72,7 @@ def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> Pse
     """A pseudo view without what it shows of windows of a training camera, where it stands at that or was made from its
     photograph: what counts in no loss must not come back as a pseudo detail. A pixel that shows a part of a window does
     not count; nor does what is known of a view at a lower resolution, if it shows any."""
-    if not (view.provenance.get("source") == "photo" or stands_at(view.camera, camera)):
+    if not (view.provenance.get("source") == "photo" or view.camera.has_pose_of(camera)):
         return view
     seen = [window.seen_by(view.camera, camera) for window in windows]
     seen = [part for part in seen if part.width and part.height]
@@ -83,11 +83,6 @@ def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> Pse
     for part in seen:
         weight[part.pixels] = 0
     return replace(view, pixel_weight=weight, coarse=None)
-
-
-def stands_at(camera: Camera, other: Camera) -> bool:
-    """Whether two cameras have one pose."""
-    return torch.equal(camera.rotation, other.rotation) and torch.equal(camera.translation, other.translation)
 
 
 def picture_name(augmenter: str, view: PseudoView) -> str:

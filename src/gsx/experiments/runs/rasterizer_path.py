@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
@@ -91,7 +91,7 @@ def compile_now(settings: RasterSettings, learnt: Learnt, device: torch.device, 
     calls = needed(settings, learnt, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
         with helper(settings, learnt.sh_degree) if helped else nullcontext():
-            common = set(map(file_of, of_any_backbone(settings, learnt.sh_degree)))
+            common = set(map(file_of, of_any_backbone(calls, settings, learnt)))
             make_ahead(sorted(calls, key=lambda call: file_of(call) in common))  # first what nobody helps with
             learn_little(settings, learnt, device)
     return time.perf_counter() - begun
@@ -153,7 +153,8 @@ def help_compiling(words: str) -> None:
     Thread(target=end_with, args=[sys.stdin.buffer], daemon=True).start()
     given = json.loads(words)
     torch.set_num_threads(given["threads"])
-    make_ahead(of_any_backbone(RasterSettings(**given["settings"]), given["sh_degree"])[::-1])
+    settings, learnt = RasterSettings(**given["settings"]), Learnt(sh_degree=given["sh_degree"])
+    make_ahead(of_any_backbone(needed(settings, learnt, torch.device("cpu")), settings, learnt)[::-1])
 
 
 def end_with(stream: IO[bytes]) -> None:
@@ -162,13 +163,10 @@ def end_with(stream: IO[bytes]) -> None:
     os._exit(0)
 
 
-def of_any_backbone(settings: RasterSettings, sh_degree: int) -> list[Call]:
-    """Calls of what is the same by any screen filter and any gradients, which the backbone chooses."""
+def of_any_backbone(calls: Sequence[Call], settings: RasterSettings, learnt: Learnt) -> list[Call]:
+    """Those of a step's calls that are the same by any screen filter and any gradients, which the backbone chooses."""
     other = replace(settings, dilation=settings.dilation + 1, compensate=not settings.compensate, zoomed="plain")
-    calls, others = (
-        needed(rules, Learnt(sh_degree=sh_degree, absolute_gradient=absolute), torch.device("cpu"))
-        for rules, absolute in ((settings, False), (other, True))
-    )
+    others = needed(other, replace(learnt, absolute_gradient=not learnt.absolute_gradient), torch.device("cpu"))
     files = set(map(file_of, others))
     return [call for call in calls if file_of(call) in files]
 

@@ -88,10 +88,9 @@ class DemoSource:
 
 def same_view(camera: Camera, own: Camera) -> bool:
     """Whether `camera` is `own` at some resolution, and no crop of it."""
-    pose = torch.equal(camera.rotation, own.rotation) and torch.equal(camera.translation, own.translation)
     back = camera.resize(*own.size)
     intrinsics = ((back.fx, own.fx), (back.fy, own.fy), (back.cx, own.cx), (back.cy, own.cy))
-    return pose and all(abs(a - b) < SAME for a, b in intrinsics)
+    return camera.has_pose_of(own) and all(abs(a - b) < SAME for a, b in intrinsics)
 
 
 def camera_key(camera: Camera) -> str:
