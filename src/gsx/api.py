@@ -24,7 +24,7 @@ from gsx.cli.messages import set_up_logging as show_messages
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.processes import processes
@@ -152,7 +152,7 @@ def train(*given: str, **values: Any) -> TrainedRun:
     if is_table(words) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
     if train_job(compose(words, loaded := plugins()), loaded, folders):
-        raise KeyboardInterrupt(f"gsx resume {folders[0]} goes on")
+        raise KeyboardInterrupt(f"{command('resume', folders[0])} goes on")
     return load_run(folders[0])
 
 

@@ -456,6 +456,13 @@ def without_checkpoints(folder: Path) -> Path:
     return folder
 
 
+def run_of_old(folder: Path) -> Path:
+    """What makes a folder a run, and nothing else."""
+    folder.mkdir()
+    (folder / "config.yaml").write_text("")
+    return folder
+
+
 TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "a value for a group": (
         lambda t: words(t / "run", "eval=3"),
@@ -500,6 +507,28 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
     "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "is of .spz files"),
     "no trades": (lambda t: ["trade", "training", "--trades", "", "--to", str(t / "t")], "--trades names none"),
+    "a choice that is there twice": (
+        lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),
+        "augmenter=[upscale,bootstrap,upscale]: upscale is there twice, and works once",
+    ),
+    "a word that no scene knows": (
+        lambda t: words(t / "run", "iterations=1", "scene.masks=alpa"),
+        "scene.masks is 'alpa', use one of auto, alpha, none. Did you mean 'alpha'?",
+    ),
+    "a filter that no scene knows": (
+        lambda t: words(t / "run", "iterations=1", "scene.resize_filter=cubic"),
+        "scene.resize_filter is 'cubic', use one of bicubic, area, lanczos. Did you mean 'bicubic'?",
+    ),
+    "datasets nowhere": (lambda t: ["datasets", f"data_root={t / 'no'}"], "is no folder: give the one below which"),
+    "more steps of an evaluation": (
+        lambda t: ["eval", str(run_of_old(t / "my run")), "iterations=40"],
+        "/my run is trained: leave it out (gsx resume '",
+    ),
+    "another seed for photographs": (
+        lambda t: ["photographs", str(run_of_old(t / "run")), "seed=4"],
+        "'seed=4' is for training",
+    ),
+    "training from a run": (lambda t: [str(run_of_old(t / "my run"))], "/my run', gsx eval '"),
     "trade with a place of its own": (
         lambda t: ["trade", "training", f"output={t / 'o'}", "--to", str(t / "t")],
         "runs go below --to FOLDER",

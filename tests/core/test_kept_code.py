@@ -3,10 +3,12 @@
 import os
 import subprocess
 import sys
+import time
 import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 from typing import Any
 from unittest.mock import patch
 
@@ -220,6 +222,25 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
     assert compiled == []
 
 
+def test_waiting_for_another_process_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file, got = tmp_path / "blend-0123.bin", list[bool]()
+
+    def wait() -> None:
+        with made_by_one(file, wait=True) as alone:
+            got.append(alone)
+
+    caplog.set_level("INFO", "gsx")
+    thread = Thread(target=wait)
+    with made_by_one(file) as alone:
+        thread.start()
+        deadline = time.monotonic() + 60
+        while not caplog.messages and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert (alone, got) == (True, [])
+    thread.join(60)
+    assert (got, caplog.messages) == ([True], ["waiting for another process, which is making blend ..."])
+
+
 def test_a_compiler_is_not_asked_for_where_calls_are_only_to_be_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsx.core.compiling.complaint", lambda device: f"none for {device}")
     with recorded():
@@ -324,9 +345,12 @@ def test_what_returns_something_is_not_called_directly(folder: Path) -> None:
 OTHER = """
 import os, sys
 from pathlib import Path
+from threading import Thread
 import torch
 sys.path += [{tests!r}, {here!r}]
 from compilations import new_code
+from gsx.core import compiling
+compiling.available = lambda: True  # or this file, when it is imported, has something compiled to see whether it is
 from test_kept_code import rows, weighted
 from gsx.core.compiling import WHOLE_LOOPS, compile_rows
 with new_code() as names:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.train import verb_train
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
 from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.plugins import Plugins
@@ -39,15 +39,14 @@ def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[s
         InputError: it is none; a splat file gets told what can be done with it.
     """
     from gsx.experiments.runs.compose import word_of
-    from gsx.experiments.runs.inspect import readable, unknown
+    from gsx.experiments.runs.inspect import readable, refuse_run, unknown
     from gsx.experiments.runs.video import is_video, photos_of
 
-    if (path / "config.yaml").is_file():
-        raise InputError(f"{path} is a run: gsx view {path}, gsx eval {path}, gsx resume {path}")
+    refuse_run(path)
     if path.is_file() and suffix_of(path):
         raise InputError(
-            f"{path} is a splat file: gsx view {path}, gsx eval {path} scene=... scene.path=FOLDER, or train on with "
-            f"init={path} scene=... scene.path=FOLDER"
+            f"{path} is a splat file: {command('view', path)}, {command('eval', path)} scene=... scene.path=FOLDER, "
+            f"or train on with {shlex.quote(word_of('init', str(path)))} scene=... scene.path=FOLDER"
         )
     if is_video(path):
         output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")

@@ -63,6 +63,8 @@ def verb_datasets(arguments: list[str]) -> int:
                 raise InputError(f"'{name}' is no dataset; there are {', '.join(known)}.{nearest(name, known)}")
             asked = [f"dataset={name}", *overrides]
             root = Path(str(compositions.value(asked, "data_root")))
+            if any(word.startswith("data_root=") for word in overrides) and not root.is_dir():
+                raise InputError(f"data_root={root} is no folder: give the one below which datasets lie")
             sys.stdout.write("\n".join(described(compositions.node(asked, "dataset"), root)) + "\n")
     return 0
 

@@ -37,13 +37,13 @@ def complaint(device: str) -> str:
     """Why nothing can be compiled for this device; empty where it can. Asked by compiling a few operations,
     those of a vector library among them."""
     try:
-        compile_rows(few_operations)(torch.ones(32, device=device))
+        compile_rows(test_of_the_compiler)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return ""
 
 
-def few_operations(x: Tensor) -> Tensor:
+def test_of_the_compiler(x: Tensor) -> Tensor:
     """What is compiled to see whether anything can be."""
     return 2 * x.exp() + x.log()
 

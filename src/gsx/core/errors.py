@@ -1,6 +1,7 @@
 """Errors a user can act on: one sentence that names value, place and remedy. The command line exits with 2 on them."""
 
 import difflib
+import shlex
 from collections.abc import Iterable
 
 
@@ -44,6 +45,11 @@ def nearest(word: str, options: Iterable[str]) -> str:
     """` Did you mean 'x'?` for the closest option, or an empty string when nothing is close."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""
+
+
+def command(*words: object) -> str:
+    """`gsx` with these words, as a shell takes it: for what is to be copied."""
+    return shlex.join(["gsx", *map(str, words)])
 
 
 def first_line(error: BaseException) -> str:

@@ -214,7 +214,10 @@ def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
         return
     with stream:
         try:
-            alone = lock(stream, wait)
+            alone = lock(stream)
+            if wait and not alone:
+                logger.info("waiting for another process, which is making %s ...", file.name.partition("-")[0])
+                alone = lock(stream, wait)
         except (OSError, InputError):
             alone = True
         yield alone

@@ -12,16 +12,13 @@ from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import is_file
-from gsx.scenes.options import SceneOptions, refuse_other
+from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
 """Folder of the photos, unless a scene says otherwise."""
 FOLDER = "masks"
 """Beside the folder of the photographs (COLMAP)."""
-MASKS = ("auto", "alpha", "none")
-"""`auto`: what the scene names (`mask_path` of nerfstudio), else files in FOLDER. `alpha`: what is opaque counts,
-instead of compositing the rest. `none`: all pixels count."""
 
 
 def mask_of(
@@ -30,10 +27,8 @@ def mask_of(
     """The mask of a photograph of that name; None: it has none. `expected`: (width, height) of the whole photograph.
 
     Raises:
-        ConfigError: scene.masks has no such value.
         InputError: a mask that the scene names is not there, or has another shape than its photograph.
     """
-    refuse_other("masks", options.masks, MASKS)
     if options.masks == "none":
         return None
     if options.masks == "alpha":

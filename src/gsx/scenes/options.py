@@ -4,9 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from gsx.core.data.resize import FILTERS, LIGHTS
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.options import without_effect
 from gsx.core.ranges import Gigabytes, Range, Share, Steps
+
+WORDS = {
+    "resize_filter": FILTERS,
+    "resize_light": LIGHTS,
+    "principal_point": ("exact", "centred"),
+    "masks": ("auto", "alpha", "none"),
+}
+"""What options of any scene may be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +56,16 @@ class SceneOptions:
     """Share of the images named by a file of poses that may be absent from the disk, or of photographs that may be
     unreadable; more are refused."""
     masks: str = "auto"
-    """auto | alpha | none: which pixels of photographs count (gsx.scenes.masked)."""
+    """Which pixels of photographs count. auto: what the scene names (`mask_path` of nerfstudio), else files in a folder
+    `masks`; alpha: what is opaque counts, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
     split: str = "every:8"
     """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
+
+
+def refuse_unknown(options: SceneOptions) -> None:
+    """Raise ConfigError for a word that is none of its option's values."""
+    for key, known in WORDS.items():
+        refuse_other(key, getattr(options, key), known)
 
 
 def refuse_other(key: str, word: str, known: Sequence[str]) -> None:

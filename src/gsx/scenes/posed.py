@@ -16,13 +16,13 @@ from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
-from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import is_file
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
 from gsx.scenes.masked import mask_of, masks_named
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_unknown
 from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined
@@ -34,7 +34,6 @@ STRAY = 1e4
 speck to the others. A city from the street to the sky spans some 1e2."""
 SAME_PLACE = 1e-3  # units: cameras that are no farther apart, as on a tripod, say nothing of how large a scene is
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
-PRINCIPAL_POINTS = ("exact", "centred")
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 
 
@@ -234,10 +233,8 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
         ConfigError: an option of the resize rule, of masks or the principal point is unknown.
         InputError: a mask that the scene names is not there, or a camera is far off all others.
     """
+    refuse_unknown(options)
     refuse_stray(shots)
-    if options.principal_point not in PRINCIPAL_POINTS:
-        hint = nearest(options.principal_point, PRINCIPAL_POINTS)
-        raise ConfigError(f"scene.principal_point is '{options.principal_point}', use exact or centred.{hint}")
     red, green, blue = rgb(options.background)
     rule = ResizeRule(filter=options.resize_filter, light=options.resize_light, background=(red, green, blue))
     cache = ImageCache(int(options.cache_gb * 1e9))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, Frame, centred, look_at
+from gsx.core.errors import InputError
 
 
 def camera(**changes: object) -> Camera:
@@ -84,6 +85,12 @@ def test_crops_remember_the_raster_they_were_cut_from() -> None:
     assert camera().frame == Frame(left=0, top=0, width=120, height=90)
     assert camera().crop(10, -5, 30, 40).frame == Frame(left=10, top=-5, width=120, height=90)
     assert camera().crop(10, -5, 30, 40).crop(3, 8, 5, 5).frame == Frame(left=13, top=3, width=120, height=90)
+
+
+def test_a_window_without_pixels_is_refused() -> None:
+    for width, height in ((0, 5), (5, -1)):
+        with pytest.raises(InputError, match=f"a window of {width} x {height} px has no pixels"):
+            camera().crop(1, 2, width, height)
 
 
 def test_zoom_and_crop_commute_up_to_the_window() -> None:

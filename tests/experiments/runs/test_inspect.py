@@ -12,7 +12,7 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 from gsx.builtin import plugins
 from gsx.core.data.images import write_image
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
-from gsx.experiments.runs.inspect import command, describe, readable
+from gsx.experiments.runs.inspect import describe, readable, training_command
 from gsx.scenes import colmap, photos
 
 POSE = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
@@ -56,9 +56,17 @@ def test_colmap_scene(tmp_path: Path) -> None:
     assert labelled(lines, "train") == [f"gsx scene=colmap 'scene.path={folder}'"]
 
 
+def test_a_run_is_no_scene(tmp_path: Path) -> None:
+    folder = tmp_path / "my run"
+    (folder / "images").mkdir(parents=True)
+    (folder / "config.yaml").write_text("")
+    told = f"{folder} is a run: gsx view '{folder}', gsx eval '{folder}', gsx resume '{folder}'"
+    assert describe(folder, plugins()) == [f"problem   {told}"]
+
+
 @pytest.mark.parametrize("name", ["plain", "my scene", "fö 'x", "p=q/fox", "a,b", "-lead", "{x}: $y", "back\\slash'"])
 def test_the_command_can_be_pasted_whatever_the_folder_is_called(name: str, tmp_path: Path) -> None:
-    told = command(plugins().registry.find("scene", "colmap"), tmp_path / name, {"images": name})
+    told = training_command(plugins().registry.find("scene", "colmap"), tmp_path / name, {"images": name})
     program, *words = shlex.split(told)
     with hydra_session(plugins()):
         composed = compose_raw(words)

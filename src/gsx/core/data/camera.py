@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.device import uploaded
+from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
 
 NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
@@ -121,7 +122,13 @@ class Camera:
         return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """The window with its upper left corner at pixel (left, top); it may reach past the raster."""
+        """The window with its upper left corner at pixel (left, top); it may reach past the raster.
+
+        Raises:
+            InputError: it has no pixels.
+        """
+        if width < 1 or height < 1:
+            raise InputError(f"a window of {width} x {height} px has no pixels: give a width and a height of 1 or more")
         frame = self.frame
         return replace(
             self,

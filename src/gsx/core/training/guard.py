@@ -9,7 +9,7 @@ import math
 
 import torch
 
-from gsx.core.errors import Disagreement, LostModel, TrainingError
+from gsx.core.errors import Disagreement, LostModel, TrainingError, command
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
 from gsx.core.training.recorded import loss_and_sums, told_of
@@ -90,7 +90,7 @@ class Agreement:
         if due and run.ranks.size > 1 and len(set(run.ranks.all_gather(digest(run)))) > 1:
             raise Disagreement(
                 f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
-                f"checkpoint before, if there is one, with gsx resume {run.folder}"
+                f"checkpoint before, if there is one, with {command('resume', run.folder)}"
             )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.errors import ConfigError, InputError, first_line
+from gsx.core.errors import ConfigError, InputError, command, first_line
 from gsx.core.files import read_json, replace_file, write_json
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.suffixes import STANDARD
@@ -120,7 +120,7 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
         run, settings = open_run(target, plugins, overrides)
         if not run.complete:
             raise InputError(
-                f"{target} is at step {run.step} of {run.iterations}: `gsx resume {target}` finishes it first"
+                f"{target} is at step {run.step} of {run.iterations}: `{command('resume', target)}` finishes it first"
             )
         if not run.iterations:
             raise InputError(f"{target} judged a splat file and trained nothing: give that file, and its scene=...")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsx.core.errors import command
 from gsx.experiments.reports.comparison import Entry, Group
 from gsx.experiments.run_folder.files import RunFiles, gain_of, is_number, part
 
@@ -151,4 +152,4 @@ def without(entry: Entry) -> dict[str, str]:
     """A run that has figures and no pictures, and why."""
     run = entry.run
     reason = run.problems.get("renders/index.json", "renders/index.json is missing")
-    return {"name": entry.name, "reason": reason, "remedy": f"gsx eval {run.folder}"}
+    return {"name": entry.name, "reason": reason, "remedy": command("eval", run.folder)}

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from gsx.core.errors import command
 from gsx.core.files import is_file, read_json
 from gsx.core.gaussians.suffixes import suffix_of
 from gsx.experiments.run_folder.heads import checkpoint_problem, newest_checkpoint, splats_problem
@@ -68,7 +69,7 @@ class RunFiles:
         """The command that completes the run."""
         only_results = not any(name.startswith((*self.begun, "checkpoints/")) for name in self.lacking)
         verb = "eval" if only_results and 0 < self.iterations <= self.step else "resume"
-        return f"gsx {verb} {self.folder}"
+        return command(verb, self.folder)
 
     @cached_property
     def begun(self) -> tuple[str, ...]:

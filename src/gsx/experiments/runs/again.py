@@ -10,7 +10,7 @@ from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.execute import finish
-from gsx.experiments.runs.open import as_trained, open_run, refuse_other
+from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.rasterizer_path import warm
 
 
@@ -22,6 +22,7 @@ def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()
         CheckpointError: there is no usable checkpoint.
     """
     refuse_other(folder)
+    refuse_training(folder, overrides)
     with claimed(folder):
         remove_partial(folder)
         run, settings = open_run(folder, plugins, overrides)

@@ -212,19 +212,23 @@ def check_groups(overrides: Sequence[str]) -> None:
             refuse_sweep(override, override.key_or_group in groups)
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
-        if override.key_or_group not in groups:
-            continue
-        options = listed(override.key_or_group)
-        if not options:
-            inner = ", ".join(group for group in groups if group.startswith(f"{override.key_or_group}/"))
-            raise ConfigError(f"{override.key_or_group} is chosen by role: {inner}")
-        value = override.value()
-        for name in value if isinstance(value, list) else [value]:
-            if str(name) not in options:
-                raise ConfigError(
-                    f"{override.key_or_group}={name}: there is no such {override.key_or_group}; "
-                    f"choose from {', '.join(options)}.{nearest(str(name), options)}"
-                )
+        if override.key_or_group in groups:
+            check_choices(override.key_or_group, override.value(), groups)
+
+
+def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
+    """Refuse options that a group does not have, or one that is chosen twice."""
+    options = listed(group)
+    if not options:
+        inner = ", ".join(one for one in groups if one.startswith(f"{group}/"))
+        raise ConfigError(f"{group} is chosen by role: {inner}")
+    names = [str(name) for name in (value if isinstance(value, list) else [value])]
+    for number, name in enumerate(names):
+        if name not in options:
+            choices = f"choose from {', '.join(options)}.{nearest(name, options)}"
+            raise ConfigError(f"{group}={name}: there is no such {group}; {choices}")
+        if name in names[:number]:
+            raise ConfigError(f"{group}=[{','.join(names)}]: {name} is there twice, and works once: leave one out")
 
 
 def refuse_sweep(override: Any, group: bool) -> NoReturn:

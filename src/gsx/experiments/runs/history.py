@@ -10,7 +10,7 @@ from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
-from gsx.core.errors import InputError
+from gsx.core.errors import InputError, command
 from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
@@ -133,7 +133,7 @@ def refuse_another(run: Run, names: Sequence[str]) -> None:
     if names:
         raise InputError(
             f"{run.folder} was trained to step {run.step} with other {' and '.join(names)}: restore them, or go on all "
-            f"the same with gsx resume {run.folder} --changed"
+            f"the same with {command('resume', run.folder, '--changed')}"
         )
 
 

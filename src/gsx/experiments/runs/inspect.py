@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
-from gsx.core.errors import GsxError, InputError
+from gsx.core.errors import GsxError, InputError, command
 from gsx.core.plugins import Component, Plugins
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
@@ -51,13 +51,14 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
     loaders: Readable = []
 
     def formats() -> Iterator[str]:
+        refuse_run(path)
         loaders.extend(readable(path, plugins))
         yield from format_lines(path, loaders, plugins)
 
     found.ask(formats)
     if loaders:
         loader, its = loaders[0]
-        found.command = command(loader, path, {})
+        found.command = training_command(loader, path, {})
         found.ask(lambda: scene_lines(loader, its, path, found, plugins, patient))
     problems = [f"problem   {problem}" for problem in found.problems]
     label = "then" if problems else "train"
@@ -74,6 +75,13 @@ def readable(path: Path, plugins: Plugins) -> Readable:
         except Exception as error:  # a plugin's; the other loaders are asked all the same
             logger.warning("scene=%s cannot look at %s (%s: %s)", loader.name, path, type(error).__name__, error)
     return found
+
+
+def refuse_run(path: Path) -> None:
+    """Raise InputError for the folder of a run, which is no scene."""
+    if (path / "config.yaml").is_file():
+        looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
+        raise InputError(f"{path} is a run: {looks}")
 
 
 def format_lines(path: Path, loaders: Readable, plugins: Plugins) -> Iterator[str]:
@@ -107,7 +115,7 @@ def scene_lines(
     """What lies in the folder, and what the loader makes of it."""
     yield from its.facts(path)
     overrides = its.overrides(path)
-    found.command = command(loader, path, overrides)
+    found.command = training_command(loader, path, overrides)
     if its.quick or patient:
         scene = loader.factory(options_for(loader, path, overrides, plugins))
         yield from loaded_lines(scene)
@@ -116,7 +124,7 @@ def scene_lines(
         yield f"poses     not known yet: gsx scenes {shlex.quote(str(path))} --poses finds them and judges the coverage"
 
 
-def command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
+def training_command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
     """The command that trains a folder."""
     more = [word_of(f"scene.{key}", value) for key, value in overrides.items()]
     return shlex.join(["gsx", f"scene={loader.name}", word_of("scene.path", str(path)), *more])

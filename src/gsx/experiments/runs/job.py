@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsx.core.cache import in_use
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
 from gsx.core.processes import processes, say, speaks
 
@@ -162,5 +162,5 @@ def way_on(run: "Run", settings: "Settings") -> str:
     """The command that goes on with a run; one that is named by its composition is found again by it."""
     from gsx.experiments.runs.settings import named_code
 
-    trust = " --trust" if named_code(settings) else ""
-    return "the same command" if settings.general.reuse else f"gsx resume {run.folder}{trust}"
+    trust = ["--trust"] if named_code(settings) else []
+    return "the same command" if settings.general.reuse else command("resume", run.folder, *trust)

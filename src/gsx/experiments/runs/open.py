@@ -11,7 +11,7 @@ from pathlib import Path
 from gsx.core.cache import source_revision
 from gsx.core.collector import collecting_nothing
 from gsx.core.data.scene import Scene
-from gsx.core.errors import CheckpointError, InputError
+from gsx.core.errors import CheckpointError, ConfigError, InputError, command
 from gsx.core.files import keep_names, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
@@ -31,6 +31,7 @@ from gsx.experiments.run_folder.run_key import (
 )
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
+from gsx.experiments.runs.compose import key_of
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
@@ -43,6 +44,9 @@ from gsx.experiments.runs.verified import verified
 
 logger = logging.getLogger(__name__)
 
+OF_TRAINING = ("iterations", "length", "seed", "init", "reuse", "warm_start_at", "output", "folder")
+"""How long a run is trained, from what, and where it goes: nothing of what it shows once it is there."""
+
 
 def refuse_used(folder: str) -> None:
     """Raise InputError if the run folder asked for exists and holds something."""
@@ -50,7 +54,7 @@ def refuse_used(folder: str) -> None:
     if folder and path.exists() and not path.is_dir():
         raise InputError(f"'{folder}' is a file, no folder for a run: choose another place")
     if folder and path.exists() and any(one.name != LOCK for one in path.iterdir()):
-        raise InputError(f"folder={folder} is not empty: choose another, or go on with `gsx resume {folder}`")
+        raise InputError(f"folder={folder} is not empty: choose another, or go on with `{command('resume', folder)}`")
 
 
 def new_folder(settings: Settings, scene: Scene) -> Path:
@@ -130,6 +134,14 @@ def refuse_other(folder: Path) -> None:
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
 
 
+def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
+    """Raise ConfigError for an override that changes how a run is trained, or where, and nothing of what it shows."""
+    for word in overrides:
+        if key_of(word) in OF_TRAINING:
+            onwards = command("resume", folder, "iterations=N")
+            raise ConfigError(f"'{word}' is for training, and {folder} is trained: leave it out ({onwards} trains on)")
+
+
 def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
     """Raise InputError for a folder that names code to be run, unless the command line names the same."""
     words = [word.partition("=") for word in overrides]
@@ -137,7 +149,7 @@ def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> N
         if code not in [str(value_of(value)) for name, _, value in words if name.startswith(f"{key}.")]:
             raise InputError(
                 f"{folder / 'config.yaml'} runs code, {key}: '{code}', which would have all your rights: look at it "
-                f"first, then `gsx resume {folder} --trust`"
+                f"first, then `{command('resume', folder, '--trust')}`"
             )
 
 

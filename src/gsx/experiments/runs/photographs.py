@@ -24,7 +24,7 @@ from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.claims import claimed
-from gsx.experiments.runs.open import as_trained, open_run, refuse_other
+from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.rasterizer_path import warm
 
@@ -41,6 +41,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
         CheckpointError: there is no usable checkpoint.
     """
     refuse_other(folder)
+    refuse_training(folder, overrides)
     with claimed(folder):
         run, settings = open_run(folder, plugins, overrides)
         run.raster = as_trained(run)

@@ -23,7 +23,7 @@ from gsx.core.shapes import Float, UInt8
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, render, seen_at
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_unknown
 from gsx.scenes.splits import check_rule
 
 logger = logging.getLogger(__name__)
@@ -134,10 +134,11 @@ def check(options: DemoOptions) -> None:
     """Refuse options that make no scene.
 
     Raises:
-        ConfigError: a count is too small, there are more test than training views, the background is no colour, or
-            the split is unreadable.
+        ConfigError: a word is unknown, a count is too small, there are more test than training views, the background
+            is no colour, or the split is unreadable.
     """
     check_rule(options.split)
+    refuse_unknown(options)
     if options.path:
         raise ConfigError(
             f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "
