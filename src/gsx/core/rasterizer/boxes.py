@@ -38,7 +38,7 @@ def window(
 def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
     """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
     pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
-    return torch.div(pixel, tile, rounding_mode="floor").clamp(-FAR, FAR).nan_to_num().int() + int(past)
+    return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
 
 
 def box(
