@@ -64,8 +64,16 @@ def test_a_splat_file_draws_what_its_run_does(run: gsx.TrainedRun, tmp_path: Pat
     torch.testing.assert_close(splats.render(camera, background), run.render(camera), rtol=0, atol=1e-5)
     over = torch.tensor(background)
     assert torch.equal(splats.render(run.scene.test[0], over), splats.render(run.scene.test[0].camera, over))
-    with pytest.raises(InputError, match="give three values"):
-        splats.render(camera, (1, 1))
+    for wrong, told in (
+        ((1, 1), "give three values"),
+        ((0, 0, 255), r"in \[0, 1\]"),
+        ((math.nan, 0, 0), r"in \[0, 1\]"),
+    ):
+        with pytest.raises(InputError, match=told):
+            splats.render(camera, wrong)
+    with pytest.raises(InputError, match="is no camera: give one, or a view"):
+        splats.render("test_000")
+    assert repr(splats) == f"<300 splats of {tmp_path / 'model.ply'}>"
     with pytest.raises(InputError, match=r"gsx writes .*\.ply"):
         run.export(tmp_path / "model.obj")
 
@@ -76,10 +84,36 @@ def test_a_folder_is_opened_as_it_was_left(run: gsx.TrainedRun) -> None:
     assert torch.equal(opened.render(opened.scene.test[0]), run.render(run.scene.test[0]))
     with pytest.raises(InputError, match="does not exist"):
         gsx.load(run.folder / "nothing")
+    with pytest.raises(InputError, match="drawn as it was trained: raster is for splat files"):
+        gsx.load(run.folder, raster=run.run.raster)
+    assert repr(opened) == f"<run of 3 steps in {run.folder}>"
+
+
+def test_a_home_is_looked_for(run: gsx.TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(run.folder.parent))
+    assert gsx.load(f"~/{run.folder.name}").folder == run.folder
+
+
+@pytest.mark.parametrize("given", [Path("photos"), "photos", {"seed": 3}, 4])
+def test_what_is_no_setting_is_refused(given: Any) -> None:
+    with pytest.raises(ConfigError, match=r"give settings, as 'scene=colmap' and 'scene\.path=FOLDER'"):
+        gsx.train(given)
+
+
+@pytest.mark.parametrize("seen", [0, None, Path("test_000")])
+def test_what_is_no_camera_is_refused(run: gsx.TrainedRun, seen: Any) -> None:
+    with pytest.raises(InputError, match="is no camera: give one, or a view"):
+        run.render(seen)
+
+
+def test_what_a_camera_sees_is_exported(run: gsx.TrainedRun, tmp_path: Path) -> None:
+    view = run.scene.test[0]
+    files = [run.export(tmp_path / f"{n}.ply", seen) for n, seen in enumerate((view, view.camera, view.name))]
+    assert files[0].read_bytes() == files[1].read_bytes() == files[2].read_bytes()
 
 
 def test_a_zoom_that_is_none_is_refused(run: gsx.TrainedRun) -> None:
-    for zoom in (0, -1, math.nan, 1e9, "2"):
+    for zoom in (0, -1, math.nan, 1e9, "2", None):
         with pytest.raises(InputError, match=r"give a number from 0\.015625 to 64"):
             run.render(run.scene.test[0], zoom)
 

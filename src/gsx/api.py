@@ -19,12 +19,13 @@ import torch
 from torch import Tensor
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import ZOOMS, refuse_beyond
+from gsx.cli.arguments import ZOOMS, is_override, refuse_beyond
 from gsx.cli.messages import set_up_logging as show_messages
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, command
+from gsx.core.files import at_home
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.processes import processes
@@ -81,11 +82,10 @@ class TrainedRun:
         Raises:
             InputError: there is no view of that name, the nearest is told; or zoom is none of `ZOOMS`.
         """
-        if isinstance(zoom, str):
+        if isinstance(zoom, str) or zoom is None:
             raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
         refuse_beyond("zoom", zoom := float(zoom), ZOOMS)
-        view = view_named(self.run, seen) if isinstance(seen, str) else seen
-        camera = view.camera if isinstance(view, View) else view
+        camera = camera_of(view_named(self.run, seen) if isinstance(seen, str) else seen)
         return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
@@ -100,16 +100,20 @@ class TrainedRun:
         words = [f"eval.{name}={json.dumps(plain(name, value))}" for name, value in options.items()]
         return evaluate_again(self.folder, plugins(), words)
 
-    def export(self, path: str | Path, seen: View | str | None = None) -> Path:
-        """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view.
+    def export(self, path: str | Path, seen: Camera | View | str | None = None) -> Path:
+        """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view, or by
+        that camera.
 
         Raises:
             InputError: the suffix is that of no format that is written, or there is no such view.
         """
         refuse_export(path := Path(path))
         view = view_named(self.run, seen) if isinstance(seen, str) else seen
-        export(self.run, path, view.camera if view else None)
+        export(self.run, path, None if view is None else camera_of(view))
         return path
+
+    def __repr__(self) -> str:
+        return f"<run of {self.step} steps in {self.folder}>"
 
 
 @dataclass(eq=False)
@@ -133,8 +137,24 @@ class SplatFile:
             over = torch.as_tensor(background, dtype=torch.float32).reshape(3)
         except (TypeError, ValueError, RuntimeError) as error:
             raise InputError(f"background is {background!r}: give three values, red, green and blue") from error
-        camera = seen.camera if isinstance(seen, View) else seen
-        return render_gaussians(self.gaussians, camera, self.raster, over)
+        if not bool(((over >= 0) & (over <= 1)).all()):  # nor is nan
+            raise InputError(f"background is {background!r}: give red, green and blue in [0, 1]")
+        return render_gaussians(self.gaussians, camera_of(seen), self.raster, over)
+
+    def __repr__(self) -> str:
+        return f"<{len(self.gaussians.means):,} splats of {self.path}>"
+
+
+def camera_of(seen: Camera | View) -> Camera:
+    """A camera, or that of a view.
+
+    Raises:
+        InputError: it is neither.
+    """
+    camera = seen.camera if isinstance(seen, View) else seen
+    if not isinstance(camera, Camera):
+        raise InputError(f"{seen!r} is no camera: give one, or a view of `run.scene`, or of a run the name of a view")
+    return camera
 
 
 def train(*given: str, **values: Any) -> TrainedRun:
@@ -148,6 +168,9 @@ def train(*given: str, **values: Any) -> TrainedRun:
         TrainingError: training went wrong; the run folder holds the last step.
         KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
     """
+    for word in given:
+        if not (isinstance(word, str) and is_override(word)):
+            raise ConfigError(f"gsx.train was given {word!r}: give settings, as 'scene=colmap' and 'scene.path=FOLDER'")
     words, folders = [*given, *overrides(values)], list[Path]()
     if is_table(words) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
@@ -157,14 +180,16 @@ def train(*given: str, **values: Any) -> TrainedRun:
 
 
 def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
-    """A run folder, or a splat file of any kind that is written; raster: what it is drawn by, if not as it says.
+    """A run folder, or a splat file of any kind that is written; raster: what that is drawn by, if not as it says.
 
     Raises:
-        InputError: it is neither, or damaged.
+        InputError: it is neither, or damaged; or `raster` is given for a run, which has its own.
         CheckpointError: the run has no usable checkpoint.
     """
-    path = Path(path)
+    path = at_home(path)
     if path.is_dir():
+        if raster is not None:
+            raise InputError(f"{path} is a run, drawn as it was trained: raster is for splat files")
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")

@@ -12,6 +12,11 @@ RESUME_FLAGS = ("--trust", "--changed")
 """Of gsx resume."""
 
 
+def is_override(word: str) -> bool:
+    """Whether a word is a flag or changes the configuration: a path that says so (./a=b/c) is none."""
+    return not word.startswith((".", "/", "~/")) and (word.startswith(("-", "+", "~")) or "=" in word)
+
+
 def run_arguments(verb: str, arguments: list[str], description: str, flags: str = "") -> tuple[Path, list[str]]:
     """The run folder and the overrides after it; `flags`: others that the verb has, for its help."""
     parser = Parser(prog=f"gsx {verb}", usage=f"%(prog)s RUN [KEY=VALUE ...]{flags}", description=description)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from gsx import __version__
-from gsx.cli.arguments import RESUME_FLAGS
+from gsx.cli.arguments import RESUME_FLAGS, is_override
 from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
@@ -109,11 +109,6 @@ def dispatch(arguments: list[str]) -> int:
         raise ConfigError(f"{problem}{nearest(arguments[0], VERBS)} See gsx --help")
     set_up_logging()
     return VERBS[arguments[0]](arguments[1:])
-
-
-def is_override(word: str) -> bool:
-    """Whether a word is a flag or changes the configuration: a path that says so (./a=b/c) is none."""
-    return not word.startswith((".", "/", "~/")) and (word.startswith(("-", "+", "~")) or "=" in word)
 
 
 VERBS: dict[str, Callable[[list[str]], int]] = {

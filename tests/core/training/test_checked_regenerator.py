@@ -210,3 +210,20 @@ def test_the_mean_of_samples_counts_and_is_projected_where_that_is_asked_for() -
     (moved,) = checked(uneven).redraw([asked], samples=2, project=True)
     assert moved.image is not None
     torch.testing.assert_close(box_average(moved.image, 2), asked.image)
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (lambda asked: [one.image for one in asked][1:], "was asked for 2 pictures and returned 1: it is to return"),
+        (lambda asked: None, "returned NoneType: it is to return a tensor"),
+        (lambda asked: [one.image.numpy() for one in asked], "returned ndarray among them: it is to return a tensor"),
+    ],
+)
+def test_what_is_no_picture_for_each_request_is_told_with_the_regenerator(
+    returned: Callable[[list[Request]], object], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = checked(lambda asked: asked.image)
+    monkeypatch.setattr(made.inner, "regenerate", returned)
+    with pytest.raises(TrainingError, match=rf"^Made\.regenerate .*{told}"):
+        made.redraw([request(texture(), 1)] * 2)

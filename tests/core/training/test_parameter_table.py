@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gsx.core.errors import CheckpointError
+from gsx.core.errors import CheckpointError, ConfigError
 from gsx.core.training.parameter_table import (
     Networks,
     ParameterTable,
@@ -314,6 +314,43 @@ def test_networks_are_moved_saved_and_restored_with_the_rows() -> None:
     assert {name: value.tolist() for name, value in table_tensors(again).items()} == {
         name: value.tolist() for name, value in table_tensors(table).items()
     }
+
+
+def test_what_networks_keep_beside_parameters_is_saved_and_restored() -> None:
+    def made() -> ParameterTable:
+        modules = nn.ModuleDict({"colour": nn.Sequential(nn.BatchNorm1d(2), nn.Linear(2, 3))})
+        return ParameterTable({"flat": Parameter(torch.ones(2))}, {}, {}, Networks(modules, modules["colour"]))
+
+    table, other = made(), made()
+    table.networks.modules["colour"](torch.tensor([[1.0, 5], [3, 9]]))
+    assert table.networks.modules["colour"][0].running_mean.tolist() == pytest.approx([0.2, 0.7])
+    found = table_tensors(restored_table(other, table_tensors(table)))
+    assert found["buffers.colour.0.running_mean"].tolist() == pytest.approx([0.2, 0.7])
+    assert found["buffers.colour.0.num_batches_tracked"] == 1
+    saved = {name: value for name, value in table_tensors(table).items() if not name.startswith("buffers.")}
+    with pytest.raises(CheckpointError, match="holds no buffers"):
+        restored_table(made(), saved)
+
+
+def test_a_parameter_that_no_rate_would_move_is_refused() -> None:
+    modules = nn.Module()
+    modules.colour, modules.tint = nn.Linear(2, 3), Parameter(torch.zeros(3))
+    for alone, told in ((modules, "^tint of"), (nn.Linear(2, 3), "^weight and bias of")):
+        with pytest.raises(ConfigError, match=f"{told} a backbone's networks would never learn"):
+            Networks(alone, alone)
+
+
+def test_what_is_recorded_later_comes_back() -> None:
+    def made() -> ParameterTable:
+        return ParameterTable(
+            {"flat": Parameter(torch.ones(2))}, record={"first": torch.tensor(2.0), "new": torch.ones(1)}
+        )
+
+    table = made()
+    table.record |= {"first": torch.tensor(3.0), "budget": torch.tensor([4, 5])}
+    del table.record["new"]  # of a later version, as far as the file knows
+    found = restored_table(made(), table_tensors(table)).record
+    assert {name: value.tolist() for name, value in found.items()} == {"first": 3, "budget": [4, 5], "new": [1]}
 
 
 def test_steps_are_shorter_by_the_pace_and_rates_stay() -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,12 +12,13 @@ from small_scene import small_scene, spread
 from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
+from gsx.core.data.camera import look_at
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.plateau import Plateau, PlateauOptions
-from gsx.core.training.pseudo_views import PseudoView, pseudo_loss
+from gsx.core.training.pseudo_views import PseudoView, kept_out, pseudo_loss
 from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
 from gsx.experiments.runs.build import build
@@ -231,6 +233,22 @@ def test_pseudo_details_do_not_show_the_windows(tmp_path: Path, seen: list[Pseud
         assert pseudo.coarse is None or not bool(inside.any())
         hidden[pseudo.provenance["scale"]] += int(inside.sum())
     assert min(hidden[1], hidden[2]) > 0
+
+
+@pytest.mark.parametrize(
+    ("provenance", "corrected", "hidden"),
+    [({}, False, 12), ({"kind": "base"}, True, 12), ({"source": "photo"}, True, 12), ({"kind": "random"}, True, 0)],
+)
+def test_where_a_pseudo_view_shows_a_window_is_told_by_what_it_was_made_from(
+    provenance: dict[str, str], corrected: bool, hidden: int
+) -> None:
+    camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=12, height=8)
+    now = replace(camera, translation=camera.translation + 0.01) if corrected else camera
+    target = torch.zeros(3, 8, 12, dtype=torch.uint8)
+    view = PseudoView(camera=camera, target=target, parent=0, provenance=provenance)
+    weight = kept_out(view, now, [Window(5, 2, 4, 3)]).pixel_weight
+    assert (0 if weight is None else int((weight[2:5, 5:9] == 0).sum())) == hidden
+    assert weight is None or int((weight == 255).sum()) == 12 * 8 - hidden
 
 
 def windows_by_parent(windows: list[tuple[View, Window]], run: Run) -> dict[int, tuple[View, Window]]:

@@ -20,6 +20,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.render import render
 from gsx.experiments.runs import bake as baking
+from gsx.experiments.runs import export as exporting
 from gsx.experiments.runs.bake import Sums, bake
 from gsx.experiments.runs.open import open_run
 
@@ -80,6 +81,21 @@ def test_a_baked_model_looks_like_the_model(scaffold: Path) -> None:
     for view in run.scene.test:
         baked = render(run, view.camera, splats=splats_of(gaussians, view.camera.centre)).image
         assert psnr(baked, render(run, view.camera).image) > 30
+
+
+def test_a_model_without_splats_for_all_views_is_baked_for_its_file(
+    scaffold: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a plugin's may be, whose published files hold no more than others."""
+    run, _ = open_run(scaffold, plugins())
+    monkeypatch.setattr(exporting, "own_columns", lambda run: None)
+    written = exporting.export(run, tmp_path / "x.ply")
+    assert written is not None
+    assert written.baked
+    assert torch.equal(read_gaussians(tmp_path / "x.ply").means, bake(run).means)
+    monkeypatch.setattr(exporting, "Bakeable", type(None))
+    with pytest.raises(InputError, match="--view"):
+        exporting.export(run, tmp_path / "y.ply")
 
 
 def test_compact_formats_and_pages_of_it_are_baked_and_their_loss_is_told(

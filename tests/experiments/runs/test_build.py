@@ -3,12 +3,40 @@
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gsx.core.cache import MANIFEST, trim
-from gsx.experiments.runs.build import keep_compiled_code
+from gsx.experiments.runs.build import keep_compiled_code, plan_of
+from gsx.experiments.runs.environment import in_words
+
+
+@dataclass
+class Telling:
+    """A backbone with a schedule."""
+
+    told: dict[str, Any]
+
+    def plan(self) -> dict[str, Any]:
+        return self.told
+
+
+@pytest.mark.parametrize(
+    "told", [{"grows every": 4, "until": [1.5, 20]}, {"mine": {"grows every": 4, "until": [1.5, 20]}}]
+)
+def test_a_plan_may_have_parts_or_none(told: dict[str, Any]) -> None:
+    plateau = SimpleNamespace(plan=dict)
+    run: Any = SimpleNamespace(
+        config={"backbone": {"name": "mine"}}, backbone=Telling(told), plateau=plateau, augmenters=[]
+    )
+    assert plan_of(run) == {"mine": {"grows every": 4, "until": [1.5, 20]}}
+    assert [in_words(value) for value in (4, 0.25, [1.5, 20], [], True, "soon", None)] == [
+        *("4", "0.25", "1.5 20", "none", "1", "soon", "None")
+    ]
 
 
 def test_compiled_code_is_kept_in_an_entry_of_the_cache_or_where_torch_keeps_it(

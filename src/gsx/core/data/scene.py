@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
+from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float, UInt8
 
 
@@ -66,7 +67,21 @@ class View:
 
     def image(self) -> Float[Tensor, "3 H W"]:
         """The truth at the camera's resolution, display values in [0, 1]."""
-        return self.source.image(self.camera).float() / 255.0
+        return self.picture().float() / 255.0
+
+    def picture(self) -> UInt8[Tensor, "3 H W"]:
+        """The truth at the camera's resolution, display values.
+
+        Raises:
+            InputError: the source gives another picture than its camera takes.
+        """
+        found, (width, height) = self.source.image(self.camera), self.camera.size
+        if found.dtype != torch.uint8 or found.shape != (3, height, width):
+            raise InputError(
+                f"the picture of view '{self.name}' is {found.dtype} {list(found.shape)}, and its camera takes "
+                f"torch.uint8 {[3, height, width]}: its source is to return that"
+            )
+        return found
 
     def counted(self) -> Bool[Tensor, "H W"] | None:
         """Which pixels count in losses and figures; None: all. The others show what is not part of the scene."""

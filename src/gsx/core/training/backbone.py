@@ -154,7 +154,8 @@ class Planned(Protocol):
     """A backbone with a schedule to tell."""
 
     def plan(self) -> dict[str, Any]:
-        """The rescaled schedule in absolute steps, for the log and the report."""
+        """The rescaled schedule in absolute steps, for the log and the report: numbers or lists of them by name, or
+        several such parts by theirs."""
         ...
 
 

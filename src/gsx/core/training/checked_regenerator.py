@@ -205,13 +205,32 @@ class CheckedRegenerator:
         `samples`: of each the mean of so many results counts. `project`: enlarged pictures are moved to the nearest
         one that reduces to the request's.
         """
-        results = [self.inner.regenerate([replace(one, seed=one.seed + n) for one in requests]) for n in range(samples)]
+        results = [self.results([replace(one, seed=one.seed + n) for one in requests]) for n in range(samples)]
         drawn = []
         for request, *of_one in zip(requests, *results, strict=True):
             mean = torch.stack([result.detach().cpu().float() for result in of_one]).mean(0)
             drawn.append(self.checked(request, mean, project))
         self.tally.pending += [replace(one, image=None) for one in drawn]
         return drawn
+
+    def results(self, requests: Sequence[Request]) -> list[Tensor]:
+        """What the regenerator makes of requests.
+
+        Raises:
+            TrainingError: it is not a picture for each.
+        """
+        found: Any = self.inner.regenerate(requests)
+        told = f"{type(self.inner).__name__}.regenerate was asked for {len(requests)} pictures and returned"
+        remedy = "it is to return a tensor [3, h, w] for each, in order"
+        try:
+            pictures = list(found)
+        except TypeError as error:
+            raise TrainingError(f"{told} {type(found).__name__}: {remedy}") from error
+        if other := [type(one).__name__ for one in pictures if not isinstance(one, Tensor)]:
+            raise TrainingError(f"{told} {other[0]} among them: {remedy}")
+        if len(pictures) != len(requests):
+            raise TrainingError(f"{told} {len(pictures)}: {remedy}")
+        return pictures
 
     def checked(self, request: Request, result: Tensor, project: bool) -> Redrawn:
         """The result, put right, if it may be used."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gsx.core.errors import CheckpointError
+from gsx.core.errors import CheckpointError, ConfigError
 from gsx.core.shapes import Bool
 
 ADAM_EPSILON = 1e-15
@@ -38,8 +38,13 @@ class Networks:
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
-        parts = self.modules.named_children()
-        groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in parts]
+        parts = dict(self.modules.named_children())
+        if outside := [name for name, _ in self.modules.named_parameters() if name.partition(".")[0] not in parts]:
+            raise ConfigError(
+                f"{' and '.join(outside)} of a backbone's networks would never learn: each child of `modules` has a "
+                "learning rate, so put parameters into one, for example nn.ModuleDict({'colour': network})"
+            )
+        groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in parts.items()]
         self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
 
     def names(self) -> list[str]:
@@ -54,6 +59,12 @@ class Networks:
         """Parameters by the names that they are saved under."""
         return ((f"heads.{name}", parameter) for name, parameter in self.modules.named_parameters())
 
+    def buffers(self) -> Iterator[tuple[str, Tensor]]:
+        """What networks keep beside parameters (means of a batch norm ...), by the names that it is saved under."""
+        learnt = dict(self.modules.named_parameters())
+        state = self.modules.state_dict(keep_vars=True)
+        return ((f"buffers.{name}", value) for name, value in state.items() if name not in learnt)
+
 
 @dataclass(eq=False)
 class ParameterTable:
@@ -66,7 +77,7 @@ class ParameterTable:
     """Values with N rows that density control gathers; new rows begin with 0."""
     networks: Networks | None = None
     record: dict[str, Tensor] = field(default_factory=dict)
-    """What density control has found and decided so far, without rows."""
+    """What density control has found and decided so far, without rows; entries may be added at any step."""
     pace: float = 1.0
     """All learning rates are multiplied by it (`training.cooldown`)."""
     optimiser: torch.optim.Adam = field(init=False)
@@ -231,11 +242,15 @@ def size_of(table: ParameterTable) -> tuple[int, int]:
 # -- checkpoints -------------------------------------------------------------------------------------------------------
 
 
+RECORD = "record."
+"""Before the names that entries of a record are saved under."""
+
+
 def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     """Everything of a table, by the names it is saved under."""
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
-    out |= {f"record.{name}": found for name, found in table.record.items()}
+    out |= {f"{RECORD}{name}": found for name, found in table.record.items()}
     for name, parameter in table.parameters.items():
         out[f"parameters.{name}"] = parameter.detach()
         out |= adam_tensors(name, parameter, table.optimiser)
@@ -243,11 +258,13 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
         for name, parameter in networks.named():
             out[name] = parameter.detach()
             out |= adam_tensors(name, parameter, networks.optimiser)
+        out |= {name: buffer.detach() for name, buffer in networks.buffers()}
     return out
 
 
 def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
     """The table that `table_tensors` saw, whatever its number of rows, with all that `like` has and its learning rates.
+    Of the record all that was saved comes back, whether `like` has it by now or not.
 
     Raises:
         CheckpointError: something of it was not saved: the run had other options.
@@ -258,7 +275,8 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     device = next(iter(like.parameters.values())).device
     rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
-    record = {name: tensors.get(f"record.{name}", found).to(found) for name, found in like.record.items()}
+    written = {name[len(RECORD) :]: value.to(device) for name, value in tensors.items() if name.startswith(RECORD)}
+    record = written | {name: written.get(name, found).to(found) for name, found in like.record.items()}
     table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks, record)
     for name, parameter in table.parameters.items():
         table.set_rate(name, like.group(name)["lr"])
@@ -267,6 +285,8 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
         for name, parameter in networks.named():
             parameter.data.copy_(saved(name, parameter.shape, tensors))
             restore_adam(name, parameter, networks.optimiser, tensors, device)
+        for name, buffer in networks.buffers():
+            buffer.copy_(saved(name, buffer.shape, tensors))
     return table
 
 

@@ -68,7 +68,7 @@ class Photographs:
         """The photograph, on the device."""
         picture = self.kept.get(view)
         if picture is None:
-            picture = uploaded(view.source.image(view.camera), self.device)
+            picture = uploaded(view.picture(), self.device)
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
         return picture

@@ -69,10 +69,12 @@ def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool =
 
 
 def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> PseudoView:
-    """A pseudo view without what it shows of windows of a training camera, where it stands at that or was made from its
-    photograph: what counts in no loss must not come back as a pseudo detail. A pixel that shows a part of a window does
-    not count; nor does what is known of a view at a lower resolution, if it shows any."""
-    if not (view.provenance.get("source") == "photo" or view.camera.has_pose_of(camera)):
+    """A pseudo view without what it shows of windows of a training camera, where it stands at that (or did, before its
+    pose was corrected) or was made from its photograph: what counts in no loss must not come back as a pseudo detail.
+    A pixel that shows a part of a window does not count; nor does what is known of a view at a lower resolution, if it
+    shows any."""
+    made = view.provenance
+    if not (made.get("source") == "photo" or made.get("kind") == "base" or view.camera.has_pose_of(camera)):
         return view
     seen = [window.seen_by(view.camera, camera) for window in windows]
     seen = [part for part in seen if part.width and part.height]

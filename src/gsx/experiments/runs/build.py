@@ -4,6 +4,7 @@ import logging
 import os
 import platform
 import weakref
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -279,4 +280,6 @@ def plan_of(run: Run) -> dict[str, Any]:
     """The rescaled schedules of the backbone, of the loop and of the augmenters."""
     names = run.config.get("augmenter") or {}
     own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
+    if not all(isinstance(part, Mapping) for part in own.values()):
+        own = {run.config["backbone"]["name"]: own}
     return own | run.plateau.plan() | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}

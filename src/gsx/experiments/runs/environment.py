@@ -97,6 +97,8 @@ def announce(run: Run, plugins: Plugins) -> None:
     )
 
 
-def in_words(value: float | list[float]) -> str:
-    """A number of the plan, or several."""
-    return " ".join(f"{v:.6g}" for v in value) or "none" if isinstance(value, list) else f"{value:.6g}"
+def in_words(value: object) -> str:
+    """A number of the plan, or several, or whatever else a plugin tells."""
+    if isinstance(value, list | tuple):
+        return " ".join(map(in_words, value)) or "none"
+    return f"{value:.6g}" if isinstance(value, int | float) else str(value)

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import View
+from gsx.core.errors import GsxError
 from gsx.core.gaussians.arrays import arrays_of, gaussians_from
 from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.core.gaussians.ply import write_whole
@@ -21,7 +22,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import WithOwnFile
+from gsx.core.training.backbone import Bakeable, WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
@@ -59,8 +60,9 @@ def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub"
     if columns is not None and suffix_of(path) == STANDARD and not zoom:
         write_columns(path, columns, notes(run))
         return None
-    baked = columns is not None or zoom > 0
-    gaussians = bake(run, zoom or 1.0) if baked else run.backbone.explicit(camera, run.model_step)
+    explicit = None if columns is not None or zoom > 0 else explicit_of(run, camera)
+    baked = explicit is None
+    gaussians = bake(run, zoom or 1.0) if explicit is None else explicit
     gaussians = Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
     comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
     if baked:
@@ -70,6 +72,20 @@ def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub"
     else:
         write_gaussians(path, gaussians, comments, run.raster.compensate, axes)
     return Exported(gaussians=gaussians, baked=baked)
+
+
+def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
+    """The splats that a backbone has as they are; None: none that hold for all cameras, but some can be baked.
+
+    Raises:
+        GsxError: neither.
+    """
+    try:
+        return run.backbone.explicit(camera, run.model_step)
+    except GsxError:
+        if camera is None and isinstance(run.backbone, Bakeable):
+            return None
+        raise
 
 
 def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:

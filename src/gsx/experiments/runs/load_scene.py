@@ -3,10 +3,11 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from gsx.core.data.camera import offsets_from
+from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.disturbed import Disturbable, disturbed
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
@@ -24,10 +25,11 @@ def load_scene(settings: Settings) -> Scene:
     """The scene, with views to evaluate on.
 
     Raises:
-        InputError: it cannot be loaded, the split leaves no test views, or cameras and points are all in one place.
+        InputError: it cannot be loaded, its loader made no scene of it, the split leaves no test views, or cameras and
+            points are all in one place.
     """
     options = settings.scene.options
-    loaded = settings.scene.component.factory(options)
+    loaded = checked(settings.scene.component.factory(options), settings.scene.component.name)
     loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
     scene = warned_of_units(measured(in_units(loaded, options.unit if isinstance(options, InUnits) else 1.0)))
     if not scene.test:
@@ -40,6 +42,40 @@ def load_scene(settings: Settings) -> Scene:
     if isinstance(options, Fillable):
         scene = with_more_points(scene, options.fill, settings.general.seed)
     return disturbed(scene, options.disturb) if isinstance(options, Disturbable) else scene
+
+
+def checked(scene: Any, loader: str) -> Scene:
+    """What a loader, maybe a plugin's, has returned.
+
+    Raises:
+        InputError: it is no scene that can be trained on and judged.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"scene={loader} returned {type(scene).__name__}: a loader returns a gsx.core.data.scene.Scene"
+        )
+    named, told = {view.name: view.camera for view in scene.train}, f"scene={loader} returned a scene"
+    odd = [view.name for view in [*scene.train, *scene.test] if not finite(view.camera)]
+    both = [view.name for view in scene.test if view.name in named and view.camera.has_pose_of(named[view.name])]
+    if not scene.train:
+        raise InputError(f"{told} without training views: check the folder, or scene.split")
+    if odd:
+        raise InputError(
+            f"{told} whose camera of '{odd[0]}' holds a value that is not finite: correct it, or leave it out"
+        )
+    if both:
+        raise InputError(f"{told} with '{both[0]}' to train on and to test on: a view is one or the other")
+    if not bool(torch.isfinite(scene.points.positions).all()):
+        raise InputError(f"{told} with points that are not finite: leave them out")
+    if scene.background.shape != (3,) or not bool(((scene.background >= 0) & (scene.background <= 1)).all()):
+        raise InputError(f"{told} whose background is {scene.background.tolist()}: give red, green and blue in [0, 1]")
+    return scene
+
+
+def finite(camera: Camera) -> bool:
+    """Whether all numbers of a camera are."""
+    numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    return all(bool(torch.isfinite(values).all()) for values in (numbers, camera.rotation, camera.translation))
 
 
 def count_notes(settings: Settings) -> list[str]:
