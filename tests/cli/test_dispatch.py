@@ -530,7 +530,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "training from a run": (lambda t: [str(run_of_old(t / "my run"))], "/my run', gsx eval '"),
     "a home in the folder": (
-        lambda t: [*OVERRIDES, "iterations=1", "folder=~/x"],
+        lambda t: [*OVERRIDES, "iterations=1", "folder='~/x'"],
         f"folder is '~/x', which would be below this folder: give folder={Path.home() / 'x'}",
     ),
     "trade with a place of its own": (
