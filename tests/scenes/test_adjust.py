@@ -1,6 +1,7 @@
 """Bundle adjustment of what a COLMAP model says: against the poses and lenses that its observations were made with."""
 
 import math
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,16 @@ def test_it_is_done_once_and_found_again(tmp_path: Path, cache: Path, monkeypatc
     monkeypatch.setattr(adjust, "bundle_adjusted", None)
     again = load(colmap_options(tmp_path, adjust="always"))
     assert all(one.camera.draws_as(other.camera) for one, other in zip(first.train, again.train, strict=True))
+
+
+def test_other_poses_are_adjusted_anew(tmp_path: Path, cache: Path) -> None:
+    """Of which COLMAP 4 keeps some in files of their own."""
+    write_scene(turned(synthesize(), 2.0), tmp_path)
+    load(colmap_options(tmp_path, adjust="always"))
+    (frames,) = (tmp_path / "sparse").rglob("frames.bin")
+    os.utime(frames, ns=(1, 1))
+    load(colmap_options(tmp_path, adjust="always"))
+    assert len(list((cache / "adjusted").glob("*/"))) == 2
 
 
 def test_the_remedy_is_named_where_cameras_do_not_fit(tmp_path: Path) -> None:

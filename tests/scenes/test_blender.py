@@ -384,3 +384,10 @@ def test_a_camera_that_is_nowhere_near_is_refused(folder: Path) -> None:
     write(folder, "train", [FRONT, [[0, 0, 1, 1e300], *SIDE[1:]]])
     with pytest.raises(InputError, match=r"r_1\.png' is more than 1e\+09 units away"):
         load(options(folder))
+
+
+def test_a_lens_that_is_left_out_is_told(folder: Path) -> None:
+    assert not any("states" in note for note in load(options(folder)).notes)
+    write(folder, "train", [FRONT, SIDE], fl_x=100.0, k1=-0.2, cx=0)
+    (note,) = (note for note in load(options(folder)).notes if "states" in note)
+    assert note.startswith("transforms_train.json states fl_x, k1, which the format's published readers leave out")

@@ -475,6 +475,33 @@ def test_dots_on_a_straight_grid_are_straight_after_undistortion(model: str) -> 
     assert (found - expected).norm(dim=1).max() < 0.05
 
 
+def test_names_that_a_text_model_cuts_are_explained(tmp_path: Path) -> None:
+    reconstruction = synthesize(frames=3)
+    for image in reconstruction.images.values():
+        image.name = f"my {Path(image.name).name}"
+    write_scene(reconstruction, tmp_path)
+    folder = tmp_path / "sparse" / "0"
+    for file in folder.iterdir():
+        file.unlink()
+    reconstruction.write_text(folder)
+    with pytest.raises(InputError, match=r"as far as their first space: write it as \.bin"):
+        load(colmap_options(tmp_path))
+
+
+def test_the_colour_of_what_is_transparent_is_interpolated_nowhere() -> None:
+    """A cut-out disc, the same over black and over white where nothing is opaque."""
+    bent = pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=48, params=[60.0, 32.0, 24.0, -0.1])
+    down, across = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
+    alpha = ((across - 32) ** 2 + (down - 24) ** 2 < 200).to(torch.uint8) * 255
+    found = []
+    for hidden in (0, 255):
+        colours = torch.where(alpha > 0, torch.tensor([220, 90, 30], dtype=torch.uint8)[:, None, None], hidden)
+        found.append(undistort(torch.cat([colours.to(torch.uint8), alpha[None]]), bent, pinhole_of(bent), (64, 48)))
+    assert torch.equal(found[0], found[1])
+    assert set(found[0][0][found[0][3] > 60].tolist()) == {220}
+    assert int(((found[0][3] > 60) & (found[0][3] < 200)).sum()) > 0
+
+
 def test_undistortion_agrees_with_colmaps_own(tmp_path: Path) -> None:
     camera = lens("OPENCV")
     y, x = torch.meshgrid(torch.arange(300) + 0.5, torch.arange(400) + 0.5, indexing="ij")

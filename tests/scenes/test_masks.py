@@ -7,12 +7,18 @@ import pytest
 import torch
 
 import gsx
-from gsx.core.data.images import read_image, write_image
+from gsx.core.data.camera import look_at
+from gsx.core.data.coarser import coarser
+from gsx.core.data.images import ImageCache, read_image, write_image
 from gsx.core.data.masks import Mask, blacked
+from gsx.core.data.photo_source import PhotoSource
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.resize import ResizeRule
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.quality.losses import ssim_map
 from gsx.core.quality.metrics import psnr, ssim
-from gsx.scenes.masked import candidates
+from gsx.scenes.masked import candidates, masks_named
 from tests.synthetic_colmap import synthesize, write_scene
 
 NOISE = torch.Generator().manual_seed(3)
@@ -59,6 +65,57 @@ def test_no_masked_pixel_reaches_a_counted_one_through_any_filter(tmp_path):
             same = (resize(one, width, height, filter) == resize(other, width, height, filter)).all(0)
             assert bool(same[counted].all()), (filter, width)
             assert 0 < counted.float().mean() < 1
+
+
+@pytest.mark.parametrize("filter", ["area", "bicubic", "lanczos"])
+def test_no_masked_pixel_reaches_a_counted_one_of_a_coarse_view(filter):
+    """Two photographs that differ where they are masked alone."""
+    generator = torch.Generator().manual_seed(0)
+    excluded = torch.rand(128, 160, generator=generator) < 0.001
+    one = torch.randint(0, 256, (3, 128, 160), generator=generator, dtype=torch.uint8)
+
+    class Photo:
+        def __init__(self, picture):
+            self.picture = picture
+
+        def image(self, camera):
+            return self.picture
+
+        def counted(self, camera):
+            return ~excluded
+
+        def max_zoom(self, camera):
+            return 1.0
+
+    camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=160, height=128)
+    for times in (2, 4):
+        views = [
+            coarser(View("a", camera, Photo(picture)), Reduction(filter=filter), times)
+            for picture in (one, torch.where(excluded, 255 - one, one))
+        ]
+        counted = views[0].counted()
+        assert 0.1 < float(counted.float().mean()) < 1
+        assert bool(((views[0].image() == views[1].image()).all(0))[counted].all()), times
+
+
+def test_other_masks_are_another_protocol(tmp_path):
+    def named(places):
+        views = []
+        for number in range(2):
+            photo = tmp_path / f"{number}.png"
+            write_image(photo, torch.zeros(3, 8, 8))
+            mask = Mask(path=stored_mask(tmp_path / f"{number}_mask.png", places))
+            camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=8, height=8)
+            rule = ResizeRule(filter="area", light="display", background=(0, 0, 0))
+            source = PhotoSource(path=photo, whole=camera, rule=rule, cache=ImageCache(10**6), mask=mask)
+            views.append(View(str(number), camera, source))
+        return masks_named(views)
+
+    first, again, other = named([(0, 1)]), named([(0, 1)]), named([(0, 2)])
+    assert first == again
+    assert (first["masks"], other["masks"]) == (2, 2)
+    assert first["masks_content"] != other["masks_content"]
+    assert masks_named([]) == {}
 
 
 def test_alpha_counts_where_opaque(tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pycolmap
 import pytest
 import torch
@@ -156,6 +157,54 @@ def test_hidden_files_are_no_photos(tmp_path: Path) -> None:
     for name in ("a.jpg", "b.jpg", "._a.jpg"):  # the last kind is what macOS leaves on foreign disks
         (tmp_path / name).touch()
     assert find_photos(tmp_path)[1] == ["a.jpg", "b.jpg"]
+    for place in ("cam", ".thumbs", "cam/@eaDir/a.jpg", "__MACOSX"):
+        (tmp_path / "deep" / place).mkdir(parents=True)
+        for name in ("a.jpg", "b.jpg"):
+            (tmp_path / "deep" / place / name).touch()
+    assert find_photos(tmp_path / "deep")[1] == ["cam/a.jpg", "cam/b.jpg"]
+
+
+def test_photos_that_are_passed_over_are_told(tmp_path: Path) -> None:
+    for place in ("", "images", "masks"):
+        (tmp_path / place).mkdir(exist_ok=True)
+        for name in ("a.jpg", "b.jpg"):
+            (tmp_path / place / name).touch()
+    (note,) = photos.passed_over(tmp_path, *find_photos(tmp_path))
+    assert note == (
+        f"2 photos in images are not used, as there are some in {tmp_path}: set scene.path to the folder that is meant."
+    )
+    (tmp_path / "a.jpg").unlink()
+    (tmp_path / "b.jpg").unlink()
+    assert photos.passed_over(tmp_path, *find_photos(tmp_path)) == []
+
+
+def test_photos_share_a_camera_by_size_and_by_lens(tmp_path: Path) -> None:
+    """As a phone's lenses, which take pictures of one size."""
+    exif = {"wide": 24.0, "wide2": 24.0, "long": 48.0, "plain": None, "small": 24.0}
+    for name, focal in exif.items():
+        height, width = (30, 40) if name == "small" else (60, 80)
+        spec = oiio.ImageSpec(width, height, 3, "uint8")
+        if focal:
+            spec.attribute("Make", "Maker")
+            spec.attribute("Model", "Phone")
+            spec.attribute("Exif:FocalLengthIn35mmFilm", int(focal))
+        output = oiio.ImageOutput.create("a.jpg")
+        assert output.open(str(tmp_path / f"{name}.jpg"), spec)
+        output.write_image(np.zeros((height, width, 3), np.uint8))
+        output.close()
+    sizes = {f"{name}.jpg": image_size(tmp_path / f"{name}.jpg") for name in exif}
+    for mode, groups in (
+        ("auto", [["small.jpg"], ["plain.jpg"], ["wide.jpg", "wide2.jpg"], ["long.jpg"]]),
+        ("per_image", [[name] for name in sorted(sizes)]),
+    ):
+        database = tmp_path / f"{mode}.db"
+        sfm.import_photos(database, tmp_path, sizes, options(tmp_path, camera_mode=mode))
+        with pycolmap.Database.open(database) as opened:
+            cameras = {image.name: image.camera_id for image in opened.read_all_images()}
+        assert len(set(cameras.values())) == len(groups)
+        assert all(len({cameras[name] for name in group}) == 1 for group in groups)
+    with pytest.raises(InputError, match=r"of several sizes, 40x30 \(small.jpg\), 80x60 \(long.jpg\)"):
+        sfm.import_photos(tmp_path / "one.db", tmp_path, sizes, options(tmp_path, camera_mode="single"))
 
 
 @pytest.mark.parametrize(

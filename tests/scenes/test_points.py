@@ -48,8 +48,8 @@ def test_points_of_a_file(tmp_path: Path) -> None:
     assert cloud.colours.tolist() == [[0, 1, 2], [255, 254, 253]]
     write_ply(tmp_path / "b.ply", columns)
     assert read_points(tmp_path / "b.ply").colours.unique().tolist() == [127]
-    write_ply(tmp_path / "c.ply", columns | {name: np.full(3, 0.5) for name in colours})  # not of 8 bits
-    assert read_points(tmp_path / "c.ply").colours.unique().tolist() == [127]
+    write_ply(tmp_path / "c.ply", columns | {name: np.full(3, 0.5) for name in colours})
+    assert read_points(tmp_path / "c.ply").colours.unique().tolist() == [128]
 
 
 def test_files_without_usable_points_are_refused(tmp_path: Path) -> None:
@@ -59,3 +59,20 @@ def test_files_without_usable_points_are_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "b.ply", {axis: np.full(2, np.inf) for axis in "xyz"})
     with pytest.raises(InputError, match="no point with finite coordinates"):
         read_points(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (np.array([0.0, 0.5, 1.0], np.float32), [0, 128, 255]),
+        (np.array([0, 32768, 65535], np.uint16), [0, 128, 255]),
+        (np.array([0, 7, 255], np.uint8), [0, 7, 255]),
+        (np.array([0.0, 128.0, 255.0], np.float32), [127, 127, 127]),
+        (np.array([0, 128, 255], np.int32), [127, 127, 127]),
+    ],
+    ids=["float", "16 bits", "8 bits", "float beyond 1", "int"],
+)
+def test_colours_may_be_of_several_kinds(given: np.ndarray, found: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = dict.fromkeys("xyz", np.zeros(3, np.float32)) | dict.fromkeys(("red", "green", "blue"), given)
+    monkeypatch.setattr("gsx.scenes.points.read_ply", lambda path: columns)
+    assert read_points(Path("a.ply")).colours.tolist() == [[value] * 3 for value in found]

@@ -23,7 +23,7 @@ from torch import Tensor
 from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
-from gsx.scenes.colmap_model import Model, ModelImage, model_files, read_model
+from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model
 from gsx.scenes.kept_models import kept_model
 from gsx.scenes.sfm import quiet
 from gsx.scenes.undistort import pinhole_of, undistort_points
@@ -52,7 +52,7 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
     before = shift_of(model)
     if when == "auto" and not (before is not None and before > SHIFT):
         return model, [f"Nothing is adjusted: {fit_told(before)} (scene.adjust=auto)."]
-    stamps = [file_stamp(file) for file in model_files(model.folder).values()]
+    stamps = [file_stamp(file) for file in present_files(model.folder)]
     key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
     after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [

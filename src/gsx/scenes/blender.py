@@ -151,6 +151,10 @@ def _scales_named(options: BlenderOptions) -> dict[str, Any]:
     return {} if scales == {"scales": [1], "test_scales": [1]} else scales
 
 
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+"""Keys of nerfstudio's transforms for what a lens does."""
+
+
 def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
     """The shots of one transforms file, in its order, and a note where photos are missing.
 
@@ -165,6 +169,12 @@ def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
             "with fl_x use scene=transforms."
         )
     present, notes = present_frames(file.parent, frames, file, missing)
+    if stated := sorted({key for node in (content, *frames) for key in LENS if node.get(key)}):
+        notes.append(
+            f"{file.name} states {', '.join(stated)}, which the format's published readers leave out, and so does "
+            "scene=blender: pictures are taken for those of camera_angle_x, with nothing bent. With one "
+            "transforms.json, scene=transforms reads them."
+        )
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes
 
 

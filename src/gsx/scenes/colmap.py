@@ -109,9 +109,12 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     """
     present = [image for image in model.images if is_file(photos / image.name)]
     if not present and model.images:
+        remedy = "set scene.images to the folder that holds them"
+        if (model.folder / "images.txt").is_file() and not (model.folder / "images.bin").is_file():
+            remedy += "; of a model as text pycolmap reads names as far as their first space: write it as .bin"
         raise InputError(
             f"None of the {len(model.images)} images of {model.folder} is in {photos} (looked for "
-            f"{named([image.name for image in model.images])}): set scene.images to the folder that holds them."
+            f"{named([image.name for image in model.images])}): {remedy}."
         )
     if len(present) < MIN_IMAGES:
         raise InputError(

@@ -252,12 +252,14 @@ def _reconstruction(folder: Path) -> Any:
         return pycolmap.Reconstruction(folder)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
         raise InputError(
-            f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in _present(folder))}): "
+            f"pycolmap cannot read the COLMAP model {folder} "
+            f"({', '.join(file.name for file in present_files(folder))}): "
             f"{str(problem).strip()}; copy or make the model again."
         ) from None
 
 
-def _present(folder: Path) -> Iterator[Path]:
+def present_files(folder: Path) -> Iterator[Path]:
+    """Files of a model that are there; by COLMAP 4 its poses are in `frames` and `rigs`."""
     names = (*REQUIRED, "rigs", "frames")
     return (file for name in names if (file := folder / f"{name}{_suffix(folder)}").is_file())
 

@@ -1,5 +1,6 @@
 """Masks of photographs: where loaders look for them, and which photographs have one."""
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -94,4 +95,14 @@ def masked(views: Sequence[View]) -> int:
 def masks_named(views: Sequence[View]) -> Mapping[str, Any]:
     """For the provenance; nothing without masks, so that such a protocol keeps its hash."""
     found = masked(views)
-    return {"masks": found} if found else {}
+    return {"masks": found, "masks_content": content_of_masks(views)} if found else {}
+
+
+def content_of_masks(views: Sequence[View]) -> str:
+    """A digest of the files of masks, view by view; those that are the alpha of photographs are these' own."""
+    digest = hashlib.sha256()
+    for view in views:
+        if isinstance(view.source, PhotoSource) and (mask := view.source.mask) is not None:
+            digest.update(repr((view.name, mask.alpha)).encode())
+            digest.update(b"" if mask.alpha else mask.path.read_bytes())
+    return digest.hexdigest()[:16]

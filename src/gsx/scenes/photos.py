@@ -29,7 +29,7 @@ HEIC = (".heic", ".heif")
 MATCHERS = ("auto", "exhaustive", "sequential")
 CAMERA_MODES = ("auto", "single", "per_image")
 MIN_PHOTOS = 2
-METHOD = "sfm/1"  # part of the cache key: raise the number when the reconstruction changes
+METHOD = "sfm/2"  # part of the cache key: raise the number when the reconstruction changes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,7 @@ def load(options: PhotosOptions) -> Scene:
     refuse_unknown(options)
     folder, photos = find_photos(Path(options.path).expanduser())
     sizes, notes = readable_sizes(folder, photos)
+    notes += passed_over(Path(options.path).expanduser(), folder, photos)
     refuse_partial(
         sorted({*photos} - sizes.keys()), len(photos), folder, options.missing, "cannot be read", "export them again"
     )
@@ -92,10 +93,25 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     return folder, names
 
 
+def passed_over(path: Path, folder: Path, photos: Sequence[str]) -> list[str]:
+    """A note where a folder holds more photos than those that are taken, which lie at its top."""
+    taken = {(folder / name).resolve() for name in photos}
+    others = [name for name in photos_in(path, "**/*") if (path / name).resolve() not in taken]
+    places = sorted({str(Path(name).parent) for name in others})
+    used = f"{len(others)} photos in {', '.join(places[:3])}{' ...' if len(places) > 3 else ''} are not used"
+    return [f"{used}, as there are some in {folder}: set scene.path to the folder that is meant."] if others else []
+
+
 def photos_in(folder: Path, pattern: str) -> list[str]:
-    """Sorted names of photos below `folder` that match `pattern`; hidden files and masks do not count."""
+    """Sorted names of photos below `folder` that match `pattern`; masks do not count, nor what is hidden or beside
+    photos by another program."""
     files = (file.relative_to(folder) for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted(file.as_posix() for file in files if not file.name.startswith(".") and file.parts[0] != FOLDER)
+    return sorted(file.as_posix() for file in files if file.parts[0] != FOLDER and not any(map(aside, file.parts)))
+
+
+def aside(name: str) -> bool:
+    """Whether a file or folder is none of a user's own: hidden, or thumbnails and attributes of a NAS or of macOS."""
+    return name.startswith(".") or name in ("@eaDir", "__MACOSX")
 
 
 def heic_in(folder: Path) -> int:

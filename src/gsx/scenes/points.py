@@ -1,5 +1,6 @@
 """Initial points of scenes that no reconstruction comes with: from a PLY file, or random (3D-GS)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.ply import read_ply
-from gsx.core.shapes import Float
+from gsx.core.shapes import Float, UInt8
 
 GREY = 127  # colour of points without one: the published random clouds store this byte
 
@@ -36,7 +37,8 @@ def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Points of a PLY file: x, y, z and, where present, 8-bit red, green, blue; those not finite are left out.
+    """Points of a PLY file: x, y, z and, where present, red, green, blue, of 8 or 16 bits or in [0, 1]; those that are
+    not finite are left out.
 
     Raises:
         InputError: the file cannot be read, has no coordinates, or holds no finite point.
@@ -48,8 +50,18 @@ def read_points(path: Path) -> PointCloud:
     finite = positions.isfinite().all(dim=1)
     if not finite.any():
         raise InputError(f"'{path}' holds no point with finite coordinates, give another or scene.points=random.")
-    names = ("red", "green", "blue")
-    if any(name not in columns or columns[name].dtype != np.uint8 for name in names):
-        return grey_points(positions[finite])
-    colours = torch.from_numpy(np.stack([columns[name] for name in names], axis=1))
-    return PointCloud(positions[finite], colours[finite])
+    colours = colours_in(columns)
+    return grey_points(positions[finite]) if colours is None else PointCloud(positions[finite], colours[finite])
+
+
+def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None:
+    """Display RGB of points by the columns of their file; None: they have none, or of a kind that nobody writes."""
+    if not {"red", "green", "blue"} <= set(columns):
+        return None
+    values = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
+    if values.dtype == np.uint8:
+        return torch.from_numpy(values)
+    most = 65535 if values.dtype == np.uint16 else 1
+    if values.dtype != np.uint16 and not (values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all()):
+        return None
+    return torch.from_numpy((values.astype(np.float64) * (255 / most) + 0.5).astype(np.uint8))

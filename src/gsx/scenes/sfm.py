@@ -9,6 +9,7 @@ library in the process, and each of the two drops the other's file locks.
 
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+from gsx.core.data.images import Lens, lens_of
 from gsx.core.errors import InputError
 from gsx.core.ranges import Count, Range
 
@@ -44,7 +46,8 @@ class SfmOptions:
     max_features: Annotated[int, Range(1, 10**6)]
     """Features kept of each photo."""
     camera_mode: str
-    """auto (photos of one size share a camera) | single (all share one) | per_image."""
+    """auto (photos of one size, by one lens at one focal length as EXIF tells, share a camera) | single (all share one)
+    | per_image."""
     camera_model: str
     """COLMAP's name of the lens model to estimate."""
     num_threads: Annotated[int, Range(-1, 4096)]
@@ -81,21 +84,26 @@ def import_photos(database: Path, folder: Path, sizes: Sizes, options: SfmOption
     shared = options.camera_mode != "per_image"
     mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
     pycolmap.Database.open(database).close()
-    for names in _camera_groups(sizes, options.camera_mode):
+    kinds = {name: (size, lens_of(folder / name)) for name, size in sizes.items()}
+    for names in _camera_groups(kinds, options.camera_mode):
         pycolmap.import_images(database, folder, camera_mode=mode, image_names=names, options=reader)
 
 
-def _camera_groups(sizes: Sizes, camera_mode: str) -> list[list[str]]:
+def _camera_groups(kinds: Mapping[str, tuple[tuple[int, int], Lens]], camera_mode: str) -> list[list[str]]:
+    """Names of photos that share a camera, by the size and the lens of each."""
     if camera_mode == "per_image":
-        return [sorted(sizes)]
-    groups = [sorted(name for name in sizes if sizes[name] == size) for size in sorted(set(sizes.values()))]
-    if camera_mode == "single" and len(groups) > 1:
-        found = ", ".join(
-            f"{width}x{height} ({group[0]})"
-            for group, (width, height) in zip(groups, sorted(set(sizes.values())), strict=True)
-        )
+        return [sorted(kinds)]
+    by_size = defaultdict[tuple[int, int], list[str]](list)
+    by_kind = defaultdict[tuple[tuple[int, int], Lens], list[str]](list)
+    for name in sorted(kinds):
+        by_size[kinds[name][0]].append(name)
+        by_kind[kinds[name]].append(name)
+    if camera_mode == "auto":
+        return [by_kind[kind] for kind in sorted(by_kind)]
+    if len(by_size) > 1:
+        found = ", ".join(f"{width}x{height} ({by_size[width, height][0]})" for width, height in sorted(by_size))
         raise InputError(f"One camera cannot take photos of several sizes, {found}: use scene.camera_mode=auto.")
-    return groups
+    return list(by_size.values())
 
 
 def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) -> None:

@@ -100,12 +100,23 @@ def undistort(
 
     Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
     """
-    photo = image.float() / 255
+    photo = premultiplied(image.float() / 255)
     to_photo = torch.tensor(
         [image.shape[2] / intrinsics.width, image.shape[1] / intrinsics.height], dtype=torch.float64
     )
-    bands = [to_uint8(sample(photo, pixels * to_photo)) for pixels in _distorted_pixels(intrinsics, pinhole, size)]
-    return torch.cat(bands, dim=1)
+    found = [sample(photo, pixels * to_photo) for pixels in _distorted_pixels(intrinsics, pinhole, size)]
+    return torch.cat([to_uint8(straight(band)) for band in found], dim=1)
+
+
+def premultiplied(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
+    """Colours times alpha, where there is one: what is transparent has no colour to interpolate."""
+    return photo if len(photo) < 4 else torch.cat([photo[:3] * photo[3:], photo[3:]])
+
+
+def straight(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
+    """Colours of premultiplied ones, whose alpha may be beyond [0, 1]; black where nothing is opaque."""
+    colours, alpha = photo[:3], photo[3:]
+    return photo if len(photo) < 4 else torch.cat([torch.where(alpha > 0, colours / alpha, 0.0), alpha])
 
 
 def _distorted_pixels(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
@@ -172,7 +183,7 @@ class StoredUndistortion:
 
     def stored(self) -> Path:
         """Where the result is kept; another photo, camera or method has another place."""
-        key = content_key(METHOD, _numbers(self.intrinsics), _numbers(self.pinhole), self.size)
+        key = content_key(METHOD, "premultiplied", _numbers(self.intrinsics), _numbers(self.pinhole), self.size)
         name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo))
         return cache_folder("undistorted", key) / f"{self.photo.stem}_{name}.png"
 

@@ -1,6 +1,7 @@
 """Images against hand-worked values, a dense float64 filter, and OpenImageIO's own operations."""
 
 import os
+import struct
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,16 @@ def test_premultiplied_alpha_is_divided_out(tmp_path: Path) -> None:
     image = read_image(save(tmp_path / "a.exr", pixels))
     assert image[:, 0, 0].tolist() == [255, 188, 0, 64]  # light 1, 0.5, 0; alpha 63.75
     assert image[:, 0, 1].tolist() == [0, 0, 0, 0]
+
+
+def test_alpha_of_a_bmp_is_straight(tmp_path: Path) -> None:
+    """Which OpenImageIO does not say."""
+    pixels = np.array([[[200, 100, 50, 128], [9, 8, 7, 255]]], np.uint8)
+    header = b"BM" + struct.pack("<IHHI", 14 + 108 + 8, 0, 0, 14 + 108)
+    masks = struct.pack("<IIII", 0x00FF0000, 0x0000FF00, 0x000000FF, 0xFF000000)
+    info = struct.pack("<IiiHHIIiiII", 108, 2, -1, 1, 32, 3, 8, 0, 0, 0, 0) + masks + b"BGRs" + bytes(48)
+    (tmp_path / "a.bmp").write_bytes(header + info + pixels[..., [2, 1, 0, 3]].tobytes())
+    assert read_image(tmp_path / "a.bmp").permute(1, 2, 0).tolist() == pixels.tolist()
 
 
 def test_nan_is_refused(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
-from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator, evenly
 from gsx.experiments.evaluation.lpips import LpipsOptions
 
 SIZE = (24, 16)
@@ -127,6 +127,13 @@ def likeness(*pairs: tuple[float, float]) -> float:
 def close(value: float) -> Any:
     """To float32's rounding of flat pictures."""
     return pytest.approx(value, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("views", "chosen"), [(3, [0, 1, 2]), (8, [*range(8)]), (10, [0, 1, 3, 4, 5, 6, 8, 9]), (24, [*range(1, 24, 3)])]
+)
+def test_some_views_are_looked_at_from_everywhere(views: int, chosen: list[int]) -> None:
+    assert evenly(range(views), 8) == chosen
 
 
 def test_means_over_views_are_means_of_their_figures(figures: dict[str, Any]) -> None:

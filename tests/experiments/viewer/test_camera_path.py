@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,14 @@ def test_keyframes_are_met_and_straight_ways_stay_straight() -> None:
     assert float(forward[0]) == pytest.approx(math.sqrt(0.5))
     assert float(forward[2]) == pytest.approx(math.sqrt(0.5))
     assert path().cameras(zoom=2)[0].size == (160, 120)
+
+
+def test_the_way_ends_at_its_last_keyframe_whatever_its_length() -> None:
+    """2.05 s of four frames a second are nine frames, of which the last would lie 0.2 s beyond."""
+    frames = [replace(frame, time=frame.time * 2.15 / 2) for frame in path().keyframes]
+    cameras = replace(path(), keyframes=tuple(frames)).cameras()
+    assert len(cameras) == 10
+    assert torch.allclose(cameras[-1].centre, torch.tensor([2.0, 0, 0], dtype=torch.float64), atol=1e-12)
 
 
 def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.masks import grown
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.shapes import Bool, UInt8
@@ -39,11 +40,12 @@ class CoarseSource:
         return replace(self, view=view, masks=[])
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Pixels that are made of nothing but pixels that count."""
+        """Pixels that are made of nothing but pixels that count: the filter takes from those beside, too."""
         if not self.masks:
             fine, (width, height), times = self.view.counted(), camera.size, self.times
             blocks = None if fine is None else fine[: height * times, : width * times]
-            self.masks.append(None if blocks is None else blocks.reshape(height, times, width, times).all(3).all(1))
+            whole = None if blocks is None else blocks.reshape(height, times, width, times).all(3).all(1)
+            self.masks.append(None if whole is None else ~grown(~whole[None], self.reduction.rim)[0])
         return self.masks[0]
 
 

@@ -47,7 +47,8 @@ def read_image(path: str | Path, *, upright: bool = False) -> UInt8[Tensor, "C H
         InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
     """
     pixels, spec = _decode(Path(path))
-    straight = spec.alpha_channel < 0 or spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
+    told = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
+    straight = spec.alpha_channel < 0 or told  # OpenImageIO does not say so of BMP
     image = _display_bytes(_rgb_or_rgba(pixels, spec, path), straight, path)
     image = image.permute(2, 0, 1).contiguous()
     exchange, flips = ORIENTATIONS[_orientation(spec)] if upright else (False, ())
@@ -65,6 +66,24 @@ def image_size(path: str | Path, *, upright: bool = False) -> Size:
     reader.close()
     swapped = upright and ORIENTATIONS[_orientation(spec)][0]
     return (spec.height, spec.width) if swapped else (spec.width, spec.height)
+
+
+Lens = tuple[str, str, float, float]
+"""Maker, model, focal length in mm, and that of the same view on 35 mm film; empty or 0 where a file does not tell."""
+
+
+def lens_of(path: str | Path) -> Lens:
+    """What took a photograph, from EXIF alone.
+
+    Raises:
+        InputError: the file is missing or is no image.
+    """
+    reader = _open(Path(path))
+    spec = reader.spec()
+    reader.close()
+    maker, model = (spec.get_string_attribute(name, "") for name in ("Make", "Model"))
+    focal, film = (spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm"))
+    return maker, model, round(focal, 3), round(film, 3)
 
 
 def has_alpha(path: str | Path) -> bool:

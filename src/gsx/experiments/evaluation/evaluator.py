@@ -382,7 +382,12 @@ def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequ
 
 def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
     """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
-    stride = max(1, len(run.scene.test) // count)
-    views = run.scene.test[::stride][:count]
+    views = evenly(run.scene.test, count)
     renders = ((v, render(run, v.camera, options.tile_pixels).image) for v in views)
     return statistics.fmean(psnr(image, v.image(), v.counted()) for v, image in renders)
+
+
+def evenly(views: Sequence[View], count: int) -> list[View]:
+    """Up to `count` of some views, the middles of as many equal parts."""
+    count = min(count, len(views))
+    return [views[(2 * part + 1) * len(views) // (2 * count)] for part in range(count)]

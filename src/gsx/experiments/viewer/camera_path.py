@@ -55,7 +55,8 @@ class CameraPath:
         """A camera for every frame from the first keyframe to the last; `zoom`: times the raster."""
         frames = self.keyframes
         count = 1 + round((frames[-1].time - frames[0].time) * self.fps)
-        return [self.camera(between(frames, frames[0].time + i / self.fps)).zoom(zoom) for i in range(count)]
+        times = [min(frames[0].time + number / self.fps, frames[-1].time) for number in range(count)]
+        return [self.camera(between(frames, time)).zoom(zoom) for time in times]
 
     def camera(self, frame: Keyframe) -> Camera:
         """The pinhole camera of a keyframe."""
