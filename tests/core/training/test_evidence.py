@@ -36,7 +36,8 @@ class Shot:
     seed: int = 1
 
     def image(self, camera: Camera) -> Tensor:
-        return torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(self.seed)).double()
+        generator = torch.Generator().manual_seed(self.seed)
+        return torch.randint(0, 256, (3, camera.height, camera.width), generator=generator, dtype=torch.uint8)
 
     def max_zoom(self, camera: Camera) -> float:
         return 1.0

@@ -222,10 +222,9 @@ class CheckedRegenerator:
         found: Any = self.inner.regenerate(requests)
         told = f"{type(self.inner).__name__}.regenerate was asked for {len(requests)} pictures and returned"
         remedy = "it is to return a tensor [3, h, w] for each, in order"
-        try:
-            pictures = list(found)
-        except TypeError as error:
-            raise TrainingError(f"{told} {type(found).__name__}: {remedy}") from error
+        if not isinstance(found, Iterable):
+            raise TrainingError(f"{told} {type(found).__name__}: {remedy}")
+        pictures = list(found)
         if other := [type(one).__name__ for one in pictures if not isinstance(one, Tensor)]:
             raise TrainingError(f"{told} {other[0]} among them: {remedy}")
         if len(pictures) != len(requests):
