@@ -459,7 +459,8 @@ def without_checkpoints(folder: Path) -> Path:
 def run_of_old(folder: Path) -> Path:
     """What makes a folder a run, and nothing else."""
     folder.mkdir()
-    (folder / "config.yaml").write_text("")
+    for name in ("config.yaml", "environment.json"):
+        (folder / name).write_text("")
     return folder
 
 
@@ -522,7 +523,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "datasets nowhere": (lambda t: ["datasets", f"data_root={t / 'no'}"], "is no folder: give the one below which"),
     "more steps of an evaluation": (
         lambda t: ["eval", str(run_of_old(t / "my run")), "iterations=40"],
-        "/my run is trained: leave it out (gsx resume '",
+        "/my run shows: leave it out; gsx resume '",
     ),
     "another seed for photographs": (
         lambda t: ["photographs", str(run_of_old(t / "run")), "seed=4"],

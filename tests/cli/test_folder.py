@@ -57,7 +57,8 @@ def test_what_is_no_scene_is_told_with_a_remedy(
 ) -> None:
     for folder in ("empty", "run"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "run" / "config.yaml").write_text("")
+    for file in ("config.yaml", "metrics.jsonl"):
+        (tmp_path / "run" / file).write_text("")
     for file in ("a.ply", "notes.txt"):
         (tmp_path / file).write_text("")
     assert main([str(tmp_path / name)]) == 2

@@ -1,6 +1,7 @@
 """Photos without poses: a real reconstruction of synthetic photos against its truth, and everything around it."""
 
 import logging
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -169,22 +170,32 @@ def test_photos_that_are_passed_over_are_told(tmp_path: Path) -> None:
         (tmp_path / place).mkdir(exist_ok=True)
         for name in ("a.jpg", "b.jpg"):
             (tmp_path / place / name).touch()
-    (note,) = photos.passed_over(tmp_path, *find_photos(tmp_path))
+    (note,) = photos.passed_over(tmp_path, find_photos(tmp_path)[0])
     assert note == (
         f"2 photos in images are not used, as there are some in {tmp_path}: set scene.path to the folder that is meant."
     )
     (tmp_path / "a.jpg").unlink()
     (tmp_path / "b.jpg").unlink()
-    assert photos.passed_over(tmp_path, *find_photos(tmp_path)) == []
+    assert photos.passed_over(tmp_path, find_photos(tmp_path)[0]) == []
 
 
 def test_photos_share_a_camera_by_size_and_by_lens(tmp_path: Path) -> None:
     """As a phone's lenses, which take pictures of one size."""
-    exif = {"wide": 24.0, "wide2": 24.0, "long": 48.0, "plain": None, "small": 24.0}
+    exif = {
+        "wide": 24.0,
+        "wide2": 24.0,
+        "long": 48.0,
+        "plain": None,
+        "none": math.nan,
+        "none2": math.nan,
+        "small": 24.0,
+    }
     for name, focal in exif.items():
         height, width = (30, 40) if name == "small" else (60, 80)
         spec = oiio.ImageSpec(width, height, 3, "uint8")
-        if focal:
+        if focal is not None and math.isnan(focal):  # as 0/0 is read
+            spec.attribute("Exif:FocalLength", math.nan)
+        elif focal:
             spec.attribute("Make", "Maker")
             spec.attribute("Model", "Phone")
             spec.attribute("Exif:FocalLengthIn35mmFilm", int(focal))
@@ -194,7 +205,7 @@ def test_photos_share_a_camera_by_size_and_by_lens(tmp_path: Path) -> None:
         output.close()
     sizes = {f"{name}.jpg": image_size(tmp_path / f"{name}.jpg") for name in exif}
     for mode, groups in (
-        ("auto", [["small.jpg"], ["plain.jpg"], ["wide.jpg", "wide2.jpg"], ["long.jpg"]]),
+        ("auto", [["small.jpg"], ["plain.jpg", "none.jpg", "none2.jpg"], ["wide.jpg", "wide2.jpg"], ["long.jpg"]]),
         ("per_image", [[name] for name in sorted(sizes)]),
     ):
         database = tmp_path / f"{mode}.db"

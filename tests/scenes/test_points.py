@@ -67,10 +67,11 @@ def test_files_without_usable_points_are_refused(tmp_path: Path) -> None:
         (np.array([0.0, 0.5, 1.0], np.float32), [0, 128, 255]),
         (np.array([0, 32768, 65535], np.uint16), [0, 128, 255]),
         (np.array([0, 7, 255], np.uint8), [0, 7, 255]),
+        (np.array([0, 7, 255], np.uint16), [0, 7, 255]),
         (np.array([0.0, 128.0, 255.0], np.float32), [127, 127, 127]),
         (np.array([0, 128, 255], np.int32), [127, 127, 127]),
     ],
-    ids=["float", "16 bits", "8 bits", "float beyond 1", "int"],
+    ids=["float", "16 bits", "8 bits", "8 in 16", "float beyond 1", "int"],
 )
 def test_colours_may_be_of_several_kinds(given: np.ndarray, found: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     columns = dict.fromkeys("xyz", np.zeros(3, np.float32)) | dict.fromkeys(("red", "green", "blue"), given)

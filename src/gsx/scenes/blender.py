@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -151,8 +151,19 @@ def _scales_named(options: BlenderOptions) -> dict[str, Any]:
     return {} if scales == {"scales": [1], "test_scales": [1]} else scales
 
 
-LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-"""Keys of nerfstudio's transforms for what a lens does."""
+BENDING = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Keys of nerfstudio's transforms for what a lens does to straight lines."""
+
+
+def left_out(node: Mapping[str, Any], angle: float) -> Iterator[str]:
+    """Keys of nerfstudio's transforms that make another camera than an angle of view does."""
+    width, height = (finite_number(node.get(key)) or 0.0 for key in ("w", "h"))
+    focal = width / (2 * math.tan(angle / 2))
+    for key, own in {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}.items():
+        value = finite_number(node.get(key))
+        if value is not None and abs(value - own) > 0.01 * own:
+            yield key
+    yield from (key for key in BENDING if node.get(key))
 
 
 def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
@@ -169,7 +180,7 @@ def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
             "with fl_x use scene=transforms."
         )
     present, notes = present_frames(file.parent, frames, file, missing)
-    if stated := sorted({key for node in (content, *frames) for key in LENS if node.get(key)}):
+    if stated := sorted({key for node in (content, *frames) for key in left_out(content | node, angle)}):
         notes.append(
             f"{file.name} states {', '.join(stated)}, which the format's published readers leave out, and so does "
             "scene=blender: pictures are taken for those of camera_angle_x, with nothing bent. With one "

@@ -51,7 +51,7 @@ def load(options: PhotosOptions) -> Scene:
     refuse_unknown(options)
     folder, photos = find_photos(Path(options.path).expanduser())
     sizes, notes = readable_sizes(folder, photos)
-    notes += passed_over(Path(options.path).expanduser(), folder, photos)
+    notes += passed_over(Path(options.path).expanduser(), folder)
     refuse_partial(
         sorted({*photos} - sizes.keys()), len(photos), folder, options.missing, "cannot be read", "export them again"
     )
@@ -93,13 +93,11 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     return folder, names
 
 
-def passed_over(path: Path, folder: Path, photos: Sequence[str]) -> list[str]:
-    """A note where a folder holds more photos than those that are taken, which lie at its top."""
-    taken = {(folder / name).resolve() for name in photos}
-    others = [name for name in photos_in(path, "**/*") if (path / name).resolve() not in taken]
-    places = sorted({str(Path(name).parent) for name in others})
-    used = f"{len(others)} photos in {', '.join(places[:3])}{' ...' if len(places) > 3 else ''} are not used"
-    return [f"{used}, as there are some in {folder}: set scene.path to the folder that is meant."] if others else []
+def passed_over(path: Path, folder: Path) -> list[str]:
+    """A note where photos are taken from a folder's top, and there are others where a scene has its own."""
+    others = len(photos_in(path / IMAGES, "**/*")) if folder == path and (path / IMAGES).is_dir() else 0
+    used = f"{others} photos in {IMAGES} are not used, as there are some in {path}"
+    return [f"{used}: set scene.path to the folder that is meant."] if others else []
 
 
 def photos_in(folder: Path, pattern: str) -> list[str]:

@@ -332,6 +332,18 @@ def test_what_networks_keep_beside_parameters_is_saved_and_restored() -> None:
         restored_table(made(), saved)
 
 
+def test_networks_that_share_weights_keep_them_as_parameters() -> None:
+    def made() -> ParameterTable:
+        modules = nn.ModuleDict({"colour": nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))})
+        modules["colour"][1].weight = modules["colour"][0].weight
+        return ParameterTable({"flat": Parameter(torch.ones(2))}, {}, {}, Networks(modules, modules["colour"]))
+
+    table = made()
+    assert list(table.networks.buffers()) == []
+    found = table_tensors(restored_table(made(), table_tensors(table)))
+    assert torch.equal(found["heads.colour.0.weight"], table_tensors(table)["heads.colour.0.weight"])
+
+
 def test_a_parameter_that_no_rate_would_move_is_refused() -> None:
     modules = nn.Module()
     modules.colour, modules.tint = nn.Linear(2, 3), Parameter(torch.zeros(3))

@@ -237,7 +237,13 @@ def test_pseudo_details_do_not_show_the_windows(tmp_path: Path, seen: list[Pseud
 
 @pytest.mark.parametrize(
     ("provenance", "corrected", "hidden"),
-    [({}, False, 12), ({"kind": "base"}, True, 12), ({"source": "photo"}, True, 12), ({"kind": "random"}, True, 0)],
+    [
+        ({}, False, 12),
+        ({"kind": "base"}, True, 12),
+        ({"kind": "coarser"}, True, 12),
+        ({"source": "photo"}, True, 12),
+        ({"kind": "random"}, True, 0),
+    ],
 )
 def test_where_a_pseudo_view_shows_a_window_is_told_by_what_it_was_made_from(
     provenance: dict[str, str], corrected: bool, hidden: int

@@ -60,6 +60,8 @@ def test_a_run_is_no_scene(tmp_path: Path) -> None:
     folder = tmp_path / "my run"
     (folder / "images").mkdir(parents=True)
     (folder / "config.yaml").write_text("")
+    assert not any("is a run" in line for line in describe(folder, plugins())), "others have such files, too"
+    (folder / "environment.json").write_text("")
     told = f"{folder} is a run: gsx view '{folder}', gsx eval '{folder}', gsx resume '{folder}'"
     assert describe(folder, plugins()) == [f"problem   {told}"]
 

@@ -4,6 +4,7 @@ Images are uint8 display values [C, H, W], red first, alpha (if any) straight an
 """
 
 import errno
+import math
 import os
 import shutil
 from collections import OrderedDict
@@ -82,8 +83,9 @@ def lens_of(path: str | Path) -> Lens:
     spec = reader.spec()
     reader.close()
     maker, model = (spec.get_string_attribute(name, "") for name in ("Make", "Model"))
-    focal, film = (spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm"))
-    return maker, model, round(focal, 3), round(film, 3)
+    lengths = [spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm")]
+    focal, film = (round(length, 3) if 0 < length < math.inf else 0.0 for length in lengths)  # 0/0 is read as nan
+    return maker, model, focal, film
 
 
 def has_alpha(path: str | Path) -> bool:

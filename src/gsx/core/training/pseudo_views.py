@@ -74,7 +74,9 @@ def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> Pse
     A pixel that shows a part of a window does not count; nor does what is known of a view at a lower resolution, if it
     shows any."""
     made = view.provenance
-    if not (made.get("source") == "photo" or made.get("kind") == "base" or view.camera.has_pose_of(camera)):
+    if not (
+        made.get("source") == "photo" or made.get("kind") in ("base", "coarser") or view.camera.has_pose_of(camera)
+    ):
         return view
     seen = [window.seen_by(view.camera, camera) for window in windows]
     seen = [part for part in seen if part.width and part.height]

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from gsx.core.files import at_home
 from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.options import label, without_effect
 from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Share, Steps
@@ -62,6 +61,3 @@ class GeneralOptions:
             raise ValueError("iterations is 0; give 1 or more steps, or init=FILE, a splat file to evaluate as it is")
         if self.reuse and self.folder:
             raise ValueError(f"reuse=true names the folder itself; leave out folder={self.folder}")
-        for key in ("output", "folder"):  # which Hydra and the shell take as they are
-            if (given := getattr(self, key)).startswith("~"):
-                raise ValueError(f"{key} is '{given}', which would be below this folder: give {key}={at_home(given)}")

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.files import at_home
 from gsx.core.plugins import Plugins
 from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
@@ -175,7 +176,12 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
         ConfigError: a group, option, key or value is wrong; the nearest right one is named.
     """
     with hydra_session(plugins):
-        return settings_from(compose_raw(overrides), plugins)
+        settings = settings_from(compose_raw(overrides), plugins)
+    for key in ("output", "folder"):  # which Hydra and the shell take as they are
+        given = getattr(settings.general, key)
+        if given == "~" or given.startswith("~/"):
+            raise ConfigError(f"{key} is '{given}', which would be below this folder: give {key}={at_home(given)}")
+    return settings
 
 
 def compose_raw(overrides: Sequence[str]) -> DictConfig:

@@ -79,7 +79,8 @@ def readable(path: Path, plugins: Plugins) -> Readable:
 
 def refuse_run(path: Path) -> None:
     """Raise InputError for the folder of a run, which is no scene."""
-    if (path / "config.yaml").is_file():
+    others = any((path / name).exists() for name in ("environment.json", "metrics.jsonl", "checkpoints"))
+    if others and (path / "config.yaml").is_file():
         looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
         raise InputError(f"{path} is a run: {looks}")
 

@@ -138,8 +138,10 @@ def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
     """Raise ConfigError for an override that changes how a run is trained, or where, and nothing of what it shows."""
     for word in overrides:
         if key_of(word) in OF_TRAINING:
-            onwards = command("resume", folder, "iterations=N")
-            raise ConfigError(f"'{word}' is for training, and {folder} is trained: leave it out ({onwards} trains on)")
+            longer = f"; {command('resume', folder, word)} trains on" if key_of(word) == "iterations" else ""
+            raise ConfigError(
+                f"'{word}' is for training, and changes nothing of what {folder} shows: leave it out{longer}"
+            )
 
 
 def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
