@@ -85,8 +85,7 @@ class TrainedRun:
         if isinstance(zoom, str) or zoom is None:
             raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
         refuse_beyond("zoom", zoom := float(zoom), ZOOMS)
-        camera = camera_of(view_named(self.run, seen) if isinstance(seen, str) else seen)
-        return render(self.run, camera.zoom(zoom), self.settings.evaluation.tile_pixels).image
+        return render(self.run, camera_in(self.run, seen).zoom(zoom), self.settings.evaluation.tile_pixels).image
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
         """Judge the run on its test views, as `gsx eval` does: evaluation.json, pictures and report are written anew.
@@ -108,8 +107,7 @@ class TrainedRun:
             InputError: the suffix is that of no format that is written, or there is no such view.
         """
         refuse_export(path := Path(path))
-        view = view_named(self.run, seen) if isinstance(seen, str) else seen
-        export(self.run, path, None if view is None else camera_of(view))
+        export(self.run, path, None if seen is None else camera_in(self.run, seen))
         return path
 
     def __repr__(self) -> str:
@@ -143,6 +141,11 @@ class SplatFile:
 
     def __repr__(self) -> str:
         return f"<{len(self.gaussians.means):,} splats of {self.path}>"
+
+
+def camera_in(run: Run, seen: Camera | View | str) -> Camera:
+    """A camera, that of a view, or that of a run's view of that name; errors as `camera_of` and `view_named`."""
+    return camera_of(view_named(run, seen) if isinstance(seen, str) else seen)
 
 
 def camera_of(seen: Camera | View) -> Camera:

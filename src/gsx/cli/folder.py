@@ -28,7 +28,7 @@ def train_from(arguments: list[str]) -> int:
         raise ConfigError(f"gsx {arguments[0]}: '{odd}' does not go with it: it says itself what scene it is")
     words = scene_words(path, overrides, plugins())
     logger.info("%s is %s", path, told(words, path))
-    logger.info("gsx %s", shlex.join([*words, *overrides]))
+    logger.info("%s", command(*words, *overrides))
     return verb_train([*words, *overrides])
 
 

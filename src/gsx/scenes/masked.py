@@ -69,7 +69,7 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
     Raises:
         InputError: there are masks, and none belongs to a photograph.
     """
-    found, folder = masked(views), folder_of(options)
+    found, folder = len(masks_of(views)), folder_of(options)
     if found:
         where = "alpha" if options.masks == "alpha" else "masks"
         return [f"What the {where} of {found} of {len(views)} photographs leave out counts in no loss and no figure."]
@@ -86,23 +86,23 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
     return []
 
 
-def masked(views: Sequence[View]) -> int:
-    """How many photographs have a mask."""
-    sources = (view.source for view in views)
-    return sum(isinstance(source, PhotoSource) and source.mask is not None for source in sources)
+def masks_of(views: Sequence[View]) -> list[tuple[str, Mask]]:
+    """(name, mask) of the photographs that have one."""
+    sources = ((view.name, view.source) for view in views)
+    masks = ((name, source.mask) for name, source in sources if isinstance(source, PhotoSource))
+    return [(name, mask) for name, mask in masks if mask is not None]
 
 
 def masks_named(views: Sequence[View]) -> Mapping[str, Any]:
     """For the provenance; nothing without masks, so that such a protocol keeps its hash."""
-    found = masked(views)
-    return {"masks": found, "masks_content": content_of_masks(views)} if found else {}
+    found = masks_of(views)
+    return {"masks": len(found), "masks_content": content_of(found)} if found else {}
 
 
-def content_of_masks(views: Sequence[View]) -> str:
+def content_of(masks: Sequence[tuple[str, Mask]]) -> str:
     """A digest of the files of masks, view by view; those that are the alpha of photographs are these' own."""
     digest = hashlib.sha256()
-    for view in views:
-        if isinstance(view.source, PhotoSource) and (mask := view.source.mask) is not None:
-            digest.update(repr((view.name, mask.alpha)).encode())
-            digest.update(b"" if mask.alpha else mask.path.read_bytes())
+    for name, mask in masks:
+        digest.update(repr((name, mask.alpha)).encode())
+        digest.update(b"" if mask.alpha else mask.path.read_bytes())
     return digest.hexdigest()[:16]

@@ -49,9 +49,10 @@ def load(options: PhotosOptions) -> Scene:
             cannot be reconstructed.
     """
     refuse_unknown(options)
-    folder, photos = find_photos(Path(options.path).expanduser())
+    path = Path(options.path).expanduser()
+    folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
-    notes += passed_over(Path(options.path).expanduser(), folder)
+    notes += passed_over(path, folder)
     refuse_partial(
         sorted({*photos} - sizes.keys()), len(photos), folder, options.missing, "cannot be read", "export them again"
     )

@@ -61,8 +61,10 @@ def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None
     values = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
     if values.dtype == np.uint8:
         return torch.from_numpy(values)
-    most = 65535 if values.max() > 255 else 255  # of 16 bits, as some write 8
-    most = most if values.dtype == np.uint16 else 1
-    if values.dtype != np.uint16 and not (values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all()):
+    if values.dtype == np.uint16:
+        most = 65535 if values.max() > 255 else 255  # some write 8 bits so
+    elif values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all():
+        most = 1
+    else:
         return None
     return torch.from_numpy((values.astype(np.float64) * (255 / most) + 0.5).astype(np.uint8))

@@ -9,7 +9,6 @@ library in the process, and each of the two drops the other's file locks.
 
 import logging
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from gsx.core.data.images import Lens, lens_of
+from gsx.core.data.images import lens_of
 from gsx.core.errors import InputError
 from gsx.core.ranges import Count, Range
 
@@ -84,26 +83,26 @@ def import_photos(database: Path, folder: Path, sizes: Sizes, options: SfmOption
     shared = options.camera_mode != "per_image"
     mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
     pycolmap.Database.open(database).close()
-    kinds = {name: (size, lens_of(folder / name)) for name, size in sizes.items()}
-    for names in _camera_groups(kinds, options.camera_mode):
+    for names in _camera_groups(folder, sizes, options.camera_mode):
         pycolmap.import_images(database, folder, camera_mode=mode, image_names=names, options=reader)
 
 
-def _camera_groups(kinds: Mapping[str, tuple[tuple[int, int], Lens]], camera_mode: str) -> list[list[str]]:
-    """Names of photos that share a camera, by the size and the lens of each."""
+def _camera_groups(folder: Path, sizes: Sizes, camera_mode: str) -> list[list[str]]:
+    """Names of photos that share a camera; of those of one size `auto` asks each for its lens."""
     if camera_mode == "per_image":
-        return [sorted(kinds)]
-    by_size = defaultdict[tuple[int, int], list[str]](list)
-    by_kind = defaultdict[tuple[tuple[int, int], Lens], list[str]](list)
-    for name in sorted(kinds):
-        by_size[kinds[name][0]].append(name)
-        by_kind[kinds[name]].append(name)
+        return [sorted(sizes)]
     if camera_mode == "auto":
-        return [by_kind[kind] for kind in sorted(by_kind)]
-    if len(by_size) > 1:
-        found = ", ".join(f"{width}x{height} ({by_size[width, height][0]})" for width, height in sorted(by_size))
+        return _alike({name: (size, lens_of(folder / name)) for name, size in sizes.items()})
+    groups = _alike(sizes)
+    if len(groups) > 1:
+        found = ", ".join("{}x{} ({})".format(*sizes[group[0]], group[0]) for group in groups)
         raise InputError(f"One camera cannot take photos of several sizes, {found}: use scene.camera_mode=auto.")
-    return list(by_size.values())
+    return groups
+
+
+def _alike(kinds: Mapping[str, Any]) -> list[list[str]]:
+    """Sorted names of each kind, in the order of the kinds."""
+    return [sorted(name for name in kinds if kinds[name] == kind) for kind in sorted(set(kinds.values()))]
 
 
 def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) -> None:

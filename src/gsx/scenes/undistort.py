@@ -104,8 +104,8 @@ def undistort(
     to_photo = torch.tensor(
         [image.shape[2] / intrinsics.width, image.shape[1] / intrinsics.height], dtype=torch.float64
     )
-    found = [sample(photo, pixels * to_photo) for pixels in _distorted_pixels(intrinsics, pinhole, size)]
-    return torch.cat([to_uint8(straight(band)) for band in found], dim=1)
+    bands = (sample(photo, pixels * to_photo) for pixels in _distorted_pixels(intrinsics, pinhole, size))
+    return torch.cat([to_uint8(straight(band)) for band in bands], dim=1)
 
 
 def premultiplied(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:

@@ -62,10 +62,11 @@ class Networks:
     def buffers(self) -> Iterator[tuple[str, Tensor]]:
         """What networks keep beside parameters (means of a batch norm ...), by the names that it is saved under."""
         state = self.modules.state_dict(keep_vars=True).items()
-        kept = (
-            (name, value) for name, value in state if isinstance(value, Tensor) and not isinstance(value, Parameter)
+        return (
+            (f"buffers.{name}", value)
+            for name, value in state
+            if isinstance(value, Tensor) and not isinstance(value, Parameter)
         )
-        return ((f"buffers.{name}", value) for name, value in kept)
 
 
 @dataclass(eq=False)

@@ -1,7 +1,6 @@
 """What is in this folder? Answers `gsx scenes PATH`, also for folders that cannot be trained from."""
 
 import logging
-import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError, command
 from gsx.core.plugins import Component, Plugins
+from gsx.experiments.run_folder.files import BEGUN
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
 from gsx.experiments.runs.settings import typed
@@ -79,7 +79,7 @@ def readable(path: Path, plugins: Plugins) -> Readable:
 
 def refuse_run(path: Path) -> None:
     """Raise InputError for the folder of a run, which is no scene."""
-    others = any((path / name).exists() for name in ("environment.json", "metrics.jsonl", "checkpoints"))
+    others = any((path / name).exists() for name in (*BEGUN, "checkpoints"))
     if others and (path / "config.yaml").is_file():
         looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
         raise InputError(f"{path} is a run: {looks}")
@@ -122,13 +122,13 @@ def scene_lines(
         yield from loaded_lines(scene)
         found.ask(lambda: capture_lines(scene))
     else:
-        yield f"poses     not known yet: gsx scenes {shlex.quote(str(path))} --poses finds them and judges the coverage"
+        yield f"poses     not known yet: {command('scenes', path, '--poses')} finds them and judges the coverage"
 
 
 def training_command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
     """The command that trains a folder."""
     more = [word_of(f"scene.{key}", value) for key, value in overrides.items()]
-    return shlex.join(["gsx", f"scene={loader.name}", word_of("scene.path", str(path)), *more])
+    return command(f"scene={loader.name}", word_of("scene.path", str(path)), *more)
 
 
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:

@@ -1,14 +1,13 @@
 """A table from its command line to its files: plan, run what is missing, gather, write."""
 
 import logging
-import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from gsx.core.cache import content_key, in_use
-from gsx.core.errors import ConfigError, InputError, first_line, nearest
+from gsx.core.errors import ConfigError, InputError, command, first_line, nearest
 from gsx.core.files import remove_partial, replace_text
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.overview import write_overview
@@ -80,7 +79,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         folder = folder_of(plan, plain, cells[0].config, common)
         tell(plan, lacking)
         if experiment.dry:
-            return "".join(f"gsx {shlex.join(job)}\n" for phase in plan.phases for job in phase), 0
+            return "".join(f"{command(*job)}\n" for phase in plan.phases for job in phase), 0
         tidy(folder, due)
         for number, phase in enumerate(plan.phases):
             launched(compositions, launching, folder / "launched" / str(number), phase, job)

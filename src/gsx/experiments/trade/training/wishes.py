@@ -1,9 +1,9 @@
 """Which setting is worth it: fronts of cost and quality, and the answer to a wish."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsx.core import errors
 from gsx.experiments.reports.charts import pareto_front
 from gsx.experiments.trade.training.measure import COSTS, Row, known
 
@@ -90,7 +90,7 @@ def told(one: Advice, given: Row) -> str:
 
 def command(one: Advice, words: Sequence[str]) -> str:
     """What trains it; empty: there is nothing to advise."""
-    return shlex.join(["gsx", *words, *one.row.overrides]) if one.row else ""
+    return errors.command(*words, *one.row.overrides) if one.row else ""
 
 
 def figures(row: Row, given: Row) -> str:
