@@ -63,10 +63,10 @@ def gradients(splats: Splats) -> dict[str, Tensor]:
     return {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in vars(splats).items()}
 
 
-def loss_of(image: Tensor, depth: Tensor) -> Tensor:
+def loss_of(image: Tensor, depth: Tensor | None) -> Tensor:
     """A mean with another weight at every value."""
     weight = torch.rand(image.shape, generator=torch.Generator().manual_seed(image.shape[0])).to(image)
-    return (image * weight).mean() + 0.1 * depth.mean()
+    return (image * weight).mean() + (0 if depth is None else 0.1 * depth.mean())
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,10 @@ class Truth:
     gradients: Mapping[str, Tensor]
 
 
-def truth_of(splats: Splats, camera: Camera, rules: RasterSettings) -> Truth:
+def truth_of(splats: Splats, camera: Camera, rules: RasterSettings, depth: bool = True) -> Truth:
     live = leaves(splats, torch.float64)
-    image, _, depth = render_reference(live, camera, rules)
-    loss_of(image, depth).backward()
+    image, _, distances = render_reference(live, camera, rules)
+    loss_of(image, distances if depth else None).backward()
     return Truth(image.detach(), gradients(live))
 
 
@@ -95,18 +95,17 @@ class Errors:
 
 
 def render_with_gradients(
-    splats: Splats, camera: Camera, rules: RasterSettings, factor: float = 1.0
+    splats: Splats, camera: Camera, rules: RasterSettings, factor: float = 1.0, depth: bool = True
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """A rendering, and the gradients of `factor` times its `loss_of`."""
     live = leaves(splats)
-    rendering = rasterize(live, camera, rules, depth=True)
-    assert rendering.depth is not None
+    rendering = rasterize(live, camera, rules, depth=depth)
     (factor * loss_of(rendering.image, rendering.depth)).backward()
     return rendering, gradients(live)
 
 
-def errors_of(splats: Splats, camera: Camera, rules: RasterSettings, truth: Truth) -> Errors:
-    rendering, found = render_with_gradients(splats, camera, rules)
+def errors_of(splats: Splats, camera: Camera, rules: RasterSettings, truth: Truth, depth: bool = True) -> Errors:
+    rendering, found = render_with_gradients(splats, camera, rules, depth=depth)
     error = (rendering.image.detach() - truth.image).abs()
     relative = [float((found[name] - true).norm() / true.norm()) for name, true in truth.gradients.items()]
     return Errors(float(error.max()), float(error.mean()), max(relative))

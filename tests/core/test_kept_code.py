@@ -132,6 +132,17 @@ def test_gradients_are_those_of_the_function_when_code_is_found(folder: Path) ->
     assert len(list(folder.glob("*.bin"))) == 1
 
 
+def test_where_no_gradient_is_followed_it_is_one_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that are measured have none, whether or not torch would follow some."""
+    with made(monkeypatch) as names:
+        with torch.no_grad():
+            assert agrees(compile_rows(weighted, 2), *rows(6))
+        assert agrees(function := compile_rows(weighted, 2), *rows(7))
+    assert names == ["weighted"]
+    x, y = (values.requires_grad_() for values in rows(5))
+    assert function(x, y).requires_grad
+
+
 def test_another_last_argument_is_another_function(folder: Path) -> None:
     x, y = rows(6)
     compile_rows(weighted, 2)(x, y)

@@ -142,15 +142,17 @@ TAME_CAMERAS = cameras_with(powers(-2, 2), st.floats(-10, 10), st.floats(-2, 2))
 def compare(
     splats: Splats, camera: Camera, rules: RasterSettings, dtype: torch.dtype, tolerance: float
 ) -> tuple[float, float]:
-    """Largest image error, and largest relative gradient error, over the pixels that no threshold touches."""
+    """Largest error of picture and depth, and largest relative gradient error, over the pixels that no threshold
+    touches."""
     fast, slow = leaves(splats, dtype), leaves(splats, torch.float64)
-    rendering = rasterize(fast, camera, rules)
-    image, alpha, _ = render_reference(slow, camera, rules)
+    rendering = rasterize(fast, camera, rules, depth=True)
+    image, alpha, depth = render_reference(slow, camera, rules)
     decided = (~undecided(slow, camera, rules, tolerance)).double()
     found = gradients_of(fast, rendering.image, rendering.alpha, decided)
     expected = gradients_of(slow, image, alpha, decided)
     errors = [(found[name] - truth).norm() / (1e-3 + truth.norm()) for name, truth in expected.items()]
-    return float(((rendering.image - image).abs() * decided).detach().max()), float(max(errors))
+    off = torch.cat([rendering.image - image, (rendering.depth - depth)[None] / (1 + depth)]).abs()
+    return float((off * decided).detach().max()), float(max(errors))
 
 
 @given(TAME_SPLATS, TAME_CAMERAS, RULES)

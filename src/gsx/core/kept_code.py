@@ -253,7 +253,7 @@ class KeptFunction:
 
     def code_for(self, arguments: tuple[Any, ...]) -> Code | None:
         """Code that holds for arguments; None where that is left to torch.compile."""
-        kind = (*modes(), *map(kind_of, arguments))
+        kind = (*modes(arguments), *map(kind_of, arguments))
         codes, named = self.codes.setdefault(kind, []), self.named(arguments)
         for code in codes:
             if code.holds(named):
@@ -312,7 +312,7 @@ class KeptFunction:
         varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
         forms = [form_of(value, varying) for value in arguments]
         about = self.function.__name__, self.digest, sorted(self.options.items()), self.checked, sorted(TRACING.items())
-        return f"{self.function.__name__}-{content_key(about, forms, *modes(), machine())}"
+        return f"{self.function.__name__}-{content_key(about, forms, *modes(arguments), machine())}"
 
     def compile(self, arguments: tuple[Any, ...]) -> Any:
         """What torch makes of the function for arguments such as these."""
@@ -336,9 +336,10 @@ def known_to_torch(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if hasattr(torch._dynamo.config, name)}
 
 
-def modes() -> tuple[object, ...]:
-    """What code depends on beside arguments, as long as a process lasts."""
-    return torch.is_grad_enabled(), torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+def modes(arguments: tuple[Any, ...]) -> tuple[object, ...]:
+    """What code depends on beside what arguments are: whether gradients of one of them are followed, threads, rules."""
+    followed = torch.is_grad_enabled() and any(getattr(value, "requires_grad", False) for value in flat(arguments))
+    return followed, torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
 
 
 def kind_of(value: Any) -> object:

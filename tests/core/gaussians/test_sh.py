@@ -144,7 +144,7 @@ def test_gradient_is_that_of_finite_differences(degree: int) -> None:
 def test_a_splat_at_the_camera_has_a_finite_gradient(compiled: bool) -> None:
     constant, rest, offsets = coefficients()
     offsets[4] = 0
-    offsets.requires_grad_()
+    constant, rest, offsets = (value.requires_grad_() for value in (constant, rest, offsets))
     colours_of(constant, rest, offsets, 3, compiled).sum().backward()
     assert offsets.grad is not None
     assert torch.isfinite(offsets.grad).all()

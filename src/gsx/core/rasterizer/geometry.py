@@ -69,7 +69,7 @@ def screen_axes(
     return p, q
 
 
-def covariance_and_factor(p: Columns, q: Columns, dilation: float | Tensor) -> tuple[Columns, Columns, Columns]:
+def covariance_and_factor(p: Columns, q: Columns, dilation: Float[Tensor, "1"]) -> tuple[Columns, Columns, Columns]:
     """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
 
     Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
@@ -92,7 +92,12 @@ def log_compensation(bare: Float[Tensor, "M"], added: Float[Tensor, "M"]) -> Flo
 
 
 def log_exchange(
-    p: Columns, q: Columns, bare: Float[Tensor, "M"], added: Float[Tensor, "M"], yy: Float[Tensor, "M"], drawn: Tensor
+    p: Columns,
+    q: Columns,
+    bare: Float[Tensor, "M"],
+    added: Float[Tensor, "M"],
+    yy: Float[Tensor, "M"],
+    drawn: Float[Tensor, "1"],
 ) -> Float[Tensor, "M"]:
     """ln sqrt(|S + drawn I| / |S + d I|): what keeps the mass of a splat whose dilation becomes d instead of `drawn`.
 
@@ -110,9 +115,9 @@ def geometry(
     intrinsics: Float[Tensor, "4"],
     low: Float[Tensor, "2"],
     high: Float[Tensor, "2"],
-    dilation: float | Tensor,
+    dilation: Float[Tensor, "1"],
     compensate: bool,
-    drawn: Tensor | None = None,
+    drawn: Float[Tensor, "1"] | None = None,
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
     """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
 

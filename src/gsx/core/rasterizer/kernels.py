@@ -367,8 +367,8 @@ slow) or take longer to compile (at 120: twice as long, for code that is no fast
 
 SHARED_AFTER = 50
 """The same of all others: with more of them slopes by segments find weights twice."""
-OF_ANY_GRADIENTS = {"transmit", "blend", "make_rows"}
-"""Loops whose code is one with and without absolute gradients."""
+SUMS = {"gradients", "entry_sums"}
+"""Loops whose code is another where absolute gradients are asked for."""
 OF_A_TILE = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 
@@ -398,7 +398,7 @@ def kernels(rules: Rules) -> Kernels:
 
 def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
     """`loop` of these rules through torch.compile."""
-    if loop.__name__ in OF_ANY_GRADIENTS:
+    if loop.__name__ not in SUMS:
         rules = replace(rules, absolute=False)
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
     # loops over blocks: no conditions on symbols, which are the number of blocks, the same in all arguments, and where

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -122,13 +122,14 @@ def project(
             torch.where(shown.view(-1, *[1] * (values.dim() - 1)), values, elsewhere)
             for values, elsewhere in zip(given, ELSEWHERE, strict=True)
         )
-    rules = tuple[Any, ...]((dilation, settings.compensate))
-    if not settings.published_dilation:  # numbers that differ from camera to camera are no constants of compiled code
-        rules = scales.new_full((), dilation), False, scales.new_full((), drawn) if drawn else None
+    compensate = settings.compensate and settings.published_dilation
+    # tensors: numbers would be constants of compiled code, which each makes anew; torch takes float64 ones of no axis
+    # for such numbers as well
+    rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     compute = geometry
     if len(ids) > 1 and goes_compiled(settings, ids.device.type):
-        compute = compiled_geometry(settings.published_dilation, settings.compensate, bool(drawn))
+        compute = compiled_geometry(compensate, bool(drawn))
     means, covariances, conic_factors, compensation = compute(
         points, scales, quats, uploaded(camera.rotation, ids.device, scales.dtype), *shape, *rules
     )
@@ -192,6 +193,6 @@ def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[
 
 
 @functools.lru_cache
-def compiled_geometry(published: bool, compensate: bool, exchange: bool) -> Geometry:
+def compiled_geometry(compensate: bool, exchange: bool) -> Geometry:
     """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
     return compile_rows(geometry, options=IN_VECTORS)
