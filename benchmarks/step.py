@@ -1,11 +1,13 @@
 """Where a training step's time goes, stage by stage, and whether a stage has become slower (docs/architecture.md).
 
-    python benchmarks/step.py [--scenes FOLDER] [--backbones gs3d,octree_scaffold]
+    python benchmarks/step.py [--backbones gs3d,octree_scaffold]
+    python benchmarks/step.py --scene fox --scenes FOLDER
     python benchmarks/step.py --against REVISION
 
-Runs of the built-in scene, or of `fox` in FOLDER at a quarter, are trained once below --runs; then steps from their
-last state are taken over and over, each stage on its own clock. `--against` measures another revision of the source in
-turn, in processes of their own, and exits with 1 where a stage takes 10 % and 0.5 ms longer. Nothing else should run.
+Runs of the built-in scene, or of `fox` or `lego` in FOLDER at a quarter, are trained once below --runs; then steps from
+their last state are taken over and over, each stage on its own clock. `--against` measures another revision of the
+source in turn, in processes of their own, and exits with 1 where a stage takes 10 % and 0.5 ms longer. Nothing else
+should run.
 """
 
 import argparse
@@ -30,6 +32,12 @@ from measuring.stages import measure_stages
 
 RESULTS = Path(__file__).parent / "results"
 BACKBONES = ("gs3d", "mip_splatting", "octree_gs3d", "scaffold", "octree_scaffold")
+SCENES = {
+    "demo": ("the built-in scene", ["scene=demo", "iterations=600"]),
+    "fox": ("fox at a quarter", ["scene=colmap", "scene.downscale=4", "iterations=1000"]),
+    "lego": ("lego at a quarter", ["scene=blender", "scene.downscale=4", "iterations=1000"]),
+}
+"""What is trained, as it is called and by which words."""
 SLOWER, LEAST = 1.1, 0.5
 """A stage has become slower when it takes this many times as long, and this many ms longer."""
 ROUNDS = 3
@@ -47,6 +55,7 @@ NOTE = (
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", choices=list(SCENES), default="demo", help="what is trained (demo)")
     parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
     parser.add_argument("--backbones", default=",".join(BACKBONES), help="by commas")
     parser.add_argument("--steps", type=int, default=30, help="steps of each process")
@@ -54,15 +63,16 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--runs", type=Path, default=Path("outputs/step"), help="where the runs are kept")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
     parser.add_argument("--stages-of", type=Path, default=None, help="print the stages of this run, as JSON")
-    return parser.parse_args(words)
+    given = parser.parse_args(words)
+    if given.scene != "demo" and not given.scenes:
+        parser.error(f"--scene {given.scene} needs --scenes FOLDER, the folder with the captures")
+    return given
 
 
 def subject(backbone: str, given: argparse.Namespace) -> Path:
     """The run whose steps are measured."""
-    words = ["scene=demo", "iterations=600"]
-    if given.scenes:
-        words = ["scene=colmap", f"scene.path={given.scenes / 'fox'}", "scene.downscale=4", "iterations=1000"]
-    folder = given.runs / f"{'fox' if given.scenes else 'demo'}_{backbone}"
+    words = SCENES[given.scene][1] + ([f"scene.path={given.scenes / given.scene}"] if given.scene != "demo" else [])
+    folder = given.runs / f"{given.scene}_{backbone}"
     chosen = [f"backbone={backbone}", *(["backbone.capacity=published"] if "scaffold" not in backbone else [])]
     train(folder, [*words, *chosen, "rasterizer=compiled", "device=cpu"], log=folder.with_name(f"{folder.name}.log"))
     return folder
@@ -139,7 +149,7 @@ def measured(given: argparse.Namespace, command: str) -> Section:
     with checked_out(given.against) if given.against else nullcontext() as old:
         rows = [row for name in given.backbones.split(",") for row in rows_of(name, given, limits, old)]
     notes = [NOTE, *([f"Before: revision {given.against}."] if given.against else [])]
-    title = f"Stages of a training step, {'fox at a quarter' if given.scenes else 'the built-in scene'}"
+    title = f"Stages of a training step, {SCENES[given.scene][0]}"
     return stamped(title, COLUMNS, rows, notes, load, command)
 
 
@@ -150,8 +160,7 @@ def main(words: Sequence[str]) -> int:
         print(json.dumps(vars(measure_stages(given.stages_of, given.steps))))
         return 0
     section = measured(given, shown_command(words, "benchmarks/step.py"))
-    name = "fox" if given.scenes else "demo"
-    write_results(given.to, "step_cpu", describe_machine(torch.device("cpu")), {name: section})
+    write_results(given.to, "step_cpu", describe_machine(torch.device("cpu")), {given.scene: section})
     print(text_table(section))
     found = slower(section["rows"])
     print("\n".join(found))
