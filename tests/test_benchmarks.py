@@ -207,7 +207,7 @@ def test_files_that_cannot_be_added_to_are_refused_before_anything_is_measured(
 def test_committed_results_are_what_the_writer_reads_and_their_pages_are_theirs() -> None:
     from measuring.results import markdown
 
-    files = sorted(benchmark.RESULTS.glob("*.json"))
+    files = sorted(benchmark.RESULTS.rglob("*.json"))
     assert files
     for file in files:
         sections = read_sections(file)
