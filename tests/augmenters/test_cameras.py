@@ -1,6 +1,8 @@
 """Cameras of pseudo views against the worked example and identities."""
 
 import math
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -17,6 +19,7 @@ from gsx.augmenters.cameras import (
     window_size,
     worst_window,
 )
+from gsx.augmenters.planner import Planner
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
@@ -128,6 +131,24 @@ def test_the_grid_covers_the_raster(size: tuple[int, int]) -> None:
         window.cut(seen[None]).add_(1)
         assert window == grid_window(64, 48, size, turn + count)
     assert float(seen.min()) >= 1
+
+
+@pytest.mark.parametrize("variants", [1, 2, 3])
+@pytest.mark.parametrize("variant", [0, 1])
+def test_windows_of_all_events_cover_the_raster(variants: int, variant: int) -> None:
+    """Four cells, and so many pictures of each camera at an event that two in turn would meet the same ones."""
+    options: Any = SimpleNamespace(window="grid", variants=variants)
+    planner = Planner(name="upscale", options=options, seed=0, extent=1.0, events=range(100, 112))
+    run, pose, generator = cast(Any, None), cast(Any, SimpleNamespace(size=(64, 48))), torch.Generator()
+    own = [0] if variant == 0 else range(1, variants + 1)
+    for parent in (0, 3):
+        found = {
+            (placed.left, placed.top)
+            for event in planner.events
+            for one in own
+            for placed in [planner.placed(run, parent, pose, (32, 24), event, one, generator)]
+        }
+        assert found == {(0, 0), (32, 0), (0, 24), (32, 24)}
 
 
 def test_random_windows_reach_every_border() -> None:

@@ -22,6 +22,7 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
+from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.training.checked_regenerator import displacement
 from gsx.core.training.parameter_table import table_tensors
@@ -31,7 +32,7 @@ from gsx.experiments.runs.open import open_run
 from gsx.regenerators.diffusion.cascade import Cascade
 from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, ModelSpec, steps_for
 from gsx.regenerators.diffusion.options import DiffusionOptions
-from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
+from gsx.regenerators.diffusion.redraw import Diffusion, PaddedImage, any_pipeline, content_of
 from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.diffusion.tuning import closest
 
@@ -346,10 +347,20 @@ def test_scales_out_of_reach_are_refused(name: str, scales: list[int], complaint
         Diffusion(RECIPES[name], options_of(name)).check(small_scene(spread(4)).train, scales, False)
 
 
+def test_flat_pictures_of_other_shapes_are_not_taken_for_one_another() -> None:
+    low, wide = (
+        PaddedImage(number=0, image=torch.ones(3, *size), inside=Window(left=0, top=0, width=8, height=8),
+                    request=request(torch.ones(3, 8, 8), 2), reference=None)
+        for size in ((16, 24), (24, 16))
+    )  # fmt: skip
+    assert content_of(low) != content_of(wide)
+    assert content_of(low) == content_of(replace(low, number=3))
+
+
 def test_one_step_is_executed_at_every_strength() -> None:
     """Spec 1.2: 17 steps at .06, 100 at .01."""
     assert (steps_for(0.06, 0), steps_for(0.0489, 0), steps_for(0.01, 0)) == (17, 21, 101)
-    assert all(int(steps_for(n / 10000, 0) * n / 10000) == 1 for n in range(100, 601))
+    assert all(int(steps_for(n / 10000, 0) * n / 10000) == 1 for n in (*range(100, 601), 9_999, 10_000))
 
 
 def test_batches_that_do_not_fit_are_halved_and_one_picture_is_an_error() -> None:
@@ -738,6 +749,18 @@ def test_packages_that_are_not_installed_are_named(monkeypatch: pytest.MonkeyPat
     for name, more in (("sd_x4", ""), ("sdxl_turbo_raw", ""), ("sdxl_turbo", ", peft")):
         with pytest.raises(ConfigError, match=told.format(more)):
             Diffusion(RECIPES[name], options_of(name)).check(views, [1], False)
+
+
+def test_an_adapter_that_the_clock_has_cut_short_is_the_runs_alone(
+    pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    hurried = [*TUNING, "regenerator.restore.tuning.seconds=0.001", "regenerator.restore.tuning.crops=4"]
+    Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *hurried, model=models["useful"])).prepare(
+        context_for(tmp_path / "run", pairs)
+    )
+    assert not json.loads((tmp_path / "run" / "sdxl_turbo" / "adapter.json").read_text())["whole"]
+    assert not list((tmp_path / "cache").glob("lora/*/adapter.safetensors"))
 
 
 def test_half_precision_is_not_tuned() -> None:

@@ -146,8 +146,8 @@ class Planner:
         if kind == "random" or (kind == "error" and variant > 0):
             return random_window(width, height, size, generator)
         if kind == "grid":
-            turn = self.events.index(event) * (self.options.variants + 1) + variant + parent
-            return grid_window(width, height, size, turn)
+            each, place = (1, 0) if variant == 0 else (self.options.variants, variant - 1)
+            return grid_window(width, height, size, self.events.index(event) * each + place + parent)
         if kind == "error":
             view = run.photographed[parent]
             error = blacked(render(run, pose).image - view.image(), view.counted())

@@ -78,10 +78,8 @@ class Called:
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """Each picture, in order."""
-        function = self.function()
+        function, more = self.function(), self.options.arguments
         return [
-            function(
-                r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **self.options.arguments
-            )
+            function(r.image.clone(), scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
             for r in requests
         ]

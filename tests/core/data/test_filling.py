@@ -115,3 +115,13 @@ def test_many_points_are_looked_at_a_part_at_a_time(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(filling, "MOST_DISTANCES", 300 * 7)
     assert torch.equal(in_front(pixels, depths), whole)
     assert 0 < int(whole.sum()) < 300
+    scene, largest, apart = scene_of(wall(300)), 0, torch.cdist
+
+    def watched(places: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        nonlocal largest
+        largest = max(largest, len(places) * len(pixels))
+        return apart(places, pixels)
+
+    monkeypatch.setattr(torch, "cdist", watched)
+    gaps_of(scene.train[0], scene.points, 1000, generator)
+    assert 0 < largest <= 300 * 7

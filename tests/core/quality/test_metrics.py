@@ -35,6 +35,19 @@ def test_psnr_of_equal_images_is_infinite() -> None:
     assert psnr(image, image) == math.inf
 
 
+def test_of_nothing_there_is_no_figure() -> None:
+    picture, none = (
+        torch.rand(3, 20, 20, generator=torch.Generator().manual_seed(0)),
+        torch.zeros(20, 20, dtype=torch.bool),
+    )
+    assert math.isnan(psnr(picture, 1 - picture, none))
+    assert math.isnan(psnr(picture * math.nan, picture))
+    rim = none.clone()
+    rim[:4] = True  # of no whole window the middle
+    assert math.isnan(ssim(picture, 1 - picture, "inria", none))
+    assert math.isnan(ssim(picture, 1 - picture, "valid", rim))
+
+
 def test_psnr_agrees_with_torchmetrics() -> None:
     from torchmetrics.functional.image import peak_signal_noise_ratio  # takes seconds to import
 

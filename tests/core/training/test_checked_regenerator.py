@@ -101,6 +101,7 @@ def test_half_a_pixel_of_the_finer_raster_is_the_limit() -> None:
 @pytest.mark.parametrize(("spoil", "reason"), [
     (lambda image: image[:, :, 1:], "should be (3, 80, 100)"),
     (lambda image: image / 0, "not finite"),
+    (lambda image: (255 * image).byte(), "its values are uint8 and should be display values in"),
     (lambda image: image + 0.05, "levels off"),
     (lambda image: image.flip(2), "dB from its input"),
 ])  # fmt: skip
@@ -130,6 +131,16 @@ def test_colours_are_put_right_where_they_drift() -> None:
     assert torch.equal(colour_matched(given, fine() + 1 / 255), fine() + 1 / 255)
     matched = colour_matched(given, fine() + torch.tensor([0.1, 0.0, -0.05])[:, None, None])
     torch.testing.assert_close(matched.mean((1, 2)), texture().mean((1, 2)))
+
+
+def test_a_picture_that_reduces_to_its_input_in_light_keeps_its_colour() -> None:
+    """Stripes of 0 and 1 are 0.735 as their mean light is shown, not 0.5."""
+    stripes, light = (torch.arange(24) % 2).float().expand(3, 24, 24).contiguous(), Reduction(light="linear")
+    given = replace(request(light.reduce(stripes, 2)), reduction=light)
+    assert float(given.image.mean() - stripes.mean()) > 0.2
+    assert torch.equal(colour_matched(given, stripes), stripes)
+    off = colour_matched(given, 0.9 * stripes)
+    assert float((light.reduce(off, 2) - given.image).mean().abs()) < 0.03
 
 
 def test_box_averages() -> None:
@@ -210,6 +221,14 @@ def test_the_mean_of_samples_counts_and_is_projected_where_that_is_asked_for() -
     (moved,) = checked(uneven).redraw([asked], samples=2, project=True)
     assert moved.image is not None
     torch.testing.assert_close(box_average(moved.image, 2), asked.image)
+
+
+def test_samples_of_other_sizes_are_dropped_as_one_of_that_size_is() -> None:
+    def growing(asked: Request) -> Tensor:
+        return torch.rand(3, 16, 16 + asked.seed % 2)
+
+    (found,) = checked(growing).redraw([request(torch.full((3, 8, 8), 0.5))], samples=2)
+    assert found.problem == "a: it is (3, 16, 17) and should be (3, 16, 16)"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from torch import Tensor
 from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
+from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
@@ -207,6 +208,19 @@ def test_fitted_colours_are_those_of_the_left_half_and_judged_on_the_right(
     assert found["zoom"]["2"]["enlarged_psnr"] == close(decibels(19, 4))
     assert "least squares" in found["protocol"]["colours"]
     assert found["protocol"]["hash"] != figures["protocol"]["hash"]
+
+
+def test_a_view_of_which_nothing_would_be_judged_is_refused_by_name(tmp_path: Path) -> None:
+    lpips = LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
+    options = EvalOptions(zoom=[1], quantise=True, ssim="inria", tile_pixels=1 << 20, lpips=lpips, colours="fitted")
+    run = run_of(tmp_path, Brighter)
+    view = run.scene.test[0]
+    left = torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
+    left[:, : view.camera.width // 2] = True
+    with pytest.raises(InputError, match=f"{view.name}: its mask leaves nothing of the right half"):
+        Evaluator(run, options).judged(view, left)
+    left[0, -1] = True
+    assert Evaluator(run, options).judged(view, left).sum() == 1
 
 
 def test_counts_and_sizes(figures: dict[str, Any]) -> None:

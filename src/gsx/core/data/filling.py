@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, Scene, View
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Bool, Float, Int
 
 NEIGHBOURS = 3
 """Points that a depth is carried over from."""
@@ -55,7 +55,7 @@ def gaps_of(
     pixels, depths = pixels[shown], depths[shown]
     size = torch.tensor(camera.size, dtype=torch.float32)
     asked = torch.rand(count, 2, generator=generator) * size
-    apart, nearest = torch.cdist(asked, pixels).topk(min(NEIGHBOURS, len(pixels)), largest=False)
+    apart, nearest = nearest_of(asked, pixels, min(NEIGHBOURS, len(pixels)))
     gaps = apart[:, 0] > math.sqrt(camera.width * camera.height / len(pixels))
     counted = view.counted()
     column, row = asked.long().unbind(1)
@@ -76,7 +76,14 @@ def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tens
 
 def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[Tensor, "M"]:
     """Points that are not much farther than what is seen beside them."""
-    rows = max(1, MOST_DISTANCES // max(1, len(pixels)))
-    count = min(COVERED, len(pixels))
-    nearest = torch.cat([torch.cdist(part, pixels).topk(count, largest=False)[1] for part in pixels.split(rows)])
+    _, nearest = nearest_of(pixels, pixels, min(COVERED, len(pixels)))
     return depths <= BEHIND * depths[nearest].amin(1)
+
+
+def nearest_of(
+    places: Float[Tensor, "P 2"], pixels: Float[Tensor, "M 2"], count: int
+) -> tuple[Float[Tensor, "P count"], Int[Tensor, "P count"]]:
+    """(distances to the nearest pixels, which those are) of some places, MOST_DISTANCES at a time."""
+    parts = places.split(max(1, MOST_DISTANCES // max(1, len(pixels))))
+    found = [torch.cdist(part, pixels).topk(count, largest=False) for part in parts]
+    return torch.cat([distances for distances, _ in found]), torch.cat([which for _, which in found])

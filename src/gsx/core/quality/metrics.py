@@ -23,14 +23,15 @@ def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
 def psnr(
     image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None = None
 ) -> float:
-    """20 log10(1 / sqrt(MSE)) over all channels of the pixels that count (None: all), dB; inf for equal images."""
+    """20 log10(1 / sqrt(MSE)) over all channels of the pixels that count (None: all), dB; inf for equal images, nan
+    where none counts."""
     squares = (image.double() - target.double()).square()
     return decibel(float((squares if counted is None else squares[:, counted.to(squares.device)]).mean()))
 
 
 def decibel(mean_square: float) -> float:
-    """20 log10(1 / sqrt(mean square)), dB; inf for 0."""
-    return -10 * math.log10(mean_square) if mean_square > 0 else math.inf
+    """20 log10(1 / sqrt(mean square)), dB; inf for 0, nan for nan."""
+    return math.inf if mean_square == 0 else -10 * math.log10(mean_square)
 
 
 def ssim(
@@ -40,7 +41,7 @@ def ssim(
     counted: Bool[Tensor, "H W"] | None = None,
     compiled: bool = False,
 ) -> float:
-    """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all).
+    """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all); nan where none does.
 
     They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
     `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
@@ -75,13 +76,14 @@ def whole_windows(
         image, target = (pad(picture, margin, mode="replicate") for picture in (image, target))
         counted = None
     count, rows = image.shape[1] - WINDOW + 1, max(1, STRIP_PIXELS // image.shape[2])
-    weights = torch.ones(count, image.shape[2] - WINDOW + 1) if counted is None or not counted.any() else counted
+    weights = torch.ones(count, image.shape[2] - WINDOW + 1) if counted is None else counted
     weights, total = weights.to(image.device).double(), 0.0
     for top in range(0, count, rows):
         strip = slice(top, min(top + rows, count) + WINDOW - 1)
         found = ssim_map(image[:, strip], target[:, strip], padding=0, compiled=compiled)
         total += float((found * weights[top : top + rows]).sum())
-    return total / (len(image) * float(weights.sum()))
+    windows = len(image) * float(weights.sum())
+    return total / windows if windows else math.nan
 
 
 def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:

@@ -208,8 +208,7 @@ class CheckedRegenerator:
         results = [self.results([replace(one, seed=one.seed + n) for one in requests]) for n in range(samples)]
         drawn = []
         for request, *of_one in zip(requests, *results, strict=True):
-            mean = torch.stack([result.detach().cpu().float() for result in of_one]).mean(0)
-            drawn.append(self.checked(request, mean, project))
+            drawn.append(self.checked(request, of_one, project))
         self.tally.pending += [replace(one, image=None) for one in drawn]
         return drawn
 
@@ -231,11 +230,12 @@ class CheckedRegenerator:
             raise TrainingError(f"{told} {len(pictures)}: {remedy}")
         return pictures
 
-    def checked(self, request: Request, result: Tensor, project: bool) -> Redrawn:
-        """The result, put right, if it may be used."""
-        name, problem = request.view.name, unusable(request, result)
-        if problem:
-            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {problem}")
+    def checked(self, request: Request, results: Sequence[Tensor], project: bool) -> Redrawn:
+        """The mean of the results, put right, if it may be used."""
+        name, problems = request.view.name, [told for one in results if (told := unusable(request, one))]
+        if problems:
+            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {problems[0]}")
+        result = torch.stack([one.detach().cpu().float() for one in results]).mean(0)
         result = colour_matched(request, result)
         if project and request.scale > 1:
             result = projected(result, request.image.cpu(), request.scale, request.reduction)
@@ -249,9 +249,20 @@ class CheckedRegenerator:
 
 
 def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The result, its mean colour put right where it is more than LARGEST_DRIFT off."""
-    drift = result.cpu().float().mean((1, 2)) - request.image.cpu().mean((1, 2))
-    return result if float(drift.abs().max()) <= LARGEST_DRIFT else result.cpu() - drift[:, None, None]
+    """The result, its mean colour put right where it is more than LARGEST_DRIFT off, reduced: where light is reduced a
+    finer picture has another mean of display values."""
+    low, given = both_reduced(request, result)
+    drift = low.mean((1, 2)) - given.mean((1, 2))
+    return result if float(drift.abs().max()) <= LARGEST_DRIFT else result - drift[:, None, None]
+
+
+def both_reduced(
+    request: Request, result: Float[Tensor, "3 H W"]
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
+    """(a result as coarse as its input, the input), without the rim of the window, which was reduced from pixels beyond
+    it."""
+    reduction = request.reduction
+    return reduction.inner(reduction.reduce(result, request.scale)), reduction.inner(request.image.cpu())
 
 
 def unusable(request: Request, result: Tensor) -> str:
@@ -259,19 +270,16 @@ def unusable(request: Request, result: Tensor) -> str:
     expected = (3, *request.result_size)
     if tuple(result.shape) != expected:
         return f"it is {tuple(result.shape)} and should be {expected}"
+    if not result.is_floating_point():
+        return f"its values are {str(result.dtype).removeprefix('torch.')} and should be display values in [0, 1]"
     if not bool(torch.isfinite(result).all()):
         return "it holds values that are not finite"
     return ""
 
 
 def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
-    """How a result differs from its input by more than a check allows, in words by the check's name.
-
-    Looked at without the rim of the window, which was reduced from pixels beyond it.
-    """
-    reduction = request.reduction
-    low = reduction.inner(reduction.reduce(result.cpu().float().clamp(0, 1), request.scale))
-    given = reduction.inner(request.image.cpu())
+    """How a result differs from its input by more than a check allows, in words by the check's name."""
+    low, given = both_reduced(request, result.cpu().float().clamp(0, 1))
     drift = 255 * float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
     agreement = psnr(low, given) if request.scale > 1 else math.inf
     shift = displacement(low, given) if checks.displacement.active else 0.0

@@ -21,6 +21,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
+from gsx.core.errors import InputError
 from gsx.core.quality.alignment import aligned
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.ranges import Range
@@ -222,8 +223,20 @@ class Evaluator:
         return transformed(image, self.matrices[view.name]).clamp(0, 1)
 
     def judged(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of a view are judged, of those that count; None: all."""
-        return half(view, counted, right=True) if self.options.right_halves else counted
+        """Which pixels of a view are judged, of those that count; None: all.
+
+        Raises:
+            InputError: none is.
+        """
+        if not self.options.right_halves:
+            return counted
+        right = half(view, counted, right=True)
+        if not right.any():
+            raise InputError(
+                f"{view.name}: its mask leaves nothing of the right half, by which pictures are judged where colours "
+                "are fitted or poses are aligned: give eval.colours=rendered eval.poses=given, or leave that view out"
+            )
+        return right
 
     def drawn_from(self, view: View) -> Camera:
         """The camera that a view is drawn from."""

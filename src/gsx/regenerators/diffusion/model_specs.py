@@ -88,9 +88,10 @@ class ModelSpec:
 def steps_for(strength: float, steps: int) -> int:
     """The steps to ask for; 0: as many as let image-to-image, which executes int(steps * strength), execute one.
 
-    floor(1/s) + 1, the authors' rule; ceil(1/s) ends in none for some strengths (diffusers).
+    floor(1/s) + 1, the authors' rule, which for s = 1 would execute two; ceil(1/s) ends in none for some strengths
+    (diffusers).
     """
-    return steps or math.floor(1 / strength) + 1
+    return steps or (1 if strength == 1 else math.floor(1 / strength) + 1)
 
 
 def pictures_of(pipe: Any, batch: Batch, steps: int, guidance: float, **more: Any) -> Tensor:

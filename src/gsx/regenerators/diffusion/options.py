@@ -90,7 +90,8 @@ class PipelineOptions(DiffusionOptions):
             raise ValueError(f"regenerator {self.name}: steps must be at least 1")
         if self.custom and not self.custom.endswith(".py"):
             raise ValueError(f"regenerator {self.name}: custom is '{self.custom}'; give a file ending in .py")
-        taken = set(self.arguments) & {"image", "prompt", "generator", "output_type", self.reference}
+        ours = {"image", "prompt", "generator", "output_type", "num_inference_steps", "guidance_scale", self.reference}
+        taken = set(self.arguments) & ours
         if taken:
             raise ValueError(
                 f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives it"

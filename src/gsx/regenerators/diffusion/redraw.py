@@ -245,9 +245,10 @@ def batch_of(together: Sequence[PaddedImage]) -> Batch:
 
 def content_of(part: PaddedImage) -> str:
     """Of all that a picture's result depends on, but for its company."""
-    request, exact = part.request, hashlib.sha256(part.image.numpy().tobytes())
-    if part.reference is not None:
-        exact.update(part.reference.numpy().tobytes())
+    request, exact = part.request, hashlib.sha256()
+    for picture in (part.image, part.reference):
+        if picture is not None:
+            exact.update(repr(tuple(picture.shape)).encode() + picture.numpy().tobytes())
     return content_key(exact.hexdigest(), request.seed, request.strength, request.prompt)
 
 

@@ -90,7 +90,7 @@ def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: Regener
         shared = cache_folder(ADAPTERS, key_of(pairs, options, context, files))
         if not adopted(shared, own):
             new_adapter(pipe.to(context.device), options, spec, context, pairs, files, own)
-            if options.cached:
+            if options.cached and read_facts(own)["whole"]:  # what the clock has cut short is this run's alone
                 share(own, shared)
     facts = read_facts(own)
     refuse_another(facts, own, options, files)
