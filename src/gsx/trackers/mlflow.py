@@ -202,8 +202,17 @@ def client_of(uri: str) -> Any:
 
 
 def own_store(run: Run) -> str:
-    """URI of the database in the output folder."""
-    return f"{SQLITE}{Path(run.config['output']).resolve() / 'mlflow.db'}"
+    """URI of the database in the output folder.
+
+    Raises:
+        ConfigError: no such URI can name that folder.
+    """
+    file = Path(run.config["output"]).resolve() / "mlflow.db"
+    if set("?%") & set(str(file)):
+        raise ConfigError(
+            f"MLflow cannot have its database in {file}, for ? or %: give tracker.mlflow.uri=sqlite:///FILE"
+        )
+    return f"{SQLITE}{file}"
 
 
 def experiment_id(client: Any, uri: str, name: str) -> str:

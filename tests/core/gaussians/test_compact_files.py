@@ -89,6 +89,18 @@ def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
     torch.testing.assert_close(read.sh_dc, torch.tensor([[1.0065, 0.0131, -1.0065]]), atol=1e-4, rtol=0)
 
 
+def test_spz_with_extensions_is_read_without_them(tmp_path: Path) -> None:
+    data = bytearray(gzip.decompress(encode_spz(arrays_of(the_splat()))))
+    for flags, readable in ((0, False), (2, True)):
+        data[14] = flags
+        (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data) + struct.pack("<IIB", 0xADBE0002, 1, 3)))
+        if readable:
+            torch.testing.assert_close(read_gaussians(tmp_path / "a.spz").means, the_splat().means)
+        else:
+            with pytest.raises(InputError, match="has not the bytes of 1 splats"):
+                read_gaussians(tmp_path / "a.spz")
+
+
 def test_compressed_ply_of_a_splat_by_hand() -> None:
     content = encode_compressed_ply(arrays_of(the_splat()))
     assert content.startswith(b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n")

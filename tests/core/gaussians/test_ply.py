@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import read_ply, write_ply
+from gsx.core.gaussians.ply import length_of, read_ply, write_ply
 
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\nproperty uchar red\nend_header\n"
 
@@ -48,6 +48,13 @@ def test_ascii_with_faces_and_windows_line_ends(tmp_path: Path) -> None:
     columns = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(columns["x"], np.array([0.25, -1000], np.float32))
     np.testing.assert_array_equal(columns["red"], np.array([3, 255], np.uint8))
+
+
+def test_a_comment_may_hold_the_word_that_ends_the_header(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", {"x": np.array([2.5], np.float32)}, ["what follows end_header is binary"])
+    assert read_ply(tmp_path / "a.ply")["x"].tolist() == [2.5]
+    content = (tmp_path / "a.ply").read_bytes()
+    assert length_of(content) == len(content)
 
 
 def test_no_vertices(tmp_path: Path) -> None:

@@ -73,6 +73,15 @@ def test_slopes_are_told_beside_bows_and_by_pixels_that_tell() -> None:
     assert slopes_of_light(image[..., :4, :4], photograph[..., :4, :4], ALL[:4, :4], 16).isnan().all()
 
 
+@pytest.mark.parametrize("size", [(36, 48), (35, 47), (41, 53)])
+def test_slopes_are_those_of_the_whole_side(size: tuple[int, int]) -> None:
+    """Also where sixths of it are no whole numbers of pixels."""
+    image = torch.full((3, *size), 0.4)
+    found = slopes_of_light(image, shaded(image, 0.3, -0.2), torch.ones(size, dtype=torch.bool), 9)[0]
+    torch.testing.assert_close(found[0], torch.tensor([0.15, 0.3, 0.3], dtype=torch.float64), atol=1e-3, rtol=0)
+    torch.testing.assert_close(found[1], torch.full((3,), -0.2, dtype=torch.float64), atol=1e-3, rtol=0)
+
+
 def options(**changes: object) -> ExposureOptions:
     """Those of conf, asked for, and changes."""
     return replace(ExposureOptions(when="auto", grid="auto"), **changes)

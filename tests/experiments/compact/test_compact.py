@@ -210,6 +210,16 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrin
     assert torch.equal(run.backbone.table["means"], before)
 
 
+def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
+    run = opened(folder)
+    run.exposures.begin(torch.eye(3, 4).repeat(len(run.photographed), 1, 1))
+    tried = Shrinking(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
+    first, _, again = (tried.attempt(share, tried.untouched.degree, False).drop for share in (0.25, 0.5, 0.25))
+    assert first == again
+    tried.take(tried.untouched)
+    assert torch.equal(run.exposures.tensors()["matrices"], torch.eye(3, 4).repeat(len(run.photographed), 1, 1))
+
+
 def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
     """Tries lose half a dB of the share of their rows, and what is given of their degree; nothing is learnt."""
     rows = len(shrinking.worth)

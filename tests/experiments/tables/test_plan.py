@@ -21,7 +21,7 @@ from gsx.experiments.run_folder.run_key import (
 from gsx.experiments.runs.compose import Compositions, compose
 from gsx.experiments.runs.settings import Settings, write_config
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, plan_lines, planned
-from gsx.experiments.tables.sweep import experiment_of, run_table
+from gsx.experiments.tables.sweep import experiment_of, protocol_of, run_table
 
 ROWS = {"control": "octree_gs", "UP": "octree_up", "UB": "octree_ub", "early": "octree_ub_start_10k",
         "same": "octree_ub_infer_1", "other": "3d_gs"}  # fmt: skip
@@ -214,6 +214,8 @@ def test_a_run_is_compared_with_what_it_was_trained_on() -> None:
         (["experiment.seeds=[]"], "different ones"),
         (["backbone.voxxel=1", "experiment.only=[3D-GS,Octree-3D-GS]"], "no configuration key"),
         (["hydra/launcher=slurrm"], "slurrm"),
+        (["experiment.baseline=3D-GS-Up"], "Did you mean '3D-GS-UP'"),
+        (["experiment.published=frameworkss"], "no table of the paper"),
     ],
 )
 def test_mistakes_are_named_before_anything_runs(words: list[str], message: str, tmp_path: Path) -> None:
@@ -249,6 +251,18 @@ def test_a_row_may_be_overrides_instead_of_a_variant(tmp_path: Path) -> None:
     assert "init=warm_start" in lanczos
     assert "weight_split=run" in lanczos
     assert "weight_split=run" not in baseline
+
+
+def test_a_row_may_be_added_and_is_told_to_be_none_of_the_papers(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    words = ["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", "experiment.dry=true",
+             "+experiment.rows.mine=3d_gs", "experiment.only=[3D-GS,mine]"]  # fmt: skip
+    with Compositions(plugins()) as compositions:
+        table, plain = (experiment_of(some, compositions) for some in ([words[0], *words[4:]], words[:1]))
+        cells = list(cells_of(table, DATASETS, lambda row: [f"output={tmp_path}"], compositions.settings))
+        assert "mine is no row of its table" in protocol_of(plain, cells, compositions)
+    assert run_table(words, plugins(), lambda config: None)[1] == 0
 
 
 def test_every_row_of_overrides_composes(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
 """numpy's names of PLY's types, under both generations of names; the first name of each is written."""
 
 
+HEADER_END = b"\nend_header"
+"""Of a PLY, at the beginning of a line."""
 MOST_DIGITS = 15
 """Of a number of vertices: a file with more does not exist."""
 
@@ -32,8 +34,8 @@ def read_ply(path: str | Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"Point file '{path}' does not exist, check the path.")
     data = path.read_bytes()
-    body = data.find(b"\n", data.find(b"end_header")) + 1
-    if not data.startswith(b"ply") or not body or b"end_header" not in data[:body]:
+    body = header_length(data)
+    if not data.startswith(b"ply") or not body:
         raise InputError(f"'{path}' has no complete PLY header, export it anew as PLY.")
     lines = [line.split() for line in data[:body].decode("latin-1").splitlines()]
     layout, count, table = _layout(lines, path)
@@ -109,9 +111,15 @@ def length_of(head: bytes) -> int:
     return body + sum(count * kinds.itemsize for _, count, kinds in _elements(lines))
 
 
+def header_length(content: bytes) -> int:
+    """Bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
+    end = content.find(HEADER_END)
+    return content.find(b"\n", end + 1) + 1 if end >= 0 else 0
+
+
 def _binary_header(content: bytes) -> tuple[int, list[list[str]]]:
     """Length of the header, and the words of its lines."""
-    body = content.find(b"\n", content.find(b"end_header")) + 1
+    body = header_length(content)
     lines = [line.split() for line in content[:body].decode("latin-1").splitlines()]
     whole = content.startswith(b"ply") and ["end_header"] in lines
     if not whole or ["format", "binary_little_endian", "1.0"] not in lines:

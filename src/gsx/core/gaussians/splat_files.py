@@ -14,7 +14,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.arrays import Arrays, arrays_of, degree_of, gaussians_from
 from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.core.gaussians.glb import decode_glb, encode_glb
-from gsx.core.gaussians.ply import read_ply, write_ply, write_whole
+from gsx.core.gaussians.ply import HEADER_END, read_ply, write_ply, write_whole
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.smoothing import smoothed_raw
 from gsx.core.gaussians.sog import decode_sog, encode_sog, sog_is_antialiased
@@ -199,7 +199,7 @@ def compensated(path: Path) -> bool:
         return sog_is_antialiased(path)
     if suffix_of(path) == ".glb":
         return b"SplatRenderMode: mip" in head  # a comment of ours
-    lines = head.partition(b"end_header")[0].decode("latin-1").lower().splitlines()
+    lines = head.partition(HEADER_END)[0].decode("latin-1").lower().splitlines()
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
     told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
     return bool(told) and told[-1]

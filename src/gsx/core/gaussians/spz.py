@@ -24,7 +24,7 @@ HEADER = struct.Struct("<IIIBBBB")
 FRACTION_BITS = 12
 FURTHEST = 2048 - 2**-FRACTION_BITS
 """Coordinates that 24 bits hold, scene units."""
-ANTIALIASED = 1
+ANTIALIASED, EXTENDED = 1, 2
 MOST_SPLATS = 10**9
 COLOUR_SCALE = 0.15
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
@@ -86,13 +86,14 @@ def decode_spz(content: bytes, axes: str = "rub") -> Arrays:
     data = unzipped(content, HEADER.size)
     if len(data) < HEADER.size:
         raise InputError("it is no SPZ, or ends within its header: export it anew")
-    magic, version, count, degree, bits, _, _ = HEADER.unpack_from(data)
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in COEFFICIENTS or bits > 23 or count > MOST_SPLATS:
         raise InputError("it is no SPZ of version 2 or 3 with degrees up to 3: export it anew")
     rotation_bytes = 4 if version == 3 else 3
     sizes = [9, 1, 3, 3, rotation_bytes, 3 * COEFFICIENTS[degree]]
     data = unzipped(content, HEADER.size + count * sum(sizes) + 1)
-    if len(data) != HEADER.size + count * sum(sizes):
+    beyond = len(data) - HEADER.size - count * sum(sizes)
+    if beyond < 0 or (beyond and not flags & EXTENDED):  # extensions follow; what they may tell is not read
         raise InputError(f"it has not the bytes of {count:,} splats: copy or export it anew")
     ends = HEADER.size + count * np.cumsum([0, *sizes])
     parts = [

@@ -96,7 +96,8 @@ def slopes_of_light(
     at = torch.tensor(places, dtype=torch.float64).view(-1, 2)
     found = torch.stack(gains) if gains else at.new_zeros(0, 3)
     even = at.sum(1) % 2 == 0
-    middles = (2 * at + 1) / BLOCKS - 1
+    size = at.new_tensor([columns / image.shape[2], rows / image.shape[1]])  # what no block holds is at the far end
+    middles = (2 * at + 1) * size - 1
     return torch.stack([fitted(middles[part], found[part]) for part in (torch.ones_like(even), even, ~even)])
 
 

@@ -195,7 +195,7 @@ class Shrinking:
             way: Reduction(run.backbone.table, self.worth, seen if way else None) for way in (True, False)
         }
         """The order of rows by whether they may be merged."""
-        self.whole = copied(table_tensors(run.backbone.table))
+        self.whole, self.exposures = copied(table_tensors(run.backbone.table)), copied(run.exposures.tensors())
         learn_on(run, self.learnt, degree_of_run(run), options.steps, plugins)
         self.reference = figures(run, self.judging, options.zooms)
         """Of the whole model, which has learnt on like every try: views that judge are no longer learnt from."""
@@ -247,9 +247,11 @@ class Shrinking:
         return made
 
     def cut(self, share: float, degree: int, merging: bool) -> None:
-        """Give the run the whole model with a share of its rows less, merged or not, and colours of a degree."""
+        """Give the run the whole model, at the exposures that it had, with a share of its rows less, merged or not, and
+        colours of a degree."""
         backbone = self.run.backbone
         backbone.table = restored_table(backbone.table, copied(self.whole))
+        self.run.exposures.restore(self.exposures)
         if 0 <= degree < len(self.colours):
             every = torch.ones_like(self.worth, dtype=torch.bool)
             take_coefficients(backbone.table, every, self.colours[degree])

@@ -53,6 +53,12 @@ class Experiment:
                     f"experiment.only: '{row}' is no row of {self.name}; it has {', '.join(self.rows)}."
                     f"{nearest(row, self.rows)}"
                 )
+        known = [*self.rows, *self.quoted]
+        if self.baseline not in known:
+            raise ValueError(
+                f"experiment.baseline: '{self.baseline}' is no row of {self.name}; it has {', '.join(known)}."
+                f"{nearest(self.baseline, known)}"
+            )
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"experiment.seeds is {list(self.seeds)}; give different ones, for example [0,1,2]")
 

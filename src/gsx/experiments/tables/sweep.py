@@ -73,6 +73,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         cells = list(cells_of(experiment, datasets, fitting.__getitem__, compositions.settings))
         plain = experiment_of([word for word in chosen if is_table([word])], compositions)
         foreign = protocol_of(plain, cells, compositions)
+        published = read_table(experiment.published) if experiment.published else None
         lacking = lacking_of(cells, datasets)
         due = [cell for cell in cells if (cell.dataset, cell.scene) not in lacking]
         plan = planned(experiment, datasets, due, together=any("launcher=" in word for word in launching))
@@ -83,7 +84,6 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         tidy(folder, due)
         for number, phase in enumerate(plan.phases):
             launched(compositions, launching, folder / "launched" / str(number), phase, job)
-    published = read_table(experiment.published) if experiment.published else None
     table = table_of(experiment, datasets, cells, published, lacking, foreign)
     write_table(table, folder, [cell.folder for cell in cells if cell.folder.is_dir()])
     return f"{as_text(table)}\n{folder / 'table.md'}\n", 0 if set(table.states) == {"ok"} else 2
@@ -172,16 +172,17 @@ def datasets_of(experiment: Experiment, overrides: Sequence[str], compositions: 
 
 
 def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Compositions) -> list[str]:
-    """In what the rows differ from the paper's, by one scene of each."""
-    home = experiment.datasets[0]
-    of_rows = {cell.row: cell for cell in reversed(cells)}.values()
+    """In what the rows differ from the paper's, by one scene of each; those that it has not are named."""
+    home, by_row = experiment.datasets[0], {cell.row: cell for cell in reversed(cells)}
+    added = [f"{row} is no row of its table" for row in by_row if row not in experiment.rows]
+    of_rows = [cell for row, cell in by_row.items() if row in experiment.rows]
 
     def published(cell: Cell) -> dict[str, Any]:
         name = cell.dataset if cell.dataset in experiment.datasets else home
         words = words_of(experiment.rows[cell.row])
         return compositions.settings([f"dataset={name}", *words, *experiment.overrides]).resolved
 
-    return protocol_differences([(cell.config, published(cell), cell.settings.idle) for cell in of_rows])
+    return added + protocol_differences([(cell.config, published(cell), cell.settings.idle) for cell in of_rows])
 
 
 def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[str, str], str]:

@@ -100,7 +100,9 @@ def face(table: Table) -> list[str]:
 def foot(table: Table) -> list[str]:
     """What stands below the figures."""
     states = ", ".join(f"{count} {state}" for state, count in table.states.items())
-    lines = [f"runs: {states}", f"gains are over {table.experiment.baseline}"]
+    baseline = table.experiment.baseline
+    absent = "" if baseline in table.experiment.chosen else ", which is not run: there are none"
+    lines = [f"runs: {states}", f"gains are over {baseline}{absent}"]
     seeds = table.experiment.seeds
     if len(seeds) > 1:
         lines.append(f"means over {len(seeds)} seeds, ± half of their range")
