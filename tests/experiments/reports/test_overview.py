@@ -234,6 +234,17 @@ def test_curves_of_other_scenes_and_protocols_stay_apart(tmp_path: Path) -> None
     assert not [text for text in rows_of_pictures if "other" in text and re.search(r"(?<!other )\b[ab]\b", text)]
 
 
+def test_scenes_whose_folders_are_called_alike_are_told_apart_by_their_photographs(tmp_path: Path) -> None:
+    for place, name in (("garden", "a"), ("garden", "b"), ("kitchen", "c"), ("copy_of_garden", "d")):
+        folder = make_run(tmp_path / name, {"scene": {"name": "colmap", "path": f"/data/{place}/dense"}})
+        if place == "kitchen":
+            write_image(folder / "renders" / "one.truth.png", torch.full((3, 12, 24), 0.75))
+    write_overview(tmp_path)
+    with (tmp_path / "report.csv").open(newline="") as stream:
+        scenes = {row["run"]: row["scene"] for row in csv.DictReader(stream)}
+    assert scenes == {"a": "colmap dense", "b": "colmap dense", "c": "colmap dense (2)", "d": "colmap dense"}
+
+
 def test_no_points_at_all_are_said_to_be_none(tmp_path: Path) -> None:
     write_lines(make_run(tmp_path / "a"), [(1.0, None)])
     section = Page(write_overview(tmp_path)).section("garden")

@@ -16,6 +16,7 @@ from gsx.core.files import csv_text, remove_partial, replace_text
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import template
+from gsx.experiments.reports.same_scene import told_apart
 from gsx.experiments.reports.side_by_side import pictures_of
 from gsx.experiments.run_folder.files import (
     STATES,
@@ -46,7 +47,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     Raises:
         InputError: there is no run below it.
     """
-    runs = [read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)]
+    runs = told_apart([read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)])
     rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
     remove_partial(folder, below=False)

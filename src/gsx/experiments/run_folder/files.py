@@ -51,6 +51,8 @@ class RunFiles:
     status: dict[str, Any]
     problems: dict[str, str]
     """What is wrong, by file."""
+    namesake: int = 0
+    """How many other scenes of the same name stand before its own, in a report over runs."""
 
     @property
     def step(self) -> int:
@@ -118,7 +120,9 @@ class RunFiles:
     def scene(self) -> str:
         """Scene, with the last part of its folder where it has one."""
         node = part(self.config, "scene")
-        return " ".join(word for word in (str(node.get("name", "?")), Path(str(node.get("path") or "")).name) if word)
+        number = f"({self.namesake + 1})" if self.namesake else ""
+        words = (str(node.get("name", "?")), Path(str(node.get("path") or "")).name, number)
+        return " ".join(word for word in words if word)
 
     @property
     def backbone(self) -> str:
