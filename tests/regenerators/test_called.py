@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from regenerating import request
 from tiny import StopAfter, tiny_run, tiny_settings
 from torch import Tensor
 
@@ -110,18 +109,6 @@ def test_no_module_of_the_working_directory_takes_the_place_of_an_installed_one(
     options = CalledOptions(name="callable", function="colorsys:rgb_to_hsv", arguments={})
     assert callable(Called(options).function())
     assert sys.path == before
-
-
-def centred(image: Tensor, **_: object) -> Tensor:
-    """Works in place on what it is given."""
-    return image.sub_(0.5).div_(0.5)
-
-
-def test_what_a_function_does_to_its_picture_stays_its_own() -> None:
-    asked = request(torch.full((3, 8, 8), 0.25))
-    (result,) = Called(CalledOptions(name="callable", function="test_called:centred", arguments={})).regenerate([asked])
-    assert result.unique().tolist() == [-0.5]
-    assert asked.image.unique().tolist() == [0.25]
 
 
 @pytest.mark.parametrize("function", ["", "os", "os:no_such", "no_such_module:f", "os:name"])

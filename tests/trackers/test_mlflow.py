@@ -19,7 +19,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
-from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, own_store, parameters, portions
+from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, experiment_id, own_store, parameters, portions
 
 RUN = ("iterations=12", "scene.points=100", "scene.train_views=3", "training.checkpoint_every=4",
        "training.log_every=2", "tracker=[mlflow]", "tracker.mlflow.seconds=0")  # fmt: skip
@@ -83,10 +83,12 @@ def test_metrics_are_those_of_the_files(finished: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["what?", "100%25"])
-def test_a_folder_that_no_uri_can_name_is_refused_with_a_remedy(tmp_path: Path, name: str) -> None:
+def test_its_own_database_lies_in_the_output_folder_whatever_that_is_called(tmp_path: Path, name: str) -> None:
     run: Any = SimpleNamespace(config={"output": str(tmp_path / name)})
-    with pytest.raises(ConfigError, match=r"give tracker\.mlflow\.uri=sqlite:///FILE"):
-        own_store(run)
+    experiment = experiment_id(client_of(own_store(run)), own_store(run), "demo")
+    assert experiment
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+    assert (tmp_path / name / "mlflow.db").is_file()
 
 
 def test_the_run_is_named_and_has_its_parameters_and_files(finished: Path, output: Path) -> None:

@@ -337,9 +337,17 @@ def known_to_torch(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def modes(arguments: tuple[Any, ...]) -> tuple[object, ...]:
-    """What code depends on beside what arguments are: whether gradients of one of them are followed, threads, rules."""
-    followed = torch.is_grad_enabled() and any(getattr(value, "requires_grad", False) for value in flat(arguments))
+    """What code depends on beside what arguments are: whether gradients of one of them are followed, how many threads
+    there are, and whether torch is to be deterministic."""
+    followed = torch.is_grad_enabled() and learns(arguments)
     return followed, torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+
+
+def learns(value: Any) -> bool:
+    """Whether it is, or holds, a tensor that requires a gradient."""
+    if isinstance(value, list | tuple):
+        return any(map(learns, value))
+    return isinstance(value, Tensor) and value.requires_grad
 
 
 def kind_of(value: Any) -> object:

@@ -80,6 +80,6 @@ class Called:
         """Each picture, in order."""
         function, more = self.function(), self.options.arguments
         return [
-            function(r.image.clone(), scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
+            function(r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
             for r in requests
         ]

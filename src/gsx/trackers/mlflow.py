@@ -5,10 +5,11 @@ import os
 import re
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl, unquote, urlsplit
 
 from gsx.core.device import device_name
 from gsx.core.errors import ConfigError, first_line
@@ -194,25 +195,27 @@ def client_of(uri: str) -> Any:
 
     if not uri.startswith(SQLITE):
         return MlflowClient(uri)
-    folder = Path(uri.removeprefix(SQLITE)).parent
+    folder = folder_of(uri)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".mlflow.lock").open("w") as stream:
         lock(stream, wait=True)
-        return MlflowClient(uri)
+        client = MlflowClient(uri)
+    quoted = Path(uri.removeprefix(SQLITE)).parent
+    if quoted != folder:  # MLflow makes that folder as well, and leaves it empty
+        with suppress(OSError):
+            quoted.rmdir()
+    return client
+
+
+def folder_of(uri: str) -> Path:
+    """Where the database of a URI lies."""
+    return Path(unquote(uri.removeprefix(SQLITE))).parent
 
 
 def own_store(run: Run) -> str:
-    """URI of the database in the output folder.
-
-    Raises:
-        ConfigError: no such URI can name that folder.
-    """
-    file = Path(run.config["output"]).resolve() / "mlflow.db"
-    if set("?%") & set(str(file)):
-        raise ConfigError(
-            f"MLflow cannot have its database in {file}, for ? or %: give tracker.mlflow.uri=sqlite:///FILE"
-        )
-    return f"{SQLITE}{file}"
+    """URI of the database in the output folder; in it ? and % have another meaning than in a path."""
+    file = str(Path(run.config["output"]).resolve() / "mlflow.db")
+    return SQLITE + file.replace("%", "%25").replace("?", "%3F")
 
 
 def experiment_id(client: Any, uri: str, name: str) -> str:
@@ -220,7 +223,7 @@ def experiment_id(client: Any, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     local = uri.startswith(SQLITE)  # MLflow's own choice is the current folder
-    files = (Path(uri.removeprefix(SQLITE)).parent.resolve() / "mlflow_files" / name).as_uri() if local else None
+    files = (folder_of(uri).resolve() / "mlflow_files" / name).as_uri() if local else None
     try:
         return client.create_experiment(name, artifact_location=files)
     except MlflowException as error:

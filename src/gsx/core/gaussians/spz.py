@@ -93,7 +93,7 @@ def decode_spz(content: bytes, axes: str = "rub") -> Arrays:
     sizes = [9, 1, 3, 3, rotation_bytes, 3 * COEFFICIENTS[degree]]
     data = unzipped(content, HEADER.size + count * sum(sizes) + 1)
     beyond = len(data) - HEADER.size - count * sum(sizes)
-    if beyond < 0 or (beyond and not flags & EXTENDED):  # extensions follow; what they may tell is not read
+    if beyond < 0 or (beyond and not flags & EXTENDED):  # extensions follow, which are not read
         raise InputError(f"it has not the bytes of {count:,} splats: copy or export it anew")
     ends = HEADER.size + count * np.cumsum([0, *sizes])
     parts = [

@@ -70,6 +70,8 @@ def whole_windows(
 
     In strips of rows, so that its maps stay in the CPU's cache.
     """
+    if counted is not None and not counted.any():
+        return math.nan
     missing = [max(0, WINDOW - size) for size in (image.shape[2], image.shape[1])]
     margin = [half for size in missing for half in (size // 2, size - size // 2)]
     if any(missing):
@@ -82,8 +84,7 @@ def whole_windows(
         strip = slice(top, min(top + rows, count) + WINDOW - 1)
         found = ssim_map(image[:, strip], target[:, strip], padding=0, compiled=compiled)
         total += float((found * weights[top : top + rows]).sum())
-    windows = len(image) * float(weights.sum())
-    return total / windows if windows else math.nan
+    return total / (len(image) * float(weights.sum()))
 
 
 def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:

@@ -123,7 +123,8 @@ def geometry(
 
     Fourth is the ln of the factor on opacities that makes up for dilation, all of it (`compensate`) or as far as it
     differs from `drawn`; None unless asked for.
-    `points` and `intrinsics` (fx, fy, cx, cy) are float64; `low` and `high` bound the slopes x/z, y/z in the Jacobian.
+    `dilation` and `drawn` are px^2; `points` and `intrinsics` (fx, fy, cx, cy) are float64; `low` and `high` bound the
+    slopes x/z, y/z in the Jacobian.
     """
     x, y, z = points.unbind(1)
     fx, fy, cx, cy = intrinsics

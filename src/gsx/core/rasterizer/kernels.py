@@ -368,7 +368,7 @@ slow) or take longer to compile (at 120: twice as long, for code that is no fast
 SHARED_AFTER = 50
 """The same of all others: with more of them slopes by segments find weights twice."""
 SUMS = {"gradients", "entry_sums"}
-"""Loops whose code is another where absolute gradients are asked for."""
+"""Loops whose code differs where absolute gradients are asked for."""
 OF_A_TILE = {"x", "y", "products"}
 """Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
 

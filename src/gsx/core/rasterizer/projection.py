@@ -123,8 +123,8 @@ def project(
             for values, elsewhere in zip(given, ELSEWHERE, strict=True)
         )
     compensate = settings.compensate and settings.published_dilation
-    # tensors: numbers would be constants of compiled code, which each makes anew; torch takes float64 ones of no axis
-    # for such numbers as well
+    # tensors of one element: a number would be a constant, so that each dilation would compile anew, and so would, to
+    # torch, a float64 tensor of no dimension
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     compute = geometry

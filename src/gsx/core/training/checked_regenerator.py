@@ -26,6 +26,8 @@ FEWEST = 8
 """Of pictures that are asked for now and then, at least so many are awaited before that is said."""
 LARGEST_DRIFT = 2 / 255
 """Mean colours that differ by more are put right."""
+MOST_CORRECTIONS = 4
+"""Of a mean colour."""
 LEAST_SLOPE = 1e-3
 """Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
 ACTIONS = ("drop", "warn", "off")
@@ -205,7 +207,7 @@ class CheckedRegenerator:
         `samples`: of each the mean of so many results counts. `project`: enlarged pictures are moved to the nearest
         one that reduces to the request's.
         """
-        results = [self.results([replace(one, seed=one.seed + n) for one in requests]) for n in range(samples)]
+        results = [self.results([own_copy(one, n) for one in requests]) for n in range(samples)]
         drawn = []
         for request, *of_one in zip(requests, *results, strict=True):
             drawn.append(self.checked(request, of_one, project))
@@ -248,12 +250,21 @@ class CheckedRegenerator:
         )
 
 
+def own_copy(request: Request, sample: int) -> Request:
+    """A request by the seed of a sample, with a picture that a regenerator may write into."""
+    return replace(request, seed=request.seed + sample, image=request.image.clone())
+
+
 def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The result, its mean colour put right where it is more than LARGEST_DRIFT off, reduced: where light is reduced a
-    finer picture has another mean of display values."""
-    low, given = both_reduced(request, result)
-    drift = low.mean((1, 2)) - given.mean((1, 2))
-    return result if float(drift.abs().max()) <= LARGEST_DRIFT else result - drift[:, None, None]
+    """The result, its mean colour put right where it is more than LARGEST_DRIFT off at the resolution of its input:
+    where light is reduced a finer picture has another mean, and one correction is not enough."""
+    for _ in range(MOST_CORRECTIONS):
+        low, given = both_reduced(request, result)
+        drift = low.mean((1, 2)) - given.mean((1, 2))
+        if float(drift.abs().max()) <= LARGEST_DRIFT:
+            break
+        result = result - drift[:, None, None]
+    return result
 
 
 def both_reduced(

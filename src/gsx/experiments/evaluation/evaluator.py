@@ -354,7 +354,14 @@ class Evaluator:
         return {f"{factor:g}": zoom_entry(factor, figures, details[factor]) for factor, figures in found.items()}
 
     def evaluate(self, drawing: Drawing | None = None, advance: Advance = silent) -> dict[str, Any]:
-        """The content of evaluation.json."""
+        """The content of evaluation.json.
+
+        Raises:
+            InputError: of a view nothing is judged; before any is drawn.
+        """
+        if self.options.right_halves:
+            for view in self.run.scene.test:
+                self.judged(view, view.counted())
         run, views = self.run, self.views(advance)
         primitives, size = size_of(run.backbone.table)
         groups = sorted({v["group"] for v in views if v["group"]})

@@ -101,7 +101,7 @@ def foot(table: Table) -> list[str]:
     """What stands below the figures."""
     states = ", ".join(f"{count} {state}" for state, count in table.states.items())
     baseline = table.experiment.baseline
-    absent = "" if baseline in table.experiment.chosen else ", which is not run: there are none"
+    absent = "" if baseline in table.experiment.chosen else ", which is not run: there are none of ours"
     lines = [f"runs: {states}", f"gains are over {baseline}{absent}"]
     seeds = table.experiment.seeds
     if len(seeds) > 1:

@@ -94,7 +94,7 @@ class PipelineOptions(DiffusionOptions):
         taken = set(self.arguments) & ours
         if taken:
             raise ValueError(
-                f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives it"
+                f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives them itself"
             )
 
     def named_code(self) -> str:
