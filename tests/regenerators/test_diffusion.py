@@ -417,6 +417,13 @@ def test_any_pipeline_is_called_as_its_options_say(models: dict[str, Path], tmp_
     assert torch.equal(general.regenerate(asked)[0], named.regenerate(asked)[0])
 
 
+@pytest.mark.parametrize("name", ["num_inference_steps", "guidance_scale"])
+def test_arguments_that_are_given_already_are_refused_at_once(name: str) -> None:
+    words = ["regenerator/upscale=diffusers_pipeline", f"+regenerator.upscale.arguments.{name}=2"]
+    with pytest.raises(ConfigError, match=f"arguments may not hold {name}: gsx gives them itself"):
+        compose([*words, "regenerator.upscale.model=m"], plugins())
+
+
 def test_a_pipeline_of_ones_own_is_opened_from_its_file(models: dict[str, Path], tmp_path: Path) -> None:
     """A subclass that turns pictures to grey."""
     file = tmp_path / "greying.py"

@@ -159,6 +159,13 @@ def test_some_scenes_are_not_set_against_the_mean_of_all_nor_gains_taken_over_ot
     assert table.at("base", scope.title, "PSNR").difference is None
 
 
+@pytest.mark.parametrize("change", [{"only": ["more"]}, {"baseline": "quoted"}])
+def test_a_baseline_that_is_not_run_is_told(table: Table, change: dict[str, Any]) -> None:
+    assert "gains are over base\n" in as_text(table)
+    other = replace(table, experiment=replace(table.experiment, **change))
+    assert f"gains are over {other.experiment.baseline}, which is not run: there are none of ours" in as_text(other)
+
+
 def test_rows_of_another_revision_of_the_source_are_named(tmp_path: Path) -> None:
     """One run of `base` and both of `more` are of others; `more` was begun by one and finished by another."""
     cells = [cell(r, s, 0, tmp_path) for r in ("base", "more") for s in DATASET["scenes"]]
