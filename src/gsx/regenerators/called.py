@@ -78,8 +78,10 @@ class Called:
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """Each picture, in order."""
-        function, more = self.function(), self.options.arguments
+        function = self.function()
         return [
-            function(r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
+            function(
+                r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **self.options.arguments
+            )
             for r in requests
         ]

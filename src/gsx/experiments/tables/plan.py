@@ -48,19 +48,17 @@ class Experiment:
 
     def __post_init__(self) -> None:
         for row in self.only:
-            if row not in self.rows:
-                raise ValueError(
-                    f"experiment.only: '{row}' is no row of {self.name}; it has {', '.join(self.rows)}."
-                    f"{nearest(row, self.rows)}"
-                )
-        known = [*self.rows, *self.quoted]
-        if self.baseline not in known:
-            raise ValueError(
-                f"experiment.baseline: '{self.baseline}' is no row of {self.name}; it has {', '.join(known)}."
-                f"{nearest(self.baseline, known)}"
-            )
+            self.refuse_unless("only", row, list(self.rows))
+        self.refuse_unless("baseline", self.baseline, [*self.rows, *self.quoted])
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"experiment.seeds is {list(self.seeds)}; give different ones, for example [0,1,2]")
+
+    def refuse_unless(self, key: str, row: str, known: Sequence[str]) -> None:
+        """Raise ValueError for a key's row unless it is one of these."""
+        if row not in known:
+            raise ValueError(
+                f"experiment.{key}: '{row}' is no row of {self.name}; it has {', '.join(known)}.{nearest(row, known)}"
+            )
 
     @property
     def chosen(self) -> dict[str, str]:

@@ -35,7 +35,7 @@ from gsx.regenerators.diffusion.models import (
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
 from gsx.regenerators.diffusion.pace import Pace
 from gsx.regenerators.diffusion.sizes import enlarged, grown
-from gsx.regenerators.diffusion.tuning import Tuned, tuned
+from gsx.regenerators.diffusion.tuning import Tuned, bytes_of, tuned
 
 logger = logging.getLogger(__name__)
 
@@ -248,7 +248,7 @@ def content_of(part: PaddedImage) -> str:
     request, exact = part.request, hashlib.sha256()
     for picture in (part.image, part.reference):
         if picture is not None:
-            exact.update(repr(tuple(picture.shape)).encode() + picture.numpy().tobytes())
+            exact.update(bytes_of(picture))
     return content_key(exact.hexdigest(), request.seed, request.strength, request.prompt)
 
 

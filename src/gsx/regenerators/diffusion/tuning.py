@@ -89,8 +89,8 @@ def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: Regener
         pairs = divided(context, options.tuning)
         shared = cache_folder(ADAPTERS, key_of(pairs, options, context, files))
         if not adopted(shared, own):
-            new_adapter(pipe.to(context.device), options, spec, context, pairs, files, own)
-            if options.cached and read_facts(own)["whole"]:  # what the clock has cut short is this run's alone
+            whole = new_adapter(pipe.to(context.device), options, spec, context, pairs, files, own)
+            if options.cached and whole:  # what the clock has cut short is this run's alone
                 share(own, shared)
     facts = read_facts(own)
     refuse_another(facts, own, options, files)
@@ -114,10 +114,15 @@ def key_of(pairs: Pairs, options: RestorerOptions, context: RegeneratorContext, 
     """Of everything that decides what is learnt."""
     digest = hashlib.sha256()
     for part in (image for pair in (*pairs.own, *pairs.others) for image in pair):
-        digest.update(repr(tuple(part.shape)).encode() + part.numpy().tobytes())
+        digest.update(bytes_of(part))
     machine = (code_stamp(), version("peft"), *machine_stamp(context.device))
     telling = (asdict(options.tuning), options.dtype, options.steps, options.guidance)
     return content_key(files, telling, digest.hexdigest(), context.seed, machine)
+
+
+def bytes_of(picture: Float[Tensor, "3 H W"]) -> bytes:
+    """Shape and values, for a digest: pictures of one colour and of other shapes have the same values."""
+    return repr(tuple(picture.shape)).encode() + picture.numpy().tobytes()
 
 
 def new_adapter(
@@ -128,8 +133,11 @@ def new_adapter(
     pairs: Pairs,
     files: str,
     folder: Path,
-) -> None:
-    """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder."""
+) -> bool:
+    """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder.
+
+    Returns whether all steps were taken.
+    """
     others = pairs.others
     figures = {"error_of_renders": mean_square(others), "error_raw": error_of(pipe, options, spec, others)}
     begun = time.perf_counter()
@@ -165,6 +173,7 @@ def new_adapter(
             "seed": context.seed,
         },
     )
+    return whole
 
 
 def closest(figures: dict[str, float]) -> str:
