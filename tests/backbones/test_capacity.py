@@ -20,7 +20,7 @@ from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Budget, BudgetOptions, Growing, with_rows, worth_in_training
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
@@ -31,7 +31,7 @@ from gsx.core.training.blur import Blur
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.evidence import Removal
 from gsx.core.training.exposure import Exposures
-from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
+from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
@@ -170,21 +170,13 @@ def test_gain_in_decibels_by_hand() -> None:
     assert error == pytest.approx(10 / math.log(10) * math.sqrt(2) * math.sqrt(2) / 10)
 
 
-def test_an_event_on_anchors_adds_what_there_is_room_for_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though cells of several sizes are tried in turn."""
+def test_an_event_on_anchors_adds_what_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     backbone = small_anchors("scaffold")
     monkeypatch.setattr(backbone.capacity, "room", lambda table, wanted, step: 7)
-
-    def grow(table: ParameterTable, representation: object, least: float, room: Callable[[int], int], step: int):
-        asked.append(room(100))
-        append_rows(table, {name: value[:5] for name, value in detached_rows(table).items()})
-        asked.append(room(100))
-        return 5, 0
-
-    monkeypatch.setattr(backbone.grid, "grow", grow)
+    monkeypatch.setattr(backbone.grid, "grow", lambda *given: asked.append(given[3]) or (0, 0))
     backbone.grow_and_prune(1600)
-    assert asked == [7, 2]
+    assert asked == [7]
 
 
 def test_a_cap_that_holds_growth_is_told() -> None:
@@ -202,6 +194,65 @@ def test_what_no_view_shows_outlives_a_budget() -> None:
     model.capacity.judge(model, lambda table: None, 14900)
     assert len(model.table) == 8
     assert bool((model.table["means"][:, 1] < -40).all())
+
+
+def test_a_budget_takes_as_much_from_what_any_view_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve views, each of a place of its own with twenty points: four are asked at an event, all at the last."""
+    monkeypatch.setattr("gsx.backbones.capacity.LOOKS", 4)
+    places = [10.0 * i for i in range(12)]
+    cameras = [look_at([x, -4, 1], [x, 0, 0], fov_x=0.9, width=24, height=16) for x in places]
+    points = torch.cat([spread(20, seed=i) + torch.tensor([x, 0, 0]) for i, x in enumerate(places)])
+    scene = small_scene(points)
+    scene = replace(scene, train=[View(f"view{i}", camera, Grey()) for i, camera in enumerate(cameras)])
+    model = small_gs3d(scene, options=options_of("budget", budget=BudgetOptions(primitives=120)))
+
+    def left() -> list[int]:
+        return (model.table["means"].detach()[:, 0] / 10).round().long().bincount(minlength=12).tolist()
+
+    model.capacity.judge(model, lambda table: None, 4100)  # a quarter of the events: half of the way, 60 too many
+    assert sum(left()) == 240 - 60 * 4 // 12
+    assert left().count(20) >= 8
+    model.capacity.judge(model, lambda table: None, 14900)
+    assert sum(left()) == 120
+    assert min(left()) >= 3
+
+
+@pytest.mark.parametrize("capacity", ["budget", "adaptive"])
+def test_a_run_without_an_event_is_told_that_nothing_is_decided(
+    capacity: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = small_scene(spread(20), views=30)
+    options = options_of(capacity, budget=BudgetOptions(primitives=10 * (capacity == "budget")))
+    small_gs3d(scene, options=options, iterations=40)
+    assert f"backbone.capacity={capacity} changes nothing: density control acts at no step of this run" in caplog.text
+    caplog.clear()
+    small_gs3d(scene, options=options, iterations=400)
+    assert not caplog.text
+
+
+def test_nothing_grows_beyond_the_end_of_a_run() -> None:
+    """Even where growth is to stop later than the published run: what learns on keeps its rows."""
+    growing = small_gs3d(
+        small_scene(spread(20)), options=published_options(stop=40000), iterations=30000
+    ).control.growing
+    assert growing.due(30000)
+    assert not any(growing.due(step) for step in range(30001, 40001))
+
+
+def masked(view: View) -> torch.Tensor:
+    """Nothing of it counts."""
+    return torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
+
+
+def test_masked_windows_tell_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(View, "counted", masked)
+    scene = small_scene(spread(40))
+    model = small_gs3d(scene, options=options_of("adaptive"))
+    half = with_rows(model.table, torch.arange(40) < 20)
+    judge = adaptive(scene)
+    assert judge.tried(model, lambda table: half, 700) == {}
+    assert judge.gain_of_rows(model, torch.arange(40) < 20, 700) == 0
+    assert not len(model.table.record["trials"])
 
 
 @dataclass(frozen=True, kw_only=True)

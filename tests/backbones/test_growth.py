@@ -4,7 +4,6 @@ All lengths are powers of two and all positions their multiples, so that loops a
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -67,9 +66,9 @@ def cloud(
     return ParameterTable(parameters, columns, statistics), representation
 
 
-def under(most: int, table: ParameterTable) -> Callable[[int], int]:
+def under(most: int, table: ParameterTable) -> int:
     """Room up to a table of that many anchors."""
-    return lambda wanted: room_under(most, len(table))
+    return room_under(most, len(table))
 
 
 @pytest.fixture
@@ -200,6 +199,28 @@ def test_no_anchor_is_added_beyond_the_cap_and_the_largest_gradients_come_first(
     assert torch.equal(table["features"], features.expand(3, -1))
     assert deepen(table, neural, depths=1, most=3) == 0
     assert deepen(table, neural, depths=1, most=1) == 0
+
+
+@pytest.mark.usefixtures("keep_all")
+def test_no_pseudo_view_has_seen_a_new_anchor() -> None:
+    """What pseudo views allowed of the filter's size is the older anchors'."""
+    table, neural = cloud([[0.0, 0, 0]], [[[64.0, 0.0, 0.0]]], [[3e-4]])
+    table.columns |= {"filter": torch.tensor([0.25]), "earned": torch.tensor([0.5])}
+    assert deepen(table, neural) == 1
+    assert table["earned"].tolist() == [0.5, math.inf]
+
+
+@pytest.mark.usefixtures("keep_all")
+def test_the_largest_gradients_come_first_whatever_their_cells() -> None:
+    """Four are large, each in a new cell of one voxel only; eight small ones lie in new cells of all sizes."""
+    anchors = [[1024.0 * i, 0, 0] for i in range(12)]
+    offsets = [[[64.0, 0.0, 0.0]]] * 8 + [[[1.0, 0.0, 0.0]]] * 4
+    gradients = [[3e-4 + 1e-6 * i] for i in range(8)] + [[5e-2]] * 4
+    table, neural = cloud(anchors, offsets, gradients)
+    assert deepen(table, neural, most=12 + 6) == 6
+    large = [(1024.0 * i + 1, 0.0, 0.0) for i in range(8, 12)]
+    assert grown(table, 12) == [(1024.0 * i + 64, 0.0, 0.0) for i in (6, 7)] + large
+    assert len(table["gradient_sum"]) == 18
 
 
 def node(place: list[float], size: float, origin: float = 0.0) -> tuple[int, ...]:
@@ -522,6 +543,25 @@ def test_growth_by_level_is_that_of_a_loop(seed: int, promoted: str) -> None:
     assert level_up(table, neural, promoted=promoted) == len(wanted) > 0
     assert [(level, place) for level, place, _ in wanted] == grown_levels(table, 30)
     assert table["features"][30:].tolist() == [feature for *_, feature in wanted]
+
+
+def test_the_largest_gradients_come_first_whatever_their_level() -> None:
+    """All that would grow, and what of it stays where there is room for a third."""
+    table, neural = random_cloud(0, levels=3)
+    level_up(table, neural)
+    everything = grown_levels(table, 30)
+    table, neural = random_cloud(0, levels=3)
+    strengths = []
+    added = growth.Added.add
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            growth.Added, "add", lambda self, new: strengths.extend(new.strength.tolist()) or added(self, new)
+        )
+        assert level_up(table, neural, most=30 + len(everything) // 3) == len(everything) // 3
+    least = sorted(strengths, reverse=True)[len(everything) // 3 - 1]
+    assert len({level for level, _ in everything}) > 1
+    wanted = [place for place, strength in zip(everything, strengths, strict=True) if strength >= least]
+    assert grown_levels(table, 30) == wanted
 
 
 def test_the_cap_holds_with_levels_too() -> None:

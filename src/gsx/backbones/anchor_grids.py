@@ -1,7 +1,6 @@
 """Where anchors can be: on one grid (Scaffold-GS), or on a grid for each level of detail (Octree-GS)."""
 
 import logging
-from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -22,9 +21,6 @@ from gsx.core.training.schedule import Schedule
 
 logger = logging.getLogger(__name__)
 
-Room = Callable[[int], int]
-"""Of so many new anchors how many may come."""
-
 
 @runtime_checkable
 class AnchorGrid(Protocol):
@@ -41,9 +37,10 @@ class AnchorGrid(Protocol):
         ...
 
     def grow(
-        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+        self, table: ParameterTable, representation: Representation, least: float, room: int, step: int
     ) -> tuple[int, int]:
-        """Add anchors where offsets seen in more than `least` steps ask for them; (how many, how many had no room)."""
+        """Add anchors where offsets seen in more than `least` steps ask for them, at most `room`; (how many, how many
+        had no room)."""
         ...
 
     def columns(self, table: ParameterTable) -> dict[str, Float[Tensor, "N"]]:
@@ -94,7 +91,7 @@ class VoxelGrid:
         return torch.arange(len(anchors), device=anchors.device), torch.ones_like(anchors[:, 0])
 
     def grow(
-        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+        self, table: ParameterTable, representation: Representation, least: float, room: int, step: int
     ) -> tuple[int, int]:
         """Cells of three sizes in turn."""
         growth, stop = self.options.growth, self.quirks.early_stop == "yes"
@@ -140,7 +137,7 @@ class LevelGrids:
         return mask.nonzero()[:, 0], weights
 
     def grow(
-        self, table: ParameterTable, representation: Representation, least: float, room: Room, step: int
+        self, table: ParameterTable, representation: Representation, least: float, room: int, step: int
     ) -> tuple[int, int]:
         """Cells of each anchor's level, and of the next."""
         gate = self.quirks.gate == "open" or self.levels.highest(step) == self.levels.count - 1

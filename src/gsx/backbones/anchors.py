@@ -178,7 +178,7 @@ class Anchors:
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Grow and prune when due (Scaffold-GS, train.py)."""
         due = self.growing().due(step)
-        if not due and not self.resolution.changes_after(step):
+        if not due and not self.filter.narrows(step):
             return {}
         done = self.grow_and_prune(step) if due else {}
         self.filter.refresh(self.table, self.table["anchors"], step)
@@ -202,10 +202,8 @@ class Anchors:
         visits = growth.success * self.schedule.interval(growth.every)
         found = self.capacity.judge(self, without_newborn, step)
         enough, old = eligible(self.table, visits / 2)[0], len(self.table)
-        most = old + self.capacity.room(self.table, sys.maxsize, step)
-        grown, without_room = self.grid.grow(
-            self.table, self.representation, visits / 2, lambda wanted: most - len(self.table), step
-        )
+        room = self.capacity.room(self.table, sys.maxsize, step)
+        grown, without_room = self.grid.grow(self.table, self.representation, visits / 2, room, step)
         mark_newborn(self.table, old)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)

@@ -42,6 +42,10 @@ class Growing:
         """Whether it acts at a step."""
         return self.start < step < self.stop and step % self.every == 0
 
+    def acts(self) -> bool:
+        """Whether it acts at all."""
+        return (self.stop - 1) // self.every > self.start // self.every
+
     def events(self) -> int:
         """How often it acts, at least once."""
         return max(1, (self.stop - 1) // self.every - self.start // self.every)
@@ -64,12 +68,13 @@ class Timed(Protocol):
 
 
 def growing_of(options: Timed, schedule: Schedule) -> Growing:
-    """When density control acts in this run."""
-    return Growing(schedule.step(options.start), schedule.step(options.stop), schedule.interval(options.every))
+    """When density control acts in this run, to its last step at most: what learns on afterwards does not grow."""
+    stop = min(schedule.step(options.stop), schedule.iterations + 1)
+    return Growing(schedule.step(options.start), stop, schedule.interval(options.every))
 
 
 LOOKS = 48
-"""Training views, at most, that say what a row is worth."""
+"""Training views, at most, that say what a row is worth, at all but the last event of a budget."""
 Undone = Callable[[ParameterTable], ParameterTable | None]
 """The table as it would be had the last event added nothing; None: it added nothing."""
 
@@ -152,16 +157,23 @@ class Budget(Cap):
         table.record["first"] = torch.tensor(float(len(table)), dtype=torch.float64)
 
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
-        """Remove what is beyond the curve, which falls where there are more points than primitives asked for."""
+        """Remove what is beyond the curve, which falls where there are more points than primitives asked for.
+
+        What goes is worth least to some of the views, as large a share of what they show as of all there is; at the
+        last event to all of the views.
+        """
         excess = len(model.table) - self.target(int(model.table.record["first"]), step)
         if excess <= 0:
             return {}
-        found = worth_in_training(model, self.context, step)
-        kept = torch.ones_like(found.squares, dtype=torch.bool)
-        worth = torch.where(found.shown > 0, found.squares, torch.inf)  # of what no view shows nothing is known
-        kept[worth.argsort(stable=True)[:excess]] = False
+        views, last = len(self.context.scene.train), self.growing.passed(step) == 1
+        looks = views if last else min(LOOKS, views)
+        found = worth_in_training(model, self.context, step, looks)
+        shown = found.shown > 0  # of what no view asked shows nothing is known: others may show it
+        count = excess if looks == views else round(excess * float(shown.double().mean()))
+        kept = torch.ones_like(shown)
+        kept[torch.where(shown, found.squares, torch.inf).argsort(stable=True)[:count]] = False
         keep_rows(model.table, kept)
-        return {"removed": excess}
+        return {"removed": count}
 
     def room(self, table: ParameterTable, wanted: int, step: int) -> int:
         """Up to the curve."""
@@ -181,9 +193,9 @@ def error_exponent(price: float) -> float:
     return price * math.log(10) / (10 * math.log(2))
 
 
-def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int) -> Removal:
-    """What training views lose without each row."""
-    views = some_of(context.resolution.views(step), LOOKS, context.generator)
+def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int, looks: int = LOOKS) -> Removal:
+    """What training views, at most so many of them, lose without each row."""
+    views = some_of(context.resolution.views(step), looks, context.generator)
     background, form = context.scene.background.to(context.device), context.resolution.forming(step)
 
     def look() -> Removal:

@@ -45,11 +45,11 @@ class DensityControl:
         return self.schedule.interval(self.options.reset_every, self.options.reset_passes)
 
     def reset_due(self, step: int) -> bool:
-        """Every reset interval while density control runs, and once early on a white background; or never."""
-        if not self.densification.resets:
+        """While density control runs every reset interval, and once early on a white background (3D-GS, train.py); or
+        never."""
+        if not self.densification.resets or step >= self.ends():
             return False
-        regular = step % self.reset_interval() == 0 and step < self.ends()
-        return regular or (self.white and step == self.white_reset())
+        return step % self.reset_interval() == 0 or (self.white and step == self.white_reset())
 
     def white_reset(self) -> int:
         """Step of the extra reset."""
@@ -87,7 +87,7 @@ class DensityControl:
     def plan(self) -> dict[str, Any]:
         """The schedule in steps of this run."""
         resets = {"every": self.reset_interval(), "until": self.ends()}
-        resets |= {"white_background": self.white_reset()} if self.white else {}
+        resets |= {"white_background": self.white_reset()} if self.white and self.white_reset() < self.ends() else {}
         return {
             "densify": {"from": self.growing.start, "until": self.ends(), "every": self.growing.every},
             **self.capacity.plan(),

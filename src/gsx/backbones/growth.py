@@ -5,7 +5,7 @@ gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -131,25 +131,45 @@ def candidate_anchors(
     )
 
 
-def add_anchors(
-    table: ParameterTable, new: CandidateAnchors, representation: Representation, room: Callable[[int], int]
-) -> tuple[int, int]:
-    """Append new anchors with fresh statistics, as many as there is room for; (how many, how many found none)."""
-    wanted = len(new.positions)
-    new = strongest(new, room(wanted))
+def add_anchors(table: ParameterTable, new: CandidateAnchors, representation: Representation) -> None:
+    """Append new anchors with fresh statistics."""
     count, like = len(new.positions), table["anchors"]
     if count == 0:
-        return 0, wanted
+        return
     log_lengths = torch.full((count,), math.log(new.size), dtype=like.dtype, device=like.device)
     rows = representation.rows(log_lengths, torch.full_like(new.positions, 0.5))
     if new.inherit:
         rows |= {n: pooled_max(table[n].detach()[new.parents], new.group, count) for n in representation.pooled}
     rows["anchors"] = new.positions
-    rows |= {name: torch.zeros(count, device=like.device) for name in ("bias", "filter") if name in table.columns}
+    fresh = {"bias": 0.0, "filter": 0.0, "earned": math.inf}
+    rows |= {name: like.new_full((count,), value) for name, value in fresh.items() if name in table.columns}
     if "level" in table.columns:
         rows["level"] = torch.full((count,), new.level, dtype=torch.int16, device=like.device)
     append_rows(table, rows)
-    return count, wanted - count
+
+
+class Added:
+    """What one event adds to a table, cell size by cell size: those with the largest gradients of all sizes stay."""
+
+    def __init__(self, table: ParameterTable, representation: Representation, room: int) -> None:
+        self.table, self.representation, self.room = table, representation, room
+        self.old, self.wanted, self.strengths = len(table), 0, list[Tensor]()
+
+    def add(self, new: CandidateAnchors) -> None:
+        """Append those that may stay: no more of a size than there is room for in all."""
+        self.wanted += len(new.positions)
+        new = strongest(new, self.room)
+        add_anchors(self.table, new, self.representation)
+        self.strengths.append(new.strength)
+
+    def within_room(self) -> tuple[int, int]:
+        """Remove the weakest of those appended that are too many; (how many stay, how many found no room)."""
+        strengths = torch.cat([*self.strengths, self.table["anchors"].new_zeros(0)])
+        if len(strengths) > self.room:
+            new = within_room(torch.ones_like(strengths, dtype=torch.bool), strengths, self.room)
+            keep_rows(self.table, torch.cat([new.new_ones(self.old), new]))
+        grown = len(self.table) - self.old
+        return grown, self.wanted - grown
 
 
 def grow_by_depth(
@@ -160,14 +180,14 @@ def grow_by_depth(
     least: float,
     early_stop: bool,
     generator: torch.Generator,
-    room: Callable[[int], int],
+    room: int,
 ) -> tuple[int, int]:
     """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (anchor_growing).
 
-    Returns how many grew, and how many did not for want of room.
+    Returns how many grew, at most `room`, and how many did not for want of it.
     """
     enough, gradient = eligible(table, least)
-    means, grown, without_room = offset_means(table), 0, 0
+    means, added = offset_means(table), Added(table, representation, room)
     enough = enough & on_grid(means, voxel)
     for depth in range(options.depths):
         multiple = options.coarsest // options.hierarchy**depth
@@ -178,12 +198,10 @@ def grow_by_depth(
         candidates = enough & (gradient >= threshold) & (chance > 0.5 ** (depth + 1))
         size = voxel * multiple
         cells, taken = nodes_of(means[candidates], size), nodes_of(table["anchors"], size)
-        found = candidate_anchors(table, candidates, gradient, cells, taken, 0.0, size)
-        added, left = add_anchors(table, found, representation, room)
-        grown, without_room = grown + added, without_room + left
-        if early_stop and grown == 0:
+        added.add(candidate_anchors(table, candidates, gradient, cells, taken, 0.0, size))
+        if early_stop and added.wanted == 0:
             break
-    return grown, without_room
+    return added.within_room()
 
 
 def on_grid(means: Float[Tensor, "N k 3"], size: float) -> Bool[Tensor, "N k"]:
@@ -204,18 +222,19 @@ def grow_by_level(
     least: float,
     quirks: Quirks,
     gate: bool,
-    room: Callable[[int], int],
+    room: int,
 ) -> tuple[int, int]:
     """Octree-GS: cells of the own level, and of the next one for the strongest gradients (anchor_growing).
 
-    `gate`: whether promotion and bias take place. Returns how many grew, and how many did not for want of room.
+    `gate`: whether promotion and bias take place. Returns how many grew, at most `room`, and how many did not for want
+    of it.
     """
     enough, gradient = eligible(table, least)
     taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
     means, of = offset_means(table), table["level"].clone()
     mean_gradient = gradient.sum(1) / (enough.sum(1) + 1e-6)
     enough = enough & on_grid(means, levels.size(levels.count - 1))
-    grown, without_room = 0, 0
+    added = Added(table, representation, room)
     for level in range(levels.count):
         own = of == level
         if not bool(own.any()):
@@ -225,9 +244,8 @@ def grow_by_level(
         for found in candidates_of_level(
             table, enough & own[:, None], gradient, means, level, taus, levels, options, quirks, gate
         ):
-            added, left = add_anchors(table, found, representation, room)
-            grown, without_room = grown + added, without_room + left
-    return grown, without_room
+            added.add(found)
+    return added.within_room()
 
 
 def bias_anchors(

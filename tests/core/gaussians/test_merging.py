@@ -47,6 +47,14 @@ def test_two_spheres_side_by_side_by_hand() -> None:
     assert float(one["opacity_logits"].sigmoid()) == pytest.approx(0.778, abs=5e-4)
 
 
+def test_what_weighs_nothing_leaves_the_other_as_it_is() -> None:
+    """Even where its numbers are infinite."""
+    rows = rows_of([[0, 0, 0], [4, 0, 0]], [[3, 3, 3], [1, 1, 1]], [0.2, 0.0], size=torch.tensor([2.0, math.inf]))
+    one, other = merged(rows, FIRST, SECOND), merged(rows, SECOND, FIRST)
+    assert [float(both["size"]) for both in (one, other)] == [2, 2]
+    torch.testing.assert_close(one["means"], torch.zeros(1, 3).double())
+
+
 def test_the_heavier_one_counts_more() -> None:
     """Surfaces 4 pi 9 and 4 pi, opacities 0.2 and 0.6: weights 1.8 and 0.6."""
     numbers = {"sh_dc": torch.tensor([[[1.0, 0, 0]], [[5.0, 0, 4]]]), "level": torch.tensor([2, 2], dtype=torch.int16)}

@@ -115,6 +115,16 @@ def test_rounding_counts_where_pixels_do(monkeypatch: pytest.MonkeyPatch) -> Non
     assert rounding_in(windows).tolist() == pytest.approx([300 / 12 / 255**2, 3 * (64 - 8) / 12 / 255**2])
 
 
+def test_masked_windows_leave_no_step_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are not judged, and others take their place."""
+    monkeypatch.setattr(View, "counted", lambda view: torch.zeros(*reversed(view.camera.size), dtype=torch.bool))
+    plateau = begun(9.5, [0.0, 0.0])
+    plateau.judge(windows_of(10, 10), torch.zeros(2, dtype=torch.float64), 625)
+    assert not plateau.left_out
+    assert not len(plateau.found)
+    assert not plateau.open
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
     """(a finished run that left steps out, its folder)."""

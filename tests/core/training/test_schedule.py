@@ -22,6 +22,11 @@ def test_position_rate_at_published_steps(step: int, rate: float) -> None:
     assert log_linear(step, 30000, 1.6e-4, 1.6e-6) == pytest.approx(rate, rel=1e-6)
 
 
+def test_a_decay_over_no_steps_has_ended() -> None:
+    """`backbone.decay_until` of a short run may come to step 0."""
+    assert [log_linear(step, 0, 1e-2, 1e-4) for step in (0, 1, 50)] == pytest.approx([1e-4] * 3)
+
+
 @pytest.mark.parametrize(
     ("iterations", "exponent", "factor"),
     [(30000, 0.4, 1), (60000, 0.4, 1), (3000, 0.0, 1), (3000, 0.5, 10**0.5), (1200, 1.0, 25), (1000, 0.4, 3.89806)],
@@ -102,6 +107,14 @@ def test_white_backgrounds_reset_once_more_at_500() -> None:
     assert steps_when(white.control.reset_due, 30000) == [500, 3000, 6000, 9000, 12000]
     grey = small_gs3d(small_scene(spread(4), background=0.99), iterations=30000)
     assert steps_when(grey.control.reset_due, 1000) == []
+
+
+def test_opacities_are_not_reset_where_density_control_has_ended() -> None:
+    """As in train.py, where both resets are within it: a model to go on with would lose all it draws."""
+    options = published_options(stop=0)
+    white = small_gs3d(small_scene(spread(4), background=1.0), iterations=30000, options=options)
+    assert steps_when(white.control.reset_due, 30000) == []
+    assert white.plan()["opacity_reset"] == {"every": 3000, "until": 0}
 
 
 @pytest.mark.parametrize(

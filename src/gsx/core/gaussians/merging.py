@@ -60,7 +60,8 @@ def merged(rows: Rows, first: Int[Tensor, "P"], second: Int[Tensor, "P"]) -> dic
 
     def mean(value: Tensor) -> Tensor:
         of_row = share.view(-1, *[1] * (value.dim() - 1))
-        return of_row * value[first].double() + (1 - of_row) * value[second].double()
+        one, other = of_row * value[first].double(), (1 - of_row) * value[second].double()
+        return torch.where(of_row > 0, one, 0.0) + torch.where(of_row < 1, other, 0.0)  # 0 x infinity is 0
 
     out = {name: mean(value) if value.is_floating_point() else value[first] for name, value in rows.items()}
     apart = (rows["means"][first].double() - rows["means"][second].double())[:, :, None]

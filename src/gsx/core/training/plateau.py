@@ -20,7 +20,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
-from gsx.core.training.validation import decibels, rounding_in, validation_windows
+from gsx.core.training.validation import decibels, nothing_counts, rounding_in, validation_windows
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +113,11 @@ class Plateau:
         return self.windows(views, self.begun).get(view)
 
     def judge(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
-        """Find what the steps since the windows began have gained. There are no windows then."""
+        """Find what the steps since the windows began have gained, if pixels of them count. There are no windows
+        then."""
+        if nothing_counts(windows):
+            self.begun, self.before = 0, self.before[:0]
+            return
         floor, doublings = rounding_in(windows), math.log2(step / self.begun)
         gain, error = (value / doublings for value in decibels(after + floor, self.before + floor))
         self.found = torch.cat([self.found, torch.tensor([[step, gain, error]], dtype=torch.float64)])

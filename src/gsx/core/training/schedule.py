@@ -29,6 +29,7 @@ class Schedule:
 
 
 def log_linear(step: int, steps: int, first: float, last: float) -> float:
-    """Interpolates from `first` to `last` with the logarithm linear in step / steps, held at `last` (3D-GS)."""
-    fraction = min(max(step / steps, 0.0), 1.0)
+    """Interpolates from `first` to `last` with the logarithm linear in step / steps, held at `last` (3D-GS), where it
+    is from the start if there are no steps."""
+    fraction = min(max(step / steps, 0.0), 1.0) if steps > 0 else 1.0
     return math.exp((1 - fraction) * math.log(first) + fraction * math.log(last))

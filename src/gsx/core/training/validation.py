@@ -37,8 +37,16 @@ def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
     return torch.tensor([rounding_of(view, window) for view, window in windows.items()])
 
 
+def nothing_counts(windows: Mapping[View, Window]) -> bool:
+    """Whether all pixels of all windows are masked, so that they tell nothing."""
+    return not bool(rounding_in(windows).any())
+
+
 def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:
-    """(gain in dB from the squared errors `had` to `has`, summed over windows; its standard error over the windows)."""
+    """(gain in dB from the squared errors `had` to `has`, summed over windows; its standard error over the windows): 0
+    and infinite where there are none."""
+    if not bool(had.any()):
+        return 0.0, math.inf
     gain = 10 * math.log10(float(had.sum() / has.sum()))
     spread = float((had - has).std(correction=1)) * math.sqrt(len(has)) if len(has) > 1 else math.inf
     return gain, 10 / math.log(10) * spread / float(had.sum())
