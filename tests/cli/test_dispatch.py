@@ -505,6 +505,34 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: ["compact", str(run_at_step(t / "run", 1)), "--to", str(broken_ply(t / "x.ply"))],
         "is a file, no folder for a run",
     ),
+    "a sweep of nothing": (
+        lambda t: ["-m", "seed=range(5,5)", f"output={t / 'out'}"],
+        "seed=range(5,5) sweeps no value: give at least one",
+    ),
+    "a sweep over files": (
+        lambda t: ["-m", "backbone=glob(gs*)", f"output={t / 'out'}"],
+        "cannot be swept: glob chooses among files of the configuration: name them",
+    ),
+    "a sweep into one folder": (
+        lambda t: ["-m", "seed=0,1", f"folder={t / 'out'}"],
+        "is for one run, and these are several: give output=FOLDER",
+    ),
+    "a sweep with a record of its own": (
+        lambda t: ["-m", "seed=0,1", f"hydra.sweep.dir={t / 'out'}"],
+        "a multirun's record goes below output/sweeps; give output=FOLDER",
+    ),
+    "a sweep that is shown": (
+        lambda t: ["-m", "--cfg", "job", "seed=0,1"],
+        "-m trains several runs, and --cfg trains none: leave one of them out",
+    ),
+    "a launcher of no processes": (
+        lambda t: ["-m", "seed=0,1", "hydra/launcher=processes", "hydra.launcher.n_jobs=0", f"output={t / 'out'}"],
+        "hydra.launcher.n_jobs is 0; give how many processes",
+    ),
+    "a folder for a movie": (
+        lambda t: ["render", str(t / "run"), "--orbit", str(t / "a.gif"), "--to", str(t / "to")],
+        "--to FOLDER is for pictures",
+    ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
     "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "is of .spz files"),
     "no trades": (lambda t: ["trade", "training", "--trades", "", "--to", str(t / "t")], "--trades names none"),

@@ -2,8 +2,12 @@
 
 import logging
 import shlex
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from gsx.builtin import plugins
 from gsx.cli import folder as folders
 from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
+from gsx.experiments.runs import video
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.orbit import write_animation
 from gsx.experiments.runs.video import photos_of, sharpest, sharpness
@@ -82,6 +87,33 @@ def test_sharpness_by_hand() -> None:
     assert sharpness(np.full((7, 7), 9, np.float32)) == 0
 
 
+def test_who_asks_for_the_frames_of_a_video_meanwhile_waits_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They were deleted under whoever was choosing them."""
+    half = Event()
+
+    def slowly(path: Path, total: int, stretches: int) -> Iterator[tuple[int, np.ndarray]]:
+        chosen.append(path)
+        for number in range(stretches):
+            if number == stretches // 2:
+                half.set()
+                time.sleep(0.3)
+            yield number, np.zeros((2, 2, 3), np.uint8)
+
+    chosen: list[Path] = []
+    (tmp_path / "a.mp4").write_bytes(b"")
+    instead_of = {"require": lambda *given: None, "frames_in": lambda path: range(40), "sharpest": slowly}
+    for name, instead in instead_of.items():
+        monkeypatch.setattr(video, name, instead)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(photos_of, tmp_path / "a.mp4", tmp_path, 12)
+        assert half.wait(20)
+        second = pool.submit(photos_of, tmp_path / "a.mp4", tmp_path, 12)
+        found = [len(list(one.result(20).glob("frame_*.png"))) for one in (first, second)]
+    assert (found, len(chosen)) == ([12, 12], 1)
+
+
 @pytest.mark.skipif(find_spec("av") is None, reason="PyAV is not installed")
 def test_of_each_stretch_of_a_video_the_sharpest_frame_is_taken(
     tmp_path: Path, trained: list[list[str]], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -96,20 +128,20 @@ def test_of_each_stretch_of_a_video_the_sharpest_frame_is_taken(
             blurred = torch.nn.functional.avg_pool2d(shown[None], 9, 1, 4)[0]
             yield shown if number in sharp_ones else blurred
 
-    video = tmp_path / "a video.mp4"
-    write_animation(video, frames(), 20)
-    assert {number for number, _ in sharpest(video, 40, 4)} == sharp_ones
+    film = tmp_path / "a video.mp4"
+    write_animation(film, frames(), 20)
+    assert {number for number, _ in sharpest(film, 40, 4)} == sharp_ones
     monkeypatch.chdir(tmp_path)
-    assert main([str(video)]) == 0
+    assert main([str(film)]) == 0
     settings = compose(trained[0], plugins())
     assert settings.scene.component.name == "photos"
     made = sorted(path.name for path in Path(settings.scene.options.path).glob("*.png"))
-    first = photos_of(video, tmp_path / "outputs", 4)
+    first = photos_of(film, tmp_path / "outputs", 4)
     assert sorted(path.name for path in first.glob("*.png")) == [f"frame_{n:05d}.png" for n in sorted(sharp_ones)]
     assert made
     monkeypatch.setattr(logging.getLogger("gsx"), "propagate", True)
     caplog.set_level(logging.INFO, logger="gsx")
-    assert photos_of(video, tmp_path / "outputs", 4) == first
+    assert photos_of(film, tmp_path / "outputs", 4) == first
     assert "chosen earlier" in caplog.text
     (tmp_path / "broken.mp4").write_bytes(b"no video at all" * 50)
     with pytest.raises(InputError, match="cannot be read as a video"):

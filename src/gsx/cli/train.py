@@ -32,6 +32,8 @@ HYDRA_FLAGS = (
     "--resolve",
 )
 """Flags that are handed to Hydra as they are."""
+VALUED_FLAGS = ("--cfg", "-c", "-p", "--package")
+"""Those of them whose next word is their value."""
 
 
 def verb_train(arguments: list[str]) -> int:
@@ -65,7 +67,11 @@ def fill_table(arguments: list[str]) -> int:
     """gsx +experiment=TABLE ..."""
     from gsx.experiments.tables.sweep import run_table
 
-    text, code = run_table(arguments, plugins(), sweep_job)
+    try:
+        text, code = run_table(arguments, plugins(), sweep_job)
+    except KeyboardInterrupt:
+        say("\ngsx: interrupted; the same command goes on with what is missing\n", as_error=True)
+        return INTERRUPTED
     sys.stdout.write(text)
     return code
 
@@ -73,6 +79,7 @@ def fill_table(arguments: list[str]) -> int:
 def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
+    from gsx.experiments.runs.launched import waiting_for_all
     from gsx.experiments.tables.sweep import is_table
 
     if is_table(arguments) and {"-m", "--multirun"} & set(arguments):
@@ -85,13 +92,37 @@ def hand_to_hydra(arguments: list[str]) -> int:
         finally:  # it may end the program
             sys.stdout.write(text.getvalue())
         return 0
-    given = [word for word in arguments if not word.startswith("-")]
+    flags, given = flags_and_overrides(arguments)
+    for flag in flags:
+        if flag.startswith("-") and flag not in ("-m", "--multirun"):
+            raise ConfigError(f"-m trains several runs, and {flag} trains none: leave one of them out")
+    refuse_taken_by_sweeps(given)
     sweep = new_sweep(check_overrides(given, loaded))
+    code = 0
     try:
-        hydra_main([*arguments, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+        with waiting_for_all(sweep):
+            hydra_main([*flags, *given, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+    except KeyboardInterrupt:
+        say("\ngsx: interrupted; runs that were begun say above how to go on\n", as_error=True)
+        code = INTERRUPTED
     finally:
-        code = close_sweep(sweep)
+        code = max(code, close_sweep(sweep))
     return code
+
+
+def flags_and_overrides(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """(flags, those that take one with their value; the other words), each in their order."""
+    after = [None, *arguments]
+    of_flags = [word.startswith("-") or before in VALUED_FLAGS for word, before in zip(arguments, after, strict=False)]
+    flags = [word for word, of_flag in zip(arguments, of_flags, strict=True) if of_flag]
+    return flags, [word for word, of_flag in zip(arguments, of_flags, strict=True) if not of_flag]
+
+
+def refuse_taken_by_sweeps(overrides: list[str]) -> None:
+    """Raise ConfigError for what gsx says itself of a multirun."""
+    for word in overrides:
+        if word.lstrip("+").startswith("hydra.sweep.dir="):
+            raise ConfigError(f"'{word}': a multirun's record goes below output/sweeps; give output=FOLDER")
 
 
 def new_sweep(output: Path) -> Path:
@@ -120,16 +151,25 @@ def close_sweep(sweep: Path) -> int:
 def sweep_job(config: Any) -> int:
     """One job of a multirun or of a table, in this process or in one of a launcher's; its record stays with the sweep.
 
-    An error is shown and does not end the others; Ctrl-C does.
+    An error is shown and does not end the others; Ctrl-C does, where a launcher's processes are in the end of all.
     """
+    from multiprocessing import parent_process
+
     from gsx.core.files import write_json
     from gsx.experiments.runs.compose import job_place
+    from gsx.experiments.runs.launched import ended_from_without
     from gsx.experiments.runs.settings import settings_from
 
     set_up_logging()
     folders: list[Path] = []
+    place, launched = job_place(), parent_process() is not None
     try:
-        code = train(settings_from(config, loaded := plugins()), loaded, folders)
+        with ended_from_without(place[0] if place else None):
+            code = train(settings_from(config, loaded := plugins()), loaded, folders)
+    except KeyboardInterrupt:
+        if not launched:
+            raise
+        code = INTERRUPTED
     except GsxError as error:
         code = complain(str(error))
     except OSError as error:
@@ -137,12 +177,11 @@ def sweep_job(config: Any) -> int:
     except Exception:  # a defect, perhaps a plugin's: the other jobs are worth no less
         logger.exception("this job failed")
         code = 1
-    place = job_place()
     if place is not None:
         (place[0] / "jobs").mkdir(parents=True, exist_ok=True)
         record = {"folder": str(folders[0].resolve()) if folders else "", "code": code}
         write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
-    if code == INTERRUPTED:
+    if code == INTERRUPTED and not launched:
         raise KeyboardInterrupt
     return tell_report(code, *folders)
 

@@ -257,6 +257,14 @@ def test_unsuitable_requests_are_refused(tmp_path: Path, name: str, fps: float, 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
+def test_frames_of_one_pixel_are_no_video(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("av", reason="PyAV (gsx[video]) is not installed")
+    with pytest.raises(InputError, match="frames of 1x3 px are too small for that"):
+        write_animation(tmp_path / f"a{suffix}", iter([torch.zeros(3, 3, 1)] * 2), 10)
+    assert not list(tmp_path.iterdir())
+
+
 def test_frames_that_do_not_fit_leave_no_file(tmp_path: Path) -> None:
     cases = {
         "no frames": iter(()),

@@ -5,16 +5,25 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny import OVERRIDES
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.files import read_json
 from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.trade.training.measure import Outcome, Row, combinations, different, expected
+from gsx.experiments.trade.training.measure import (
+    Outcome,
+    Row,
+    Trial,
+    combinations,
+    different,
+    expected,
+    measured,
+)
 from gsx.experiments.trade.training.settings import GIVEN, Setting, settings_of, together
 from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, front, table
 
@@ -128,6 +137,29 @@ def test_the_table_marks_what_nothing_beats_and_tells_what_does_not_go() -> None
     lines = table([*ROWS, Row(setting=Setting(name="odd"), overrides=[], failure="no such key")])
     assert [line.count("*") for line in lines[1:5]] == [0, 2, 1, 2]
     assert lines[-1] == "does not go here: odd: no such key"
+
+
+def test_a_setting_that_cannot_be_trained_does_not_cost_the_others(tmp_path: Path) -> None:
+    """Of three the middle one ends with an error, after its first seed."""
+    tried = []
+
+    def job(settings: Any) -> Path:
+        tried.append((settings.general.iterations, settings.general.seed))
+        if tried[-1] == (20, 1):
+            raise TrainingError("it was lost\nwith words")
+        folder = tmp_path / f"{len(tried)}"
+        folder.mkdir()
+        facts = {"psnr": 20.0, "zoom": {}, "primitives": 9, "megabytes": 1, "train_seconds": 1, "evaluate_seconds": 1}
+        (folder / "evaluation.json").write_text(json.dumps(facts))
+        return folder
+
+    given = ["backbone=gs3d", "iterations=10"]
+    trial = Trial(given=given, seeds=[0, 1], folder=tmp_path, job=job, plugins=plugins())
+    settings = [Setting(name=f"{n} steps", trades=["steps"], words=[f"iterations={n}"]) for n in (20, 30)]
+    rows = measured(trial, settings, 1)
+    assert tried == [(10, 0), (10, 1), (20, 0), (20, 1), (30, 0), (30, 1)]
+    assert [row.failure for row in rows] == ["", "it was lost", ""]
+    assert [len(row.outcomes) for row in rows] == [2, 0, 2]
 
 
 def evaluation(folder: Path) -> dict[str, float]:

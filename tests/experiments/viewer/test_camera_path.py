@@ -77,6 +77,27 @@ def test_nerfstudio_looks_along_minus_z_with_y_up(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ({"fps": 0}, "has 0 for fps"),
+        ({"fps": -2}, "has -2 for fps"),
+        ({"camera_path": None}, "has None where a list should be"),
+        ({"x": -1}, r"has a camera_to_world \(entry 0\) that is no rotation"),  # mirrored
+        ({"x": 0}, r"has a camera_to_world \(entry 0\) that is no rotation"),
+    ],
+)
+def test_what_no_camera_of_nerfstudio_can_be_is_told(tmp_path: Path, change: dict[str, object], words: str) -> None:
+    matrix = [change.pop("x", 1), 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
+    content = {"camera_type": "perspective", "render_width": 20, "render_height": 10, "fps": 10,
+               "camera_path": [{"camera_to_world": matrix, "fov": 90}]}  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(content | change))
+    with pytest.raises(InputError, match=words):
+        read_camera_path(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"gsx_camera_path": 2}, "is of version 2, and this gsx reads version 1"),
+        ({"keyframes": None}, "has None where a list should be"),
         ({"keyframes": []}, "no keyframes"),
         ({"size": [0, 10]}, "has size"),
         ({"fps": "fast"}, "'fast' where a number"),
@@ -122,6 +143,10 @@ def test_a_splat_file_is_filmed_along_a_path(tmp_path: Path, capsys: pytest.Capt
     assert pictures[0][0, 30, 40] > 200
     assert pictures[0][1, 30, 40] < 20
     assert int(pictures[5].max()) == 0
+    assert capsys.readouterr().err == ""
+    write_camera_path(tmp_path / "a.json", replace(path(), fps=path().fps / 2))
+    assert main([*words, "--to", str(tmp_path / "to")]) == 0
+    assert "also holds 4 frames from frame_00005.png on, of a longer path" in capsys.readouterr().err
     assert main([*words, "--movie", str(tmp_path / "a.gif")]) == 0
     assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
     assert main(["render", str(tmp_path / "a.ply")]) == 2

@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import at_home
 from gsx.core.plugins import Plugins
+from gsx.experiments.runs.launched import waiting_for_all
 from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
 OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
@@ -137,8 +138,9 @@ class Compositions:
         )
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
-        for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
-            _ = result.return_value  # raises what a job raised
+        with waiting_for_all(folder):
+            for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
+                _ = result.return_value  # raises what a job raised
 
 
 def place_of(name: str, file: Path) -> str:
@@ -216,6 +218,8 @@ def check_groups(overrides: Sequence[str]) -> None:
             raise ConfigError("'hydra' is a group of Hydra's own settings: give hydra.NAME=VALUE or hydra/GROUP=NAME")
         if override.is_sweep_override():
             refuse_sweep(override, override.key_or_group in groups)
+        if override.key_or_group == "hydra.launcher.n_jobs" and override.value() == 0:
+            raise ConfigError("hydra.launcher.n_jobs is 0; give how many processes, or -1 for as many as cores")
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
         if override.key_or_group in groups:
@@ -300,14 +304,24 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
     Returns the folder that its runs go to.
     """
     with hydra_session(plugins):
-        groups = known_groups()
-        words = [words_of(one, one.key_or_group in groups) for one in parse_overrides(overrides) if one.input_line]
+        groups, given = known_groups(), [one for one in parse_overrides(overrides) if one.input_line]
+        refuse_one_folder(given)
+        words = [words_of(one, one.key_or_group in groups) for one in given]
         first = [values[0] for values in words]
         output = Path(settings_from(compose_raw(first), plugins).general.output)
         for place, values in enumerate(words):
             for other in values[1:]:
                 compose_raw([*first[:place], other, *first[place + 1 :]])
         return output
+
+
+def refuse_one_folder(overrides: Sequence[Any]) -> None:
+    """Raise ConfigError for a sweep whose runs would all go to one folder."""
+    sweeps = any(one.is_sweep_override() for one in overrides)
+    for one in overrides:
+        if sweeps and one.key_or_group == "folder" and not one.is_sweep_override() and "${" not in one.input_line:
+            remedy = "give output=FOLDER, or a name with what they differ in, 'folder=FOLDER/${seed}'"
+            raise ConfigError(f"{one.input_line} is for one run, and these are several: {remedy}")
 
 
 def words_of(override: Any, all_of: bool) -> list[str]:
@@ -323,7 +337,10 @@ def words_of(override: Any, all_of: bool) -> list[str]:
     try:
         values = list(islice(override.sweep_string_iterator(), None if all_of else 1))
     except HydraException as error:
-        raise ConfigError(f"{override.input_line} cannot be swept: {first_line(error)}") from error
+        asked = "glob chooses among files of the configuration: name them" if "glob(" in override.input_line else ""
+        raise ConfigError(f"{override.input_line} cannot be swept: {asked or first_line(error)}") from error
+    if not values:
+        raise ConfigError(f"{override.input_line} sweeps no value: give at least one")
     return [f"{override.get_key_element()}={value}" for value in values]
 
 

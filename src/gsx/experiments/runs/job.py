@@ -12,6 +12,7 @@ from gsx.core.cache import in_use
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
 from gsx.core.processes import processes, say, speaks
+from gsx.core.signals import STOPPING, heeded
 
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
@@ -22,10 +23,6 @@ logger = logging.getLogger("gsx.cli")
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report it."""
-
-
-STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2", "SIGHUP") if hasattr(signal, name))
-"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for it); its terminal closed."""
 
 
 @contextmanager
@@ -85,11 +82,6 @@ def interruptible(run: "Run") -> Iterator[object]:
         logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
         signal.raise_signal(received[0])
         raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
-
-
-def heeded() -> list[signal.Signals]:
-    """Signals of STOPPING that end training; `nohup` has the terminal's end ignored, and it stays so."""
-    return [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]
 
 
 def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:

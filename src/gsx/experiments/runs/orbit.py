@@ -300,6 +300,8 @@ def encode(
     av = import_av(path)
     first = next(frames)
     height, width = (size // 2 * 2 for size in first.shape[:2])
+    if not (height and width):
+        raise InputError(f"{path}: frames of {first.shape[1]}x{first.shape[0]} px are too small for that; give a .gif")
     with av.open(str(path), mode="w", options=container) as output:
         stream = output.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=quality)
         stream.width, stream.height, stream.pix_fmt = width, height, pixels

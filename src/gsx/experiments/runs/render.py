@@ -1,5 +1,6 @@
 """Pictures of a run: its test views, one view by name, an orbit; and of a run or a file along a camera path."""
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
+
+logger = logging.getLogger(__name__)
 
 
 def view_named(run: Run, name: str) -> View:
@@ -52,6 +55,8 @@ def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: flo
     write_animation(path, (render(run, camera, pixels).image for camera in cameras), fps)
 
 
+FRAMES = "frame_[0-9][0-9][0-9][0-9][0-9].png"
+"""Pictures of a path."""
 Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
 
 
@@ -81,4 +86,17 @@ def render_path(way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float)
     remove_partial(to, below=False)
     for number, camera in enumerate(cameras):
         write_image(to / f"frame_{number:05d}.png", draw(camera))
+    beyond = [file for file in sorted(to.glob(FRAMES)) if file.name >= f"frame_{len(cameras):05d}.png"]
+    if beyond:
+        logger.warning(
+            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
+            *(to, len(beyond), beyond[0].name),
+        )
     return to
+
+
+def emptied(folder: Path, pattern: str) -> Path:
+    """A folder of ours without pictures of that name: those of other views or of a longer path would stay."""
+    for file in folder.glob(pattern):
+        file.unlink()
+    return folder

@@ -1,7 +1,8 @@
 """Photographs out of a video: of each stretch of time the sharpest frame."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from gsx.core.cache import content_key, file_stamp
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
+from gsx.core.locks import lock
 from gsx.core.packages import require
 from gsx.core.shapes import Float, UInt8
 
@@ -41,10 +43,30 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
     require(f"frames of {path}", ("av",), "gsx[video]")
     made_of = [*map(str, file_stamp(path)), count]
     folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
-    if (folder / INDEX).exists() and read_json(folder / INDEX) == made_of:
-        logger.info("frames were chosen earlier: %s", folder)
-        return folder
     folder.mkdir(parents=True, exist_ok=True)
+    with one_after_the_other(folder):
+        if (folder / INDEX).exists() and read_json(folder / INDEX) == made_of:
+            logger.info("frames were chosen earlier: %s", folder)
+        else:
+            choose(path, folder, count, made_of)
+    return folder
+
+
+@contextmanager
+def one_after_the_other(folder: Path) -> Iterator[None]:
+    """Processes that want the same folder wait for each other, where the file system knows locks."""
+    with (folder.parent / f".{folder.name}.lock").open("w") as stream:
+        with suppress(OSError):
+            lock(stream, wait=True)
+        yield
+
+
+def choose(path: Path, folder: Path, count: int, made_of: Sequence[Any]) -> None:
+    """Write the frames of a video to a folder, and then what they are of.
+
+    Raises:
+        InputError: the video cannot be read, or is too short.
+    """
     for old in [folder / INDEX, *folder.glob("frame_*.png")]:
         old.unlink(missing_ok=True)
     total = sum(1 for _ in frames_in(path))
@@ -55,7 +77,6 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
         write_image(folder / f"frame_{number:05d}.png", torch.from_numpy(pixels).permute(2, 0, 1))
     write_json(folder / INDEX, made_of)
     logger.info("%d of %d frames chosen, the sharpest of each stretch: %s", stretches, total, folder)
-    return folder
 
 
 def frames_in(path: Path) -> Iterator[Any]:

@@ -7,6 +7,7 @@ right, y down, z ahead) to the world; fov is vertical. nerfstudio's (`ns-render 
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,6 +26,10 @@ OWN = "gsx_camera_path"
 MOST_FRAMES = 100_000
 LARGEST_EDGE = 16_384
 """Of pictures, px."""
+VERSION = 1
+"""Of files of ours."""
+LEAST_VOLUME = 0.99
+"""Of the box that a rotation's axes span, which is 1: nerfstudio rounds them."""
 PARALLEL = 1e-6
 """Quaternions this near to each other are interpolated along the chord."""
 
@@ -73,7 +78,7 @@ def posed(position: Sequence[float], wxyz: Sequence[float], fov: float, width: i
 def between(frames: Sequence[Keyframe], time: float) -> Keyframe:
     """The camera at a time: positions along a cubic through the keyframes (finite differences as slopes), rotations
     on the shortest arc, the logarithm of tan(fov / 2) linear."""
-    after = next((i for i, frame in enumerate(frames) if frame.time >= time - 1e-9), len(frames) - 1)
+    after = min(bisect_left(frames, time - 1e-9, key=lambda frame: frame.time), len(frames) - 1)
     if after == 0 or math.isclose(frames[after].time, time, abs_tol=1e-9):
         return replace(frames[after], time=time)
     a, b = frames[after - 1], frames[after]
@@ -124,7 +129,7 @@ def write_camera_path(path: Path, made: CameraPath) -> None:
     """Write a file of ours."""
     frames = [{"time": frame.time, "position": list(frame.position), "wxyz": list(frame.wxyz),
                "fov": math.degrees(frame.fov)} for frame in made.keyframes]  # fmt: skip
-    write_json(path, {OWN: 1, "size": list(made.size), "fps": made.fps, "keyframes": frames})
+    write_json(path, {OWN: VERSION, "size": list(made.size), "fps": made.fps, "keyframes": frames})
 
 
 def read_camera_path(path: Path) -> CameraPath:
@@ -165,10 +170,12 @@ def refuse_odd(path: CameraPath) -> None:
 
 def own(content: dict[str, Any]) -> CameraPath:
     """Of gsx."""
+    if content[OWN] != VERSION:
+        raise ValueError(f"is of version {content[OWN]}, and this gsx reads version {VERSION}")
     frames = [
         Keyframe(time=number(one["time"]), position=numbers(one["position"], 3), wxyz=numbers(one["wxyz"], 4),
                  fov=math.radians(number(one["fov"])))
-        for one in content["keyframes"]
+        for one in listed(content["keyframes"])
     ]  # fmt: skip
     width, height = numbers(content["size"], 2)
     return CameraPath(size=(int(width), int(height)), fps=number(content["fps"]), keyframes=tuple(frames))
@@ -178,13 +185,18 @@ def of_nerfstudio(content: Any) -> CameraPath:
     """Of nerfstudio, a keyframe each frame."""
     if not isinstance(content, dict) or content.get("camera_type", "perspective") != "perspective":
         raise ValueError("is no path of perspective cameras")
-    entries = content["camera_path"]
-    fps = number(content["fps"]) if "fps" in content else len(entries) / number(content["seconds"])
+    entries = listed(content["camera_path"])
+    pace, seconds = ("fps", 1.0) if "fps" in content else ("seconds", float(len(entries)))
+    if not (told := number(content[pace])) > 0:
+        raise ValueError(f"has {told:g} for {pace}, which no film has")
+    fps = told if pace == "fps" else seconds / told
     frames = []
     for i, entry in enumerate(entries):
         matrix = torch.tensor(numbers(entry["camera_to_world"], 16), dtype=torch.float64).view(4, 4)
         axes = matrix[:3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
         axes = axes / axes.norm(dim=0)
+        if not float(torch.linalg.det(axes)) > LEAST_VOLUME:
+            raise ValueError(f"has a camera_to_world (entry {i}) that is no rotation")
         x, y, z = matrix[:3, 3].tolist()
         w, *xyz = quaternions_of(axes[None])[0].tolist()
         frames.append(Keyframe(i / fps, (x, y, z), (w, *xyz), math.radians(number(entry["fov"]))))
@@ -199,9 +211,16 @@ def number(value: Any) -> float:
     return float(value)
 
 
+def listed(value: Any) -> list[Any]:
+    """A list; else ValueError."""
+    if not isinstance(value, list):
+        raise ValueError(f"has {value!r} where a list should be")
+    return value
+
+
 def numbers(values: Any, count: int) -> Any:
     """So many finite numbers, of a list or of lists in it; else ValueError."""
-    flat = [one for row in values for one in (row if isinstance(row, list) else [row])]
+    flat = [one for row in listed(values) for one in (row if isinstance(row, list) else [row])]
     if len(flat) != count:
         raise ValueError(f"has {len(flat)} numbers where {count} should be")
     return tuple(number(one) for one in flat)

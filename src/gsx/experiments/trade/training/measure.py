@@ -8,11 +8,11 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from gsx.core.errors import ConfigError, first_line
+from gsx.core.errors import ConfigError, GsxError, first_line
 from gsx.core.files import read_json
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.page import duration
-from gsx.experiments.runs.compose import compose, key_of, quoted
+from gsx.experiments.runs.compose import compose, quoted
 from gsx.experiments.trade.training.settings import GIVEN, Setting, together
 
 logger = logging.getLogger(__name__)
@@ -70,7 +70,8 @@ class Row:
     def drop(self, given: "Row") -> float:
         """The most that a seed loses at any zoom beside the composition as given, dB; negative where all gain."""
         pairs = zip(self.outcomes, given.outcomes, strict=True)
-        return max(before.psnr[zoom] - after.psnr[zoom] for after, before in pairs for zoom in before.psnr)
+        both = [(after.psnr, before.psnr) for after, before in pairs]
+        return max(before[zoom] - after[zoom] for after, before in both for zoom in before.keys() & after.keys())
 
 
 def outcome_of(folder: Path, beside: Path) -> Outcome:
@@ -105,7 +106,8 @@ class Trial:
 
     def words(self, row: Sequence[str], seed: int) -> list[str]:
         """All of a run."""
-        zooms = [] if any(key_of(word) == "eval.zoom" for word in self.given) else [f"eval.zoom={ZOOMS}"]
+        named = any(word.lstrip("+").startswith("eval.zoom=") for word in self.given)
+        zooms = [] if named else [f"eval.zoom={ZOOMS}"]
         return [*zooms, *self.given, *row, f"seed={seed}", f"output={quoted(str(self.folder / RUNS))}", "reuse=true"]
 
     def composed(self, row: Sequence[str], seed: int) -> Any:
@@ -113,13 +115,14 @@ class Trial:
         return compose(self.words(row, seed), self.plugins)
 
     def tried(self, setting: Setting, iterations: int) -> Row:
-        """A setting, trained with each seed unless that has been done; what cannot be composed says why."""
+        """A setting, trained with each seed unless that has been done; what cannot be composed or trained says why."""
         overrides = setting.overrides(iterations)
         try:
             runs = [self.composed(overrides, seed) for seed in self.seeds]
-        except ConfigError as error:
+            outcomes = [outcome_of(self.job(run), self.folder) for run in runs]
+        except GsxError as error:
+            logger.info("%s: not to be had (%s)", setting.name, first_line(error))
             return Row(setting=setting, overrides=overrides, failure=first_line(error))
-        outcomes = [outcome_of(self.job(run), self.folder) for run in runs]
         row = Row(setting=setting, overrides=overrides, outcomes=outcomes)
         zoom = row.zooms()[0]
         told = f"{row.quality(zoom):.2f} dB at x{zoom}, {row.cost('megabytes'):.3g} MB, {row.cost('seconds'):.3g} s"
