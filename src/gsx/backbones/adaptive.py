@@ -266,4 +266,5 @@ class Adaptive:
 
     def plan(self) -> dict[str, Any]:
         """The price."""
-        return {"capacity": {"price_db_per_doubling": self.options.price, "events": self.growing.events()}}
+        found = {"price_db_per_doubling": self.options.price, "events": self.growing.events()}
+        return {"capacity": found | self.growing.caution()}

@@ -92,7 +92,7 @@ class Anchors:
         self.cameras = [view.camera for view in scene.train]
         self.views = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = context.schedule(options.published_iterations)
-        self.filter = filter_named(options.filter, options.mip, context, self.schedule, options.growth.stop)
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.growing().stop)
         self.raster = self.filter.rules(context.raster)
         self.capacity = capacity_of(options, context, self.growing())
         self.grid = grid_of(options, context, self.schedule, points.positions.float())
@@ -157,7 +157,7 @@ class Anchors:
     def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Visits, opacities and screen gradients while anchors are judged (Scaffold-GS, training_statis)."""
         growth = self.options.growth
-        if not self.schedule.step(growth.observe_from) < step < self.schedule.step(growth.stop):
+        if not self.schedule.step(growth.observe_from) < step < self.growing().stop:
             return {}
         decoded = drawn.decoded
         seen = densification_statistics(rendering.screen, decoded.slots, weight)

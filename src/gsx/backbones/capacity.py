@@ -50,6 +50,14 @@ class Growing:
         """How often it acts, at least once."""
         return max(1, (self.stop - 1) // self.every - self.start // self.every)
 
+    def caution(self) -> dict[str, str]:
+        """For a plan: that nothing will be decided, where it does not act at all."""
+        if self.acts():
+            return {}
+        when = f"every {self.every} steps between {self.start} and {self.stop}"
+        remedy = "take more steps, or fewer training views, all of which an interval passes over"
+        return {"caution": f"decides nothing, as density control acts at no step of this run, {when}: {remedy}"}
+
     def passed(self, step: int) -> float:
         """How much of the events is over after the one at a step, from 0 to 1."""
         return min(1.0, max(0.0, (step // self.every - self.start // self.every) / self.events()))
@@ -74,7 +82,7 @@ def growing_of(options: Timed, schedule: Schedule) -> Growing:
 
 
 LOOKS = 48
-"""Training views, at most, that say what a row is worth, at all but the last event of a budget."""
+"""Training views, at most, that are asked what a row, or its colours, are worth (all at the last event of a budget)."""
 Undone = Callable[[ParameterTable], ParameterTable | None]
 """The table as it would be had the last event added nothing; None: it added nothing."""
 
@@ -159,8 +167,8 @@ class Budget(Cap):
     def judge(self, model: Backbone[Any], undone: Undone, step: int) -> dict[str, float]:
         """Remove what is beyond the curve, which falls where there are more points than primitives asked for.
 
-        What goes is worth least to some of the views, as large a share of what they show as of all there is; at the
-        last event to all of the views.
+        What goes is worth least to some views: of what these show as large a share as is too many of all. At the last
+        event all views are asked.
         """
         excess = len(model.table) - self.target(int(model.table.record["first"]), step)
         if excess <= 0:
@@ -185,7 +193,7 @@ class Budget(Cap):
 
     def plan(self) -> dict[str, Any]:
         """The number."""
-        return {"budget": {"primitives": self.most}}
+        return {"budget": {"primitives": self.most} | self.growing.caution()}
 
 
 def error_exponent(price: float) -> float:

@@ -1,6 +1,5 @@
 """Who decides how many primitives a model has, as options say."""
 
-import logging
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -8,8 +7,6 @@ from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import Budget, BudgetOptions, Cap, Capacity, Growing
 from gsx.core.ranges import Count, Range
 from gsx.core.training.backbone import BackboneContext
-
-logger = logging.getLogger(__name__)
 
 CAPACITIES = ("published", "budget", "adaptive")
 
@@ -43,13 +40,7 @@ class CapacityOptions:
 
 
 def capacity_of(options: CapacityOptions, context: BackboneContext, growing: Growing) -> Capacity:
-    """The one that the options name; a warning where it will have nothing to decide."""
-    if options.capacity != "published" and not growing.acts():
-        logger.warning(
-            "backbone.capacity=%s changes nothing: density control acts at no step of this run, every %d steps between "
-            "%d and %d: take more steps, or fewer training views, which an interval passes over",
-            *(options.capacity, growing.every, growing.start, growing.stop),
-        )
+    """The one that the options name."""
     if options.capacity == "budget":
         return Budget(options.budget, context, growing)
     if options.capacity == "adaptive":

@@ -14,7 +14,7 @@ from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import take_rows
+from gsx.core.rasterizer import repeat_rows, take_rows
 from gsx.core.shapes import Float, Int
 from gsx.core.training.parameter_table import ParameterTable
 
@@ -144,7 +144,7 @@ class Neural:
         # what is not a number is handed on: the render counts it
         chosen = (~(opacities.detach() <= 0)).view(-1).nonzero()[:, 0]
         owner = chosen // k
-        size = lengths(take_rows(table["log_scales"], rows)).index_select(0, owner)
+        size = repeat_rows(lengths(take_rows(table["log_scales"], rows)), owner)
         shape = take_rows(shapes.reshape(-1, 7), chosen)
         scales, log_opacities = size[:, 3:] * shape[:, :3].sigmoid(), take_rows(opacities.view(-1), chosen).log()
         scales, log_opacities = filter_.smoothed(scales, log_opacities, table, rows[owner])

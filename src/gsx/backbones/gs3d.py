@@ -93,7 +93,7 @@ class GS3D:
         self.schedule = context.schedule(options.published_iterations)
         self.capacity = capacity_of(options, context, growing_of(density, self.schedule))
         self.control = DensityControl(density, self.capacity, context, self.schedule, densification)
-        self.filter = filter_named(options.filter, options.mip, context, self.schedule, density.stop)
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.control.ends())
         self.raster = self.filter.rules(context.raster)
         self.absolute_gradient = density.absolute or self.capacity.ranked
         self.first_degree = 0

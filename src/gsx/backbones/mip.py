@@ -158,7 +158,7 @@ class MipFilter:
     """With the cameras of the training views."""
     schedule: Schedule
     settled: int
-    """Published step at which density control ends: from there on the filter has a clock of its own."""
+    """Step at which density control ends: from there on the filter has a clock of its own."""
     note: str = "3D filter fused into scales and opacities"
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
@@ -184,7 +184,7 @@ class MipFilter:
         options, schedule = self.options, self.schedule
         if self.narrows(step):
             return True
-        inside = schedule.step(self.settled) < step < schedule.step(options.stop)
+        inside = self.settled < step < schedule.step(options.stop)
         return inside and step % schedule.interval(options.every) == 0
 
     def narrows(self, step: int) -> bool:

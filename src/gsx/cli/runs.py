@@ -97,15 +97,7 @@ def rendered(given: argparse.Namespace) -> Path:
     """Carry out `gsx render`; returns the file or folder written."""
     from gsx.core.files import remove_partial
     from gsx.experiments.runs.open import open_run
-    from gsx.experiments.runs.render import (
-        FRAMES,
-        emptied,
-        file_pictures,
-        render_orbit,
-        render_path,
-        render_test_views,
-        run_pictures,
-    )
+    from gsx.experiments.runs.render import file_pictures, render_orbit, render_path, render_test_views, run_pictures
     from gsx.experiments.viewer.camera_path import read_camera_path
 
     way = read_camera_path(given.path) if given.path else None
@@ -117,12 +109,12 @@ def rendered(given: argparse.Namespace) -> Path:
     run, settings = open_run(given.target, plugins())
     remove_partial(given.target / "renders")
     if way is not None:
-        to = given.movie or given.to or emptied(given.target / "renders" / "path", FRAMES)
-        return render_path(way, run_pictures(run, settings), to, bool(given.movie), given.zoom)
+        to = given.movie or given.to or given.target / "renders" / "path"
+        return render_path(way, run_pictures(run, settings), to, bool(given.movie), given.zoom, given.target)
     if given.orbit:
         render_orbit(run, settings, given.orbit, given.frames, given.fps, given.zoom)
         return Path(given.orbit)
-    folder: Path = given.to or emptied(given.target / "renders" / "test", "*.png")
+    folder: Path = given.to or given.target / "renders" / "test"
     render_test_views(run, settings, folder, given.zoom)
     return folder
 

@@ -32,8 +32,6 @@ HYDRA_FLAGS = (
     "--resolve",
 )
 """Flags that are handed to Hydra as they are."""
-VALUED_FLAGS = ("--cfg", "-c", "-p", "--package")
-"""Those of them whose next word is their value."""
 
 
 def verb_train(arguments: list[str]) -> int:
@@ -92,16 +90,13 @@ def hand_to_hydra(arguments: list[str]) -> int:
         finally:  # it may end the program
             sys.stdout.write(text.getvalue())
         return 0
-    flags, given = flags_and_overrides(arguments)
-    for flag in flags:
-        if flag.startswith("-") and flag not in ("-m", "--multirun"):
-            raise ConfigError(f"-m trains several runs, and {flag} trains none: leave one of them out")
-    refuse_taken_by_sweeps(given)
-    sweep = new_sweep(check_overrides(given, loaded))
-    code = 0
+    given = [word for word in arguments if not word.startswith("-")]
+    refuse_for_sweeps(arguments)
+    output, of_launcher = check_overrides(given, loaded)
+    sweep, code = new_sweep(output), 0
     try:
         with waiting_for_all(sweep):
-            hydra_main([*flags, *given, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+            hydra_main(["-m", *given, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     except KeyboardInterrupt:
         say("\ngsx: interrupted; runs that were begun say above how to go on\n", as_error=True)
         code = INTERRUPTED
@@ -110,17 +105,11 @@ def hand_to_hydra(arguments: list[str]) -> int:
     return code
 
 
-def flags_and_overrides(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """(flags, those that take one with their value; the other words), each in their order."""
-    after = [None, *arguments]
-    of_flags = [word.startswith("-") or before in VALUED_FLAGS for word, before in zip(arguments, after, strict=False)]
-    flags = [word for word, of_flag in zip(arguments, of_flags, strict=True) if of_flag]
-    return flags, [word for word, of_flag in zip(arguments, of_flags, strict=True) if not of_flag]
-
-
-def refuse_taken_by_sweeps(overrides: list[str]) -> None:
-    """Raise ConfigError for what gsx says itself of a multirun."""
-    for word in overrides:
+def refuse_for_sweeps(arguments: list[str]) -> None:
+    """Raise ConfigError for flags that train nothing, and for what gsx says itself of a multirun."""
+    for word in arguments:
+        if word.startswith("-") and word not in ("-m", "--multirun"):
+            raise ConfigError(f"-m trains several runs, and {word} trains none: leave one of them out")
         if word.lstrip("+").startswith("hydra.sweep.dir="):
             raise ConfigError(f"'{word}': a multirun's record goes below output/sweeps; give output=FOLDER")
 
@@ -153,21 +142,19 @@ def sweep_job(config: Any) -> int:
 
     An error is shown and does not end the others; Ctrl-C does, where a launcher's processes are in the end of all.
     """
-    from multiprocessing import parent_process
-
     from gsx.core.files import write_json
     from gsx.experiments.runs.compose import job_place
-    from gsx.experiments.runs.launched import ended_from_without
+    from gsx.experiments.runs.launched import ended_from_without, is_launched
     from gsx.experiments.runs.settings import settings_from
 
     set_up_logging()
     folders: list[Path] = []
-    place, launched = job_place(), parent_process() is not None
+    place = job_place()
     try:
-        with ended_from_without(place[0] if place else None):
+        with ended_from_without(place[0]) if place else nullcontext():
             code = train(settings_from(config, loaded := plugins()), loaded, folders)
     except KeyboardInterrupt:
-        if not launched:
+        if not is_launched():
             raise
         code = INTERRUPTED
     except GsxError as error:
@@ -181,7 +168,7 @@ def sweep_job(config: Any) -> int:
         (place[0] / "jobs").mkdir(parents=True, exist_ok=True)
         record = {"folder": str(folders[0].resolve()) if folders else "", "code": code}
         write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
-    if code == INTERRUPTED and not launched:
+    if code == INTERRUPTED and not is_launched():
         raise KeyboardInterrupt
     return tell_report(code, *folders)
 

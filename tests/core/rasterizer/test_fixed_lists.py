@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsx.core.rasterizer import ListSizes, Needed
+from gsx.core.rasterizer import ListSizes, Needed, repeat_rows
 from gsx.core.rasterizer.bags import SPARE, bag_sums
 from gsx.core.rasterizer.fixed_lists import owners
+from gsx.core.rasterizer.projection import runs_added
 
 ROOM = ListSizes(rows=10, pairs=20, blocks=6, longest=3)
 ENOUGH = Needed(dropped=0, rows=10, pairs=20, blocks=5, longest=3)
@@ -30,6 +31,20 @@ def test_sums_of_bags_leave_out_what_is_spare() -> None:
     assert bag_sums(values, places[:5], edges, spare=False).tolist() == expected
     beyond = torch.tensor([0, 2, 2, 99])  # too little room: nothing is read behind the last place
     assert bag_sums(values, places, beyond, spare=True)[:2].tolist() == expected[:2]
+
+
+def test_rows_that_are_taken_several_times_add_their_gradients() -> None:
+    ids = torch.tensor([0, 0, 2, 2, 2, 3])
+    values = torch.rand(5, 2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.equal(repeat_rows(values, ids), values[ids])
+    assert torch.autograd.gradcheck(lambda values: repeat_rows(values, ids), values)
+
+
+@pytest.mark.parametrize("ids", [[0, 0, 2, 2, 2, 3], [1, 4], []])
+def test_runs_are_added_row_by_row(ids: list[int]) -> None:
+    """As a GPU does it: in the order of the list, and without being asked how many there are of each."""
+    values, rows = torch.rand(len(ids), 3), torch.tensor(ids, dtype=torch.int64)
+    assert torch.equal(runs_added(values, rows, 5), torch.zeros(5, 3).index_add_(0, rows, values))
 
 
 def test_what_just_fits() -> None:

@@ -1,12 +1,16 @@
 """Pictures in pieces: the same bits as the whole, at any zoom, in memory that does not grow with the raster."""
 
+from typing import Any
+
 import pytest
 import torch
 from raster_scenes import changed, front_camera, leaves, random_splats, run_script
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
-from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
+from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, rasterize_tiled, tiled
 from gsx.core.rasterizer.compiled import available
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.rasterizer.tiled import covering
@@ -50,6 +54,20 @@ def test_pieces_with_too_many_pairs_are_halved_until_they_fit() -> None:
     tiled = rasterize_tiled(splats, front_camera(), rules)
     assert tiled.windows >= 4
     assert torch.equal(tiled.image, whole.image)
+
+
+def test_pieces_that_a_gpu_cannot_hold_are_halved_until_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    def holds_little(splats: Splats, camera: Camera, *given: Any, **named: Any) -> Rendering:
+        sizes.append(camera.width * camera.height)
+        if sizes[-1] > 1000:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return rasterize(splats, camera, *given, **named)
+
+    sizes = list[int]()
+    whole = rasterize(random_splats(), front_camera(), RasterSettings()).image
+    monkeypatch.setattr(tiled, "rasterize", holds_little)
+    assert torch.equal(rasterize_tiled(random_splats(), front_camera(), RasterSettings()).image, whole)
+    assert sizes[0] == 70 * 52
 
 
 def test_a_tile_with_too_many_pairs_is_refused() -> None:

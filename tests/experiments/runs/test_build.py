@@ -9,10 +9,23 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from gsx.core.cache import MANIFEST, trim
-from gsx.experiments.runs.build import keep_compiled_code, plan_of
+from gsx.experiments.runs.build import convolve_exactly, keep_compiled_code, plan_of
 from gsx.experiments.runs.environment import in_words
+
+
+def test_convolutions_on_a_gpu_are_those_of_float32() -> None:
+    """Of which torch keeps ten bits unless told otherwise, and whose sums it adds in any order."""
+    cudnn = torch.backends.cudnn
+    before = cudnn.conv.fp32_precision, cudnn.deterministic
+    cudnn.conv.fp32_precision, cudnn.deterministic = "tf32", False
+    try:
+        convolve_exactly()
+        assert (cudnn.conv.fp32_precision, cudnn.deterministic) == ("ieee", True)
+    finally:
+        cudnn.conv.fp32_precision, cudnn.deterministic = before
 
 
 @dataclass

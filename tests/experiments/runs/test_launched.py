@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
@@ -47,11 +48,12 @@ def test_all_jobs_come_to_an_end_before_a_signal_counts(
     def launched() -> None:
         for one in both:
             one.start()
-        while len(files(tmp_path, "begun")) < 2:
+        deadline = time.monotonic() + 60
+        while len(files(tmp_path, "begun")) < 2 and time.monotonic() < deadline:
             time.sleep(0.02)
+        os.kill(os.getpid(), number)
         for pid in [one.pid for one in both] if twice else []:
             os.kill(pid, number)
-        os.kill(os.getpid(), number)
         for one in both:
             one.join(20)
         assert (tmp_path / STOPPED).exists()
@@ -71,6 +73,19 @@ def test_jobs_of_this_process_are_interrupted_as_ever(tmp_path: Path) -> None:
     assert not (tmp_path / STOPPED).exists()
 
 
+def test_threads_hear_no_signals(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: [waiting_for_all(tmp_path).__enter__()]).result() == [None]
+
+
+def test_there_are_no_more_processes_than_jobs() -> None:
+    """They would share the cores, and be idle."""
+    pytest.importorskip("joblib", reason="gsx[sweep] is not installed")
+    from gsx.experiments.runs.compose import processes_for  # the processes of the first test would import it
+
+    assert [processes_for(3, 8), processes_for(8, 3), processes_for(1, -1)] == [3, 3, 1]
+
+
 def test_what_a_launcher_raises_is_told(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="of its own"), waiting_for_all(tmp_path):
         raise ValueError("of its own")
@@ -81,7 +96,7 @@ def test_what_a_launcher_raises_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_leaves_a_checkpoint_of_every_run_of_a_multirun(number: signal.Signals, tmp_path: Path) -> None:
     """Three runs in two processes: two have begun."""
-    from tiny import LIGHT, OVERRIDES  # processes of the other tests would import all of it
+    from tiny import LIGHT, OVERRIDES  # the processes of the first test would import it
 
     from gsx.core.files import read_json
 

@@ -14,6 +14,7 @@ from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
+from gsx.core.rasterizer.bags import bag_sums
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.path import compiles, goes_compiled
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
@@ -190,6 +191,35 @@ class TakeRows(torch.autograd.Function):
 def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
     """`values[ids]` for ids that are all different."""
     return TakeRows.apply(values, ids)
+
+
+class RepeatRows(torch.autograd.Function):
+    """Selects rows by ascending ids, some of them several times; their gradients are added in the order of the list.
+    torch's own selection adds them in any order on a GPU."""
+
+    @staticmethod
+    def forward(ctx, values, ids):
+        ctx.save_for_backward(ids)
+        ctx.shape = values.shape
+        return values.index_select(0, ids)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (ids,) = ctx.saved_tensors
+        if gradient.device.type == "cpu":
+            return gradient.new_zeros(ctx.shape).index_add_(0, ids, gradient), None
+        return runs_added(gradient.flatten(1), ids, ctx.shape[0]).view(ctx.shape), None
+
+
+def runs_added(values: Float[Tensor, "M V"], ids: Int[Tensor, "M"], count: int) -> Float[Tensor, "N V"]:
+    """Row n is the sum of the values whose id is n; ids ascend. Always in the same order, without asking the device."""
+    rows = torch.arange(count + 1, device=ids.device, dtype=ids.dtype)
+    return bag_sums(values, torch.arange(len(ids), device=ids.device), torch.searchsorted(ids, rows), spare=False)
+
+
+def repeat_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
+    """`values[ids]` for ids that ascend, with repetitions."""
+    return RepeatRows.apply(values, ids)
 
 
 @functools.lru_cache

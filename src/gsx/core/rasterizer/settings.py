@@ -88,7 +88,8 @@ class RasterSettings:
     """Compiled path: alpha values evaluated at once (by segments: slopes held at once); 0: 2^22 on a CPU, 2^26 on a
     GPU."""
     max_pairs: Annotated[int, Range(1, 1 << 30)] = 100_000_000
-    """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair)."""
+    """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair, on a GPU 300 B or
+    more)."""
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
     Blending more than 8 channels, sums in 16 bits and largest weights take the eager way regardless.

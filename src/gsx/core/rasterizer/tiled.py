@@ -75,11 +75,12 @@ def renderings(
     background: Float[Tensor, "C"] | None,
     depth: bool,
 ) -> Iterator[tuple[Window, Rendering]]:
-    """The window's rendering, or those of its halves where it has too many intersections, and so on to one tile."""
+    """The window's rendering, or those of its halves where it has too many intersections or a GPU too little memory,
+    and so on to one tile."""
     unit = max(WINDOW_TILE, settings.tile_size)
     try:
         part = rasterize(splats, window.of(camera), settings, background=background, depth=depth)
-    except TooManyPairs:
+    except (TooManyPairs, torch.OutOfMemoryError):  # what a GPU cannot hold
         if max(window.width, window.height) <= unit:
             raise
     else:
@@ -102,7 +103,7 @@ def rasterize_tiled(
     """What `rasterize` draws without gradients, bit for bit, in windows of at most `pixels` px (but at least a tile).
 
     Beyond the result, memory grows with `pixels` and with the pairs of one window, not with the raster. Windows that
-    need more than `settings.max_pairs` pairs are halved until they do not.
+    need more than `settings.max_pairs` pairs, or more memory than a GPU has, are halved until they do not.
 
     Raises:
         InputError: a single tile needs more pairs than `settings.max_pairs`, or `pixels` is not positive.

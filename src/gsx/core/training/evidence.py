@@ -21,6 +21,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
+from gsx.core.rasterizer.composite import sum_by_splat
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Drawn
 from gsx.core.training.parameter_table import ParameterTable
@@ -121,7 +122,8 @@ def by_row(drawn: Drawn, values: Float[Tensor, "*K M"], count: int) -> Float[Ten
     """Sums of what was found of the splats of each of so many rows."""
     if drawn.rows is None:
         return values
-    return values.new_zeros(*values.shape[:-1], count).index_add_(-1, drawn.rows, values)
+    each = values.reshape(-1, values.shape[-1]).T
+    return sum_by_splat(each, drawn.rows, count).T.reshape(*values.shape[:-1], count)
 
 
 def looked_at(

@@ -30,6 +30,7 @@ from gsx.core.rasterizer import (
     dilations_of,
     rasterize_fixed,
 )
+from gsx.core.rasterizer.intersections import raster_numbers
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
@@ -240,6 +241,7 @@ class Recorder:
             made, graph = self.record(work)
         except RuntimeError as error:
             self.broken = True
+            raster_numbers.cache_clear()  # what was to be filled while recorded work runs has nothing in it
             logger.warning("steps are launched one by one: they cannot be recorded here (%s)", first_line(error))
             return None
         found = gradients(self.backbone.table)

@@ -276,8 +276,8 @@ class Evaluator:
     def ssim(
         self, image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
     ) -> float:
-        """By the protocol's variant, compiled if renders are."""
-        return ssim(image, truth, self.options.ssim, counted, path_of(self.run.raster, self.run.device) == "compiled")
+        """By the protocol's variant, compiled if renders would be where the picture is."""
+        return ssim(image, truth, self.options.ssim, counted, path_of(self.run.raster, image.device) == "compiled")
 
     def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
         """The part of a picture that is judged, for metrics that know no mask."""

@@ -95,7 +95,15 @@ def prepare_process(device: torch.device, training: bool) -> None:
         keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
+        convolve_exactly()
     prepare_compiling()
+
+
+def convolve_exactly() -> None:
+    """On a GPU convolutions of float32 are those of float32, not of the 10 bits that torch allows there, and add in the
+    same order each time: pictures are reduced by them, and regenerators learn by them."""
+    torch.backends.cudnn.conv.fp32_precision = "ieee"  # type: ignore[attr-defined]
+    torch.backends.cudnn.deterministic = True
 
 
 def prepare_compiling() -> None:

@@ -1,5 +1,6 @@
 """From overrides to a composition: the only module that speaks to Hydra, but for the files that Hydra reads."""
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -136,6 +137,8 @@ class Compositions:
         config = hydra_compose(
             "config", overrides=[*overrides, f"hydra.sweep.dir={quoted(str(folder))}"], return_hydra_config=True
         )
+        if "n_jobs" in config.hydra.launcher:
+            config.hydra.launcher.n_jobs = processes_for(len(jobs), config.hydra.launcher.n_jobs)
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
         with waiting_for_all(folder):
@@ -297,11 +300,11 @@ def known_keys(overrides: Sequence[str]) -> list[str]:
     return list(dotted(OmegaConf.to_container(hydra_compose("config", overrides=choices), resolve=False)))
 
 
-def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
+def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, list[str]]:
     """Refuse wrong groups, keys and values of a multirun before Hydra starts it: each choice of a swept group is
     composed with the first of all other values that are swept.
 
-    Returns the folder that its runs go to.
+    Returns (the folder that its runs go to, overrides of its launcher for as many runs).
     """
     with hydra_session(plugins):
         groups, given = known_groups(), [one for one in parse_overrides(overrides) if one.input_line]
@@ -312,7 +315,28 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> Path:
         for place, values in enumerate(words):
             for other in values[1:]:
                 compose_raw([*first[:place], other, *first[place + 1 :]])
-        return output
+        return output, launcher_for(math.prod(size_of_sweep(one) for one in given), first)
+
+
+def launcher_for(jobs: int, overrides: Sequence[str]) -> list[str]:
+    """Overrides of the launcher for so many jobs."""
+    from hydra import compose as hydra_compose
+
+    launcher = hydra_compose("config", overrides=list(overrides), return_hydra_config=True).hydra.launcher
+    return [f"hydra.launcher.n_jobs={processes_for(jobs, launcher.n_jobs)}"] if "n_jobs" in launcher else []
+
+
+def processes_for(jobs: int, asked: int) -> int:
+    """Processes of joblib's launcher, at most one for each job: the cores are divided among all of them, and one
+    without a job could be ended by a signal, which ends the others."""
+    from joblib import effective_n_jobs
+
+    return int(min(jobs, effective_n_jobs(asked)))
+
+
+def size_of_sweep(override: Any) -> int:
+    """How many values an override has, up to a thousand."""
+    return sum(1 for _ in islice(override.sweep_string_iterator(), 1000)) if override.is_sweep_override() else 1
 
 
 def refuse_one_folder(overrides: Sequence[Any]) -> None:

@@ -24,6 +24,9 @@ from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)
 
+CAUTION = "caution"
+"""Key of a plan's part whose value is told as a warning."""
+
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
 POSE_DIGITS = 6
 """Digits of camera values that count, of the largest of its kind: what other machines compute differs behind them."""
@@ -91,7 +94,10 @@ def announce(run: Run, plugins: Plugins) -> None:
     for failure in plugins.failures:
         logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
     for name, part in plan_of(run).items():
-        logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in part.items()))
+        told = {key: value for key, value in part.items() if key != CAUTION}
+        logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in told.items()))
+        if CAUTION in part:
+            logger.warning("%s %s", name, part[CAUTION])
     logger.info(
         "seed %s, %d threads, %s; run folder %s", run.config["seed"], torch.get_num_threads(), run.device, run.folder
     )

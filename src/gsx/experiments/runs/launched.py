@@ -1,75 +1,100 @@
 """Runs in processes of a launcher, and the signals that end them.
 
-joblib kills all of its processes as soon as one of their tasks raises anything, or the process that waits for them.
-So neither does: the first signal ends every run with a checkpoint, and counts once all of them have ended.
+joblib kills all of its processes as soon as one of their tasks raises anything, or the process that waits for them. So
+neither does: the first signal ends every run with a checkpoint, and counts once all of them have ended.
 """
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import active_children, parent_process
+from multiprocessing import parent_process
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from gsx.core.signals import heeded
 
+LAUNCHER = "GSX_LAUNCHER"
+"""Environment variable: the process that waits for those of a launcher, which inherit it."""
 STOPPED = "stopped"
 """File in the folder of a multirun or of a table's phase: no job of it begins any more."""
+WORKING = "working"
+"""Folder there with a file for each process in a job, named by its number."""
 
 
 @contextmanager
 def waiting_for_all(folder: Path) -> Iterator[None]:
-    """The first Ctrl-C, or signal of a job's end, ends runs in processes of a launcher; nothing begins after it. Where
-    there are no such processes it is as ever, and so is a second Ctrl-C.
+    """The first Ctrl-C, or signal of a job's end, ends the jobs in processes of a launcher; none begins after it. Where
+    there are none it is as ever, and so is a second Ctrl-C. Threads but the main one hear no signals.
 
     Raises:
         KeyboardInterrupt, SystemExit: there was one, and all have ended.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     received: list[int] = []
-    mark = folder / STOPPED
 
     def stop(number: int, frame: Any) -> None:
-        children = active_children()
-        if not children:
-            give_back()
+        working = list((folder / WORKING).glob("*"))
+        if not working:
+            give_back(before)
             signal.raise_signal(number)
             return
         received.append(number)
-        folder.mkdir(parents=True, exist_ok=True)
-        mark.touch()
+        (folder / STOPPED).touch()
         signal.signal(signal.SIGINT, before[signal.SIGINT])
-        for child in children if os.name == "posix" else ():  # elsewhere it would be killed; a console tells all anyway
+        for one in working if os.name == "posix" else ():  # elsewhere it would be killed; a console tells all anyway
             with suppress(ProcessLookupError):
-                os.kill(child.pid or 0, signal.SIGTERM)
+                os.kill(int(one.name), signal.SIGTERM)
 
-    def give_back() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    mark.unlink(missing_ok=True)
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, *heeded())}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *heeded())}
+    forget(folder)
+    os.environ[LAUNCHER] = str(os.getpid())
     try:
+        for number in before:
+            signal.signal(number, stop)
         yield
     except Exception:
         if not received:
             raise
     finally:
-        give_back()
-        mark.unlink(missing_ok=True)
+        give_back(before)
+        del os.environ[LAUNCHER]
+        forget(folder)
     if received:
         raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
 
 
+def give_back(handlers: dict[signal.Signals, Any]) -> None:
+    """Handle signals as before."""
+    for number, handler in handlers.items():
+        signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def forget(folder: Path) -> None:
+    """Remove what processes tell each other in a folder."""
+    (folder / STOPPED).unlink(missing_ok=True)
+    rmtree(folder / WORKING, ignore_errors=True)
+
+
+def is_launched() -> bool:
+    """Whether this is a process of a launcher's, for which another one waits."""
+    parent = parent_process()
+    return parent is not None and os.environ.get(LAUNCHER) == str(parent.pid)
+
+
 @contextmanager
-def ended_from_without(folder: Path | None) -> Iterator[None]:
+def ended_from_without(folder: Path) -> Iterator[None]:
     """A job in a process of a launcher: the first signal raises KeyboardInterrupt, unless training heeds it; none ends
     the process, now or between its jobs. Anywhere else nothing changes.
 
     Raises:
         KeyboardInterrupt: it was ended, or jobs of `folder` do not begin any more.
     """
-    if parent_process() is None:
+    if not is_launched():
         yield
         return
 
@@ -81,12 +106,15 @@ def ended_from_without(folder: Path | None) -> Iterator[None]:
         for number in heard:
             signal.signal(number, lambda number, frame: None)
 
-    heard = (signal.SIGINT, *heeded())
+    heard, own = (signal.SIGINT, *heeded()), folder / WORKING / str(os.getpid())
     for number in heard:
         signal.signal(number, once)
     try:
-        if folder is not None and (folder / STOPPED).exists():
+        own.parent.mkdir(parents=True, exist_ok=True)
+        own.touch()
+        if (folder / STOPPED).exists():
             raise KeyboardInterrupt
         yield
     finally:
         let_pass()
+        own.unlink(missing_ok=True)

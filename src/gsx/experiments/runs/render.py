@@ -1,7 +1,7 @@
 """Pictures of a run: its test views, one view by name, an orbit; and of a run or a file along a camera path."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -42,9 +42,10 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     """Write every test view at `zoom` times the training resolution as PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     remove_partial(folder, below=False)
-    for view, name in zip(run.scene.test, file_names([view.name for view in run.scene.test]), strict=True):
-        picture = render(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels)
-        write_image(folder / f"{name}.png", picture.image)
+    names = [f"{name}.png" for name in file_names([view.name for view in run.scene.test])]
+    for view, name in zip(run.scene.test, names, strict=True):
+        write_image(folder / name, render(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels).image)
+    clear_of_others(folder, "*.png", names, run.folder)
 
 
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
@@ -75,8 +76,11 @@ def file_pictures(path: Path) -> Draw:
     return lambda camera: render_gaussians(gaussians, camera, raster, torch.zeros(3))
 
 
-def render_path(way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float) -> Path:
-    """Write the frames of a camera path: an animation, or a folder of numbered PNGs; returns which."""
+def render_path(
+    way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
+) -> Path:
+    """Write the frames of a camera path: an animation, or a folder of numbered PNGs; returns which. run_folder: of the
+    run that is drawn."""
     cameras = way.cameras(zoom)
     if movie:
         remove_partial(to.parent, below=False)
@@ -84,19 +88,22 @@ def render_path(way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float)
         return to
     to.mkdir(parents=True, exist_ok=True)
     remove_partial(to, below=False)
-    for number, camera in enumerate(cameras):
-        write_image(to / f"frame_{number:05d}.png", draw(camera))
-    beyond = [file for file in sorted(to.glob(FRAMES)) if file.name >= f"frame_{len(cameras):05d}.png"]
-    if beyond:
-        logger.warning(
-            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
-            *(to, len(beyond), beyond[0].name),
-        )
+    names = [f"frame_{number:05d}.png" for number in range(len(cameras))]
+    for name, camera in zip(names, cameras, strict=True):
+        write_image(to / name, draw(camera))
+    clear_of_others(to, FRAMES, names, run_folder)
     return to
 
 
-def emptied(folder: Path, pattern: str) -> Path:
-    """A folder of ours without pictures of that name: those of other views or of a longer path would stay."""
-    for file in folder.glob(pattern):
-        file.unlink()
-    return folder
+def clear_of_others(folder: Path, pattern: str, names: Sequence[str], run_folder: Path | None) -> None:
+    """See to pictures that were in a folder before, of other views or of a longer path: those below a run's
+    renders are removed, of others people are told."""
+    others = sorted(set(folder.glob(pattern)) - {folder / name for name in names})
+    if run_folder is not None and folder.resolve().parent == run_folder.resolve() / "renders":
+        for file in others:
+            file.unlink(missing_ok=True)
+    elif others and pattern == FRAMES:
+        logger.warning(
+            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
+            *(folder, len(others), others[0].name),
+        )

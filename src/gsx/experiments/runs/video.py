@@ -43,21 +43,29 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
     require(f"frames of {path}", ("av",), "gsx[video]")
     made_of = [*map(str, file_stamp(path)), count]
     folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
-    folder.mkdir(parents=True, exist_ok=True)
-    with one_after_the_other(folder):
-        if (folder / INDEX).exists() and read_json(folder / INDEX) == made_of:
-            logger.info("frames were chosen earlier: %s", folder)
-        else:
-            choose(path, folder, count, made_of)
+    if not chosen(folder, made_of):
+        folder.mkdir(parents=True, exist_ok=True)
+        with one_after_the_other(folder):
+            if not chosen(folder, made_of):
+                choose(path, folder, count, made_of)
+                return folder
+    logger.info("frames were chosen earlier: %s", folder)
     return folder
+
+
+def chosen(folder: Path, made_of: Sequence[Any]) -> bool:
+    """Whether a folder holds the frames of that."""
+    return (folder / INDEX).exists() and bool(read_json(folder / INDEX) == made_of)
 
 
 @contextmanager
 def one_after_the_other(folder: Path) -> Iterator[None]:
     """Processes that want the same folder wait for each other, where the file system knows locks."""
     with (folder.parent / f".{folder.name}.lock").open("w") as stream:
-        with suppress(OSError):
-            lock(stream, wait=True)
+        with suppress(OSError, InputError):
+            if not lock(stream):
+                logger.info("waiting for another process, which chooses the frames of %s", folder)
+                lock(stream, wait=True)
         yield
 
 

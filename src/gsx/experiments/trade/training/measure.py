@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from gsx.core.errors import ConfigError, GsxError, first_line
+from gsx.core.errors import ConfigError, TrainingError, first_line
 from gsx.core.files import read_json
 from gsx.core.plugins import Plugins
 from gsx.experiments.reports.page import duration
@@ -71,7 +71,8 @@ class Row:
         """The most that a seed loses at any zoom beside the composition as given, dB; negative where all gain."""
         pairs = zip(self.outcomes, given.outcomes, strict=True)
         both = [(after.psnr, before.psnr) for after, before in pairs]
-        return max(before[zoom] - after[zoom] for after, before in both for zoom in before.keys() & after.keys())
+        losses = [before[zoom] - after[zoom] for after, before in both for zoom in before.keys() & after.keys()]
+        return max(losses, default=0.0)
 
 
 def outcome_of(folder: Path, beside: Path) -> Outcome:
@@ -120,7 +121,9 @@ class Trial:
         try:
             runs = [self.composed(overrides, seed) for seed in self.seeds]
             outcomes = [outcome_of(self.job(run), self.folder) for run in runs]
-        except GsxError as error:
+        except (ConfigError, TrainingError) as error:
+            if setting == GIVEN:
+                raise
             logger.info("%s: not to be had (%s)", setting.name, first_line(error))
             return Row(setting=setting, overrides=overrides, failure=first_line(error))
         row = Row(setting=setting, overrides=overrides, outcomes=outcomes)
@@ -134,8 +137,6 @@ def measured(trial: Trial, listed: Sequence[Setting], most_together: int) -> lis
     """The composition as given, each setting alone, and what is best in several trades together."""
     iterations = trial.composed([], trial.seeds[0]).general.iterations
     given = trial.tried(GIVEN, iterations)
-    if given.failure:
-        raise ConfigError(given.failure)
     logger.info("%d settings, %d seed(s): about %s", len(listed), len(trial.seeds), duration(expected(given, listed)))
     rows = [given, *(trial.tried(setting, iterations) for setting in listed)]
     rows = different(rows)
