@@ -529,6 +529,10 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: ["-m", "seed=0,1", "hydra/launcher=processes", "hydra.launcher.n_jobs=0", f"output={t / 'out'}"],
         "hydra.launcher.n_jobs is 0; give how many processes",
     ),
+    "more pictures than anybody waits for": (
+        lambda t: ["trade", "rasterizer", "--views", "100000", "--to", str(t / "t")],
+        "gsx trade rasterizer --views is 100,000: give a number from 1 to 100",
+    ),
     "a folder for a movie": (
         lambda t: ["render", str(t / "run"), "--orbit", str(t / "a.gif"), "--to", str(t / "to")],
         "--to FOLDER is for pictures",

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, different_numbers, new_folder, not_negative, positive, whole
+from gsx.cli.arguments import Parser, different_numbers, new_folder, not_negative, positive, refuse_beyond, whole
 from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.ranges import Range
 
 logger = logging.getLogger("gsx.cli")
 
+MOST_VIEWS = 100
+"""Pictures that settings of the rasterizer are measured on: a float64 truth of each is made first."""
 USAGE = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] or gsx trade training [KEY=VALUE ...]"
 
 
@@ -40,6 +43,8 @@ def trade_arguments(arguments: list[str]) -> argparse.Namespace:
         options = ("--max-error", "--to", "--repeats", "--views", "--combinations", "--knobs")
         hint = nearest(unknown[0], options)
         raise ConfigError(f"'{unknown[0]}' is no option of {parser.prog}.{hint} See {parser.prog} --help")
+    if given.views:
+        refuse_beyond(f"{parser.prog} --views", given.views, Range(1, MOST_VIEWS))
     targets = [word for word in given.words if "=" not in word or Path(word).exists()]
     given.overrides = [word for word in given.words if word not in targets]
     if len(targets) > 1:
