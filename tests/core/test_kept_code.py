@@ -26,13 +26,13 @@ from gsx.core.kept_code import (
     digest_of,
     flat,
     lacking,
-    made_by_one,
     make_ahead,
     nothing_kept,
     recorded,
     waiting_counted,
     without_layers,
 )
+from gsx.core.locks import made_by_one
 from gsx.core.quality.similarity import compiled_correlate, correlate
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")

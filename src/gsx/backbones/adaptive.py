@@ -29,7 +29,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import window_errors
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
-from gsx.core.training.validation import decibels, nothing_counts, rounding_in, validation_windows
+from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
 logger = logging.getLogger(__name__)
 
@@ -143,7 +143,7 @@ class Adaptive:
         """Draw the validation windows with and without what the last event added."""
         table = model.table
         before = undone(table) if self.tries(table) else None
-        if before is None or nothing_counts(self.windows(step)):
+        if before is None or not bool(rounding_in(self.windows(step)).any()):  # masked windows tell nothing
             return {}
         gain, error = self.gain(model, table, before, step)
         each = self.options.discount / math.log2(len(table) / len(before))

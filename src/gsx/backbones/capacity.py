@@ -13,7 +13,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, BackboneContext
+from gsx.core.training.backbone import CAUTION, Backbone, BackboneContext
 from gsx.core.training.density import room_under
 from gsx.core.training.evidence import Removal, some_of, worth_of_rows
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
@@ -42,21 +42,21 @@ class Growing:
         """Whether it acts at a step."""
         return self.start < step < self.stop and step % self.every == 0
 
-    def acts(self) -> bool:
-        """Whether it acts at all."""
-        return (self.stop - 1) // self.every > self.start // self.every
+    def count(self) -> int:
+        """How often it acts; not at all: 0 or less."""
+        return (self.stop - 1) // self.every - self.start // self.every
 
     def events(self) -> int:
         """How often it acts, at least once."""
-        return max(1, (self.stop - 1) // self.every - self.start // self.every)
+        return max(1, self.count())
 
     def caution(self) -> dict[str, str]:
         """For a plan: that nothing will be decided, where it does not act at all."""
-        if self.acts():
+        if self.count() > 0:
             return {}
         when = f"every {self.every} steps between {self.start} and {self.stop}"
         remedy = "take more steps, or fewer training views, all of which an interval passes over"
-        return {"caution": f"decides nothing, as density control acts at no step of this run, {when}: {remedy}"}
+        return {CAUTION: f"decides nothing, as density control acts at no step of this run, {when}: {remedy}"}
 
     def passed(self, step: int) -> float:
         """How much of the events is over after the one at a step, from 0 to 1."""

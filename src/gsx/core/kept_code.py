@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import content_key, file_stamp
-from gsx.core.errors import InputError, first_line
+from gsx.core.errors import first_line
 from gsx.core.files import replacing
-from gsx.core.locks import lock
+from gsx.core.locks import made_by_one
 
 logger = logging.getLogger(__name__)
 
@@ -201,26 +201,6 @@ def save(made: Any, file: Path) -> None:
             temporary.write_bytes(hashlib.sha256(data).digest() + data)
     except Exception as error:  # a full disk, or something of this function that cannot be written
         logger.info("compiled code is not kept in %s: %s", file, first_line(error))
-
-
-@contextmanager
-def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
-    """Whether nobody else makes this file; `wait`: until nobody does. Where nothing can be locked everybody may."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        stream = file.with_suffix(".lock").open("w")
-    except OSError:
-        yield True
-        return
-    with stream:
-        try:
-            alone = lock(stream)
-            if wait and not alone:
-                logger.info("waiting for another process, which is making %s ...", file.name.partition("-")[0])
-                alone = lock(stream, wait)
-        except (OSError, InputError):
-            alone = True
-        yield alone
 
 
 # -- functions ---------------------------------------------------------------------------------------------------------

@@ -1,9 +1,15 @@
 """Locks of open files on any system. They end with their process, so a killed one leaves none behind."""
 
+import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO
 
 from gsx.core.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 RETRY_SECONDS = 0.05
 """Between attempts where the system cannot wait by itself."""
@@ -21,6 +27,26 @@ def lock(stream: IO[str], wait: bool = False) -> bool:
             return False
         time.sleep(RETRY_SECONDS)
     return True
+
+
+@contextmanager
+def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
+    """Whether nobody else makes this file; `wait`: until nobody does. Where nothing can be locked everybody may."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        stream = file.with_suffix(".lock").open("w")
+    except OSError:
+        yield True
+        return
+    with stream:
+        try:
+            alone = lock(stream)
+            if wait and not alone:
+                logger.info("waiting for another process, which is making %s ...", file.name.partition("-")[0])
+                alone = lock(stream, wait)
+        except (OSError, InputError):
+            alone = True
+        yield alone
 
 
 def locked(stream: IO[str]) -> bool:

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from gsx.core.rasterizer import ListSizes, Needed, repeat_rows
-from gsx.core.rasterizer.bags import SPARE, bag_sums
+from gsx.core.rasterizer.bags import SPARE, bag_sums, runs_added
 from gsx.core.rasterizer.fixed_lists import owners
-from gsx.core.rasterizer.projection import runs_added
 
 ROOM = ListSizes(rows=10, pairs=20, blocks=6, longest=3)
 ENOUGH = Needed(dropped=0, rows=10, pairs=20, blocks=5, longest=3)

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.bags import bag_sums
+from gsx.core.rasterizer.bags import runs_added
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.path import compiles, goes_compiled
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
@@ -173,14 +173,17 @@ def dilations_of(
     return settings.dilation_at(camera.focal if intrinsics is None else float(intrinsics[:2].max().detach()))
 
 
+def select_rows(ctx: Any, values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
+    """Forward: rows, and what their gradients are put together by."""
+    ctx.save_for_backward(ids)
+    ctx.shape = values.shape
+    return values.index_select(0, ids)
+
+
 class TakeRows(torch.autograd.Function):
     """Selects distinct rows; their gradients are copied back, where indexing would have to add."""
 
-    @staticmethod
-    def forward(ctx, values, ids):
-        ctx.save_for_backward(ids)
-        ctx.shape = values.shape
-        return values.index_select(0, ids)
+    forward = staticmethod(select_rows)
 
     @staticmethod
     def backward(ctx, gradient):
@@ -197,11 +200,7 @@ class RepeatRows(torch.autograd.Function):
     """Selects rows by ascending ids, some of them several times; their gradients are added in the order of the list.
     torch's own selection adds them in any order on a GPU."""
 
-    @staticmethod
-    def forward(ctx, values, ids):
-        ctx.save_for_backward(ids)
-        ctx.shape = values.shape
-        return values.index_select(0, ids)
+    forward = staticmethod(select_rows)
 
     @staticmethod
     def backward(ctx, gradient):
@@ -209,12 +208,6 @@ class RepeatRows(torch.autograd.Function):
         if gradient.device.type == "cpu":
             return gradient.new_zeros(ctx.shape).index_add_(0, ids, gradient), None
         return runs_added(gradient.flatten(1), ids, ctx.shape[0]).view(ctx.shape), None
-
-
-def runs_added(values: Float[Tensor, "M V"], ids: Int[Tensor, "M"], count: int) -> Float[Tensor, "N V"]:
-    """Row n is the sum of the values whose id is n; ids ascend. Always in the same order, without asking the device."""
-    rows = torch.arange(count + 1, device=ids.device, dtype=ids.dtype)
-    return bag_sums(values, torch.arange(len(ids), device=ids.device), torch.searchsorted(ids, rows), spare=False)
 
 
 def repeat_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:

@@ -149,13 +149,17 @@ class Backbone(Protocol[D]):
         ...
 
 
+CAUTION = "caution"
+"""Key of a plan's part whose text is told as a warning."""
+
+
 @runtime_checkable
 class Planned(Protocol):
     """A backbone with a schedule to tell."""
 
     def plan(self) -> dict[str, Any]:
         """The rescaled schedule in absolute steps, for the log and the report: numbers or lists of them by name, or
-        several such parts by theirs."""
+        several such parts by theirs; see CAUTION."""
         ...
 
 

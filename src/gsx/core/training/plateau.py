@@ -20,7 +20,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
-from gsx.core.training.validation import decibels, nothing_counts, rounding_in, validation_windows
+from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
 logger = logging.getLogger(__name__)
 
@@ -115,15 +115,14 @@ class Plateau:
     def judge(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
         """Find what the steps since the windows began have gained, if pixels of them count. There are no windows
         then."""
-        if nothing_counts(windows):
-            self.begun, self.before = 0, self.before[:0]
+        floor, begun, before = rounding_in(windows), self.begun, self.before
+        self.begun, self.before = 0, before[:0]
+        if not bool(floor.any()):
             return
-        floor, doublings = rounding_in(windows), math.log2(step / self.begun)
-        gain, error = (value / doublings for value in decibels(after + floor, self.before + floor))
+        gain, error = (value / math.log2(step / begun) for value in decibels(after + floor, before + floor))
         self.found = torch.cat([self.found, torch.tensor([[step, gain, error]], dtype=torch.float64)])
-        told = step, gain, error, self.options.price, step - self.begun
+        told = step, gain, error, self.options.price, step - begun
         logger.info("step %d: %.2f +- %.2f dB per doubling of the steps, price %.2f, by the last %d", *told)
-        self.begun, self.before = 0, self.before[:0]
         if gain < self.options.price:
             self.left_out = range(step + 1, self.last)
             logger.info("step %d: the run goes on with step %d", step, self.last)

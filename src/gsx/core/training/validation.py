@@ -33,13 +33,9 @@ def part_of(view: View, share: float, right: float, down: float) -> Window:
 
 
 def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
-    """Squared error of photographs' rounding to 8 bits in each window, summed over the values that count."""
+    """Squared error of photographs' rounding to 8 bits in each window, summed over the values that count; 0 where
+    all are masked."""
     return torch.tensor([rounding_of(view, window) for view, window in windows.items()])
-
-
-def nothing_counts(windows: Mapping[View, Window]) -> bool:
-    """Whether all pixels of all windows are masked, so that they tell nothing."""
-    return not bool(rounding_in(windows).any())
 
 
 def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:

@@ -18,14 +18,12 @@ from gsx.core.data.scene import View
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer.compiled import path_of
+from gsx.core.training.backbone import CAUTION
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.build import plan_of
 
 logger = logging.getLogger(__name__)
-
-CAUTION = "caution"
-"""Key of a plan's part whose value is told as a warning."""
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
 POSE_DIGITS = 6

@@ -45,7 +45,7 @@ def waiting_for_all(folder: Path) -> Iterator[None]:
             return
         received.append(number)
         (folder / STOPPED).touch()
-        signal.signal(signal.SIGINT, before[signal.SIGINT])
+        give_back({signal.SIGINT: before[signal.SIGINT]})
         for one in working if os.name == "posix" else ():  # elsewhere it would be killed; a console tells all anyway
             with suppress(ProcessLookupError):
                 os.kill(int(one.name), signal.SIGTERM)

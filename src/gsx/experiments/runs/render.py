@@ -45,7 +45,7 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     names = [f"{name}.png" for name in file_names([view.name for view in run.scene.test])]
     for view, name in zip(run.scene.test, names, strict=True):
         write_image(folder / name, render(run, view.camera.zoom(zoom), settings.evaluation.tile_pixels).image)
-    clear_of_others(folder, "*.png", names, run.folder)
+    without_others(folder, "*.png", names, run.folder)
 
 
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
@@ -91,19 +91,21 @@ def render_path(
     names = [f"frame_{number:05d}.png" for number in range(len(cameras))]
     for name, camera in zip(names, cameras, strict=True):
         write_image(to / name, draw(camera))
-    clear_of_others(to, FRAMES, names, run_folder)
+    others = without_others(to, FRAMES, names, run_folder)
+    if others:
+        logger.warning(
+            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
+            *(to, len(others), others[0].name),
+        )
     return to
 
 
-def clear_of_others(folder: Path, pattern: str, names: Sequence[str], run_folder: Path | None) -> None:
-    """See to pictures that were in a folder before, of other views or of a longer path: those below a run's
-    renders are removed, of others people are told."""
+def without_others(folder: Path, pattern: str, names: Sequence[str], run_folder: Path | None) -> list[Path]:
+    """Remove pictures that were in a folder before, of other views or of a longer path, from one of a run's renders;
+    returns those that are left anywhere else."""
     others = sorted(set(folder.glob(pattern)) - {folder / name for name in names})
-    if run_folder is not None and folder.resolve().parent == run_folder.resolve() / "renders":
-        for file in others:
-            file.unlink(missing_ok=True)
-    elif others and pattern == FRAMES:
-        logger.warning(
-            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
-            *(folder, len(others), others[0].name),
-        )
+    if run_folder is None or folder.resolve().parent != run_folder.resolve() / "renders":
+        return others
+    for file in others:
+        file.unlink(missing_ok=True)
+    return []

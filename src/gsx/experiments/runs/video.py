@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from gsx.core.cache import content_key, file_stamp
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
-from gsx.core.locks import lock
+from gsx.core.locks import made_by_one
 from gsx.core.packages import require
 from gsx.core.shapes import Float, UInt8
 
@@ -44,8 +43,7 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
     made_of = [*map(str, file_stamp(path)), count]
     folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
     if not chosen(folder, made_of):
-        folder.mkdir(parents=True, exist_ok=True)
-        with one_after_the_other(folder):
+        with made_by_one(folder / INDEX, wait=True):
             if not chosen(folder, made_of):
                 choose(path, folder, count, made_of)
                 return folder
@@ -56,17 +54,6 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
 def chosen(folder: Path, made_of: Sequence[Any]) -> bool:
     """Whether a folder holds the frames of that."""
     return (folder / INDEX).exists() and bool(read_json(folder / INDEX) == made_of)
-
-
-@contextmanager
-def one_after_the_other(folder: Path) -> Iterator[None]:
-    """Processes that want the same folder wait for each other, where the file system knows locks."""
-    with (folder.parent / f".{folder.name}.lock").open("w") as stream:
-        with suppress(OSError, InputError):
-            if not lock(stream):
-                logger.info("waiting for another process, which chooses the frames of %s", folder)
-                lock(stream, wait=True)
-        yield
 
 
 def choose(path: Path, folder: Path, count: int, made_of: Sequence[Any]) -> None:

@@ -186,10 +186,10 @@ def of_nerfstudio(content: Any) -> CameraPath:
     if not isinstance(content, dict) or content.get("camera_type", "perspective") != "perspective":
         raise ValueError("is no path of perspective cameras")
     entries = listed(content["camera_path"])
-    pace, seconds = ("fps", 1.0) if "fps" in content else ("seconds", float(len(entries)))
+    pace = "fps" if "fps" in content else "seconds"
     if not (told := number(content[pace])) > 0:
         raise ValueError(f"has {told:g} for {pace}, which no film has")
-    fps = told if pace == "fps" else seconds / told
+    fps = told if pace == "fps" else len(entries) / told
     frames = []
     for i, entry in enumerate(entries):
         matrix = torch.tensor(numbers(entry["camera_to_world"], 16), dtype=torch.float64).view(4, 4)
