@@ -6,7 +6,7 @@ launch, though it may be several.
 
     python tests/stand_in_gpu.py CASE [/ CASE]...   # steps on the CPU, then there: losses and counts of each case
 
-A CASE is [--recorded|--broken] OVERRIDES.
+A CASE is [--recorded|--broken] [--sizes] OVERRIDES; --sizes: photographs are of three.
 """
 
 import json
@@ -14,7 +14,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +26,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsx.builtin import plugins
+from gsx.core.data.scene import Scene
+from gsx.core.rasterizer import ListSizes
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import ParameterTable, gradients, zero_grad
 from gsx.core.training.recorded import Learnt, Recorder
@@ -47,6 +49,8 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
 STEPS, RECORDED, BROKEN = 4, 15, 5
 """Steps taken; steps where some are recorded: density control changes the model at the 12th of them; and where none
 can be."""
+ROOM = ListSizes(rows=1 << 12, pairs=1 << 14, blocks=1 << 12, longest=1 << 8)
+"""More than any list of the tiny scene needs."""
 
 
 @dataclass
@@ -58,6 +62,8 @@ class Tally:
     inside: str = ""
     """Compiled function under way."""
     failed: int = 0
+    """Recordings that did."""
+    made: int = 0
     """Recordings."""
     recording: bool = False
     """A graph is recorded or replayed: the host has no part in it."""
@@ -292,18 +298,26 @@ class Again:
                 place.copy_(value)
 
 
-def recording(run: Run, tally: Tally, broken: bool) -> Recorder:
-    """A recorder whose graphs are no graphs, or cannot be made."""
+def recording(run: Run, tally: Tally, broken: bool, roomy: bool) -> Recorder:
+    """A recorder whose graphs are no graphs, or cannot be made; `roomy`: it need not find how much room lists need."""
 
     def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
         if broken:
             work()
             tally.failed += 1
             raise RuntimeError("operation not permitted when stream is capturing")
+        tally.made += 1
         again = Again(work, run.backbone.table, tally)
         return again.made, again
 
-    return Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight, record=record)
+    room = {"room": ROOM} if roomy else {}
+    return Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight, record=record, **room)
+
+
+def in_three_sizes(scene: Scene) -> Scene:
+    """Its photographs, two of three of them cut off at the right."""
+    cut = [replace(v, camera=v.camera.crop(0, 0, 48 - 12 * (i % 3), 36)) for i, v in enumerate(scene.train)]
+    return replace(scene, train=cut)
 
 
 def steps(
@@ -317,10 +331,12 @@ def steps(
     """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
     be recorded; `broken`: which fails."""
     loaded, losses = plugins(), list[Tensor]()
+    sizes, words = "--sizes" in words, [word for word in words if word != "--sizes"]
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
-        run = build.build(settings, load_scene(settings), Path(folder), training=True)
-        run.recorder = recording(run, recorded, broken) if recorded else None
+        scene = load_scene(settings)
+        run = build.build(settings, in_three_sizes(scene) if sizes else scene, Path(folder), training=True)
+        run.recorder = recording(run, recorded, broken, roomy=sizes) if recorded else None
         with loaded.listening([Guard()]):
             for _ in range(count):
                 begun()
@@ -339,7 +355,7 @@ class Case:
     @classmethod
     def of(cls, words: list[str]) -> "Case":
         """From words of the command line."""
-        flags = {word for word in words if word.startswith("--")}
+        flags = {word for word in words if word in ("--recorded", "--broken")}
         return cls([w for w in words if w not in flags], recorded=bool(flags), broken="--broken" in flags)
 
     @property
@@ -354,9 +370,10 @@ class Case:
     def on_device(self, tally: Tally, own: list[Tensor]) -> dict[str, Any]:
         """Losses of all kinds, and counts of the last step."""
         words = [*self.words, "rasterizer=compiled"]
-        recorded, tally.failed = tally if self.recorded else None, 0
+        recorded, tally.failed, tally.made = tally if self.recorded else None, 0, 0
         found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.broken)}
-        counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy(), "failed": tally.failed}
+        counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy()}
+        counts |= {"failed": tally.failed, "made": tally.made}
         found |= {"unrecorded": steps(words, DEVICE, self.count)} if recorded else {}
         return {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()} | counts
 

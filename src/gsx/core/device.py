@@ -1,14 +1,41 @@
 """What computes."""
 
+import functools
 import platform
+import time
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+PROCESSORS = Path("/proc/cpuinfo")
+"""Where Linux says which processors there are."""
+OF_ITS_KIND = ("vendor_id", "cpu family", "model", "model name", "flags", "CPU implementer", "CPU part", "Features")
+"""Of what is said there: what does not change from moment to moment, on x86 and on ARM."""
+
 
 def device_name(device: torch.device) -> str:
     """Name of a GPU, or of the processor."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return told_of_processor().get("model name") or platform.processor() or platform.machine()
+
+
+@functools.cache
+def told_of_processor() -> dict[str, str]:
+    """What the system says of the first processor, by name; nothing where it is not Linux."""
+    try:
+        first = PROCESSORS.read_text(errors="replace").split("\n\n")[0]
+    except OSError:
+        return {}
+    pairs = (line.partition(":") for line in first.splitlines())
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def processor_kind() -> tuple[str, ...]:
+    """What code that is compiled for this processor is for: on others it may hold instructions that they lack."""
+    told = told_of_processor()
+    return platform.machine(), platform.processor(), *(told.get(name, "") for name in OF_ITS_KIND)
 
 
 def uploaded(values: Tensor, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
@@ -21,9 +48,17 @@ def uploaded(values: Tensor, device: torch.device, dtype: torch.dtype | None = N
     return values.to(device, dtype or values.dtype, non_blocking=True)
 
 
-def machine_stamp(device: torch.device) -> tuple[str, int, str]:
+def clock(device: torch.device) -> float:
+    """Seconds, after the device has done all it was asked to."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def machine_stamp(device: torch.device) -> tuple[object, ...]:
     """What decides, beside code and settings, on the last bits of a result: torch, threads, device."""
-    return torch.__version__, torch.get_num_threads(), device_name(device)
+    kind = () if device.type == "cuda" else processor_kind()
+    return torch.__version__, torch.get_num_threads(), device_name(device), *kind
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.cache import content_key, file_stamp
+from gsx.core.device import processor_kind
 from gsx.core.errors import first_line
 from gsx.core.files import replacing
 from gsx.core.locks import made_by_one
@@ -151,8 +152,8 @@ def machine() -> tuple[object, ...]:
     )
     compiler = shutil.which(os.environ.get("CXX", "g++"))
     return (
-        *(torch.__version__, platform.python_version(), platform.machine()),
-        torch.backends.cpu.get_cpu_capability(),
+        *(torch.__version__, platform.python_version(), torch.backends.cpu.get_cpu_capability()),
+        processor_kind(),
         compiler and file_stamp(Path(compiler).resolve()),
         settings,
     )

@@ -26,13 +26,14 @@ gradient's sign: where that is next to nothing it is another by rounding, by how
 
 
 RECORDED = ("--recorded", "backbone=mip_splatting", "training.coarse=2", "training.coarse_until=0.05")
+SIZES = ("--recorded", "--sizes", "backbone=gs3d", "backbone.density.stop=0", "backbone.sh_degree=0")
 BROKEN = ("--broken", "backbone=gs3d")
 
 
 @pytest.fixture(scope="module")
 def told() -> dict[tuple[str, ...], Any]:
     """What the stand-in tells, case by case, in a process of its own: nothing may have been compiled before."""
-    cases = [*MOST, RECORDED, BROKEN]
+    cases = [*MOST, RECORDED, SIZES, BROKEN]
     words = [word for case in cases for word in ("/", *case)][1:]
     command = [sys.executable, str(TESTS / "stand_in_gpu.py"), *words]
     paths = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
@@ -58,6 +59,13 @@ def test_a_recorded_step_waits_once_and_is_the_step_that_is_not_recorded(told: d
     assert found["launches"].get("compiled graph") == 1
     for counts, most in zip((found["waits"], found["launches"]), MOST_RECORDED, strict=True):
         assert 0 < sum(counts.values()) <= most, counts
+
+
+def test_photographs_of_many_sizes_are_not_recorded_anew_each_time(told: dict[Any, Any]) -> None:
+    """Of three, in any order: two have a record."""
+    found = told[SIZES]
+    assert found["device"] == found["unrecorded"]
+    assert found["made"] == 2, "of 15 steps"
 
 
 def test_where_recording_fails_steps_go_on_without_it(told: dict[Any, Any]) -> None:

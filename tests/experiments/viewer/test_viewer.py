@@ -225,6 +225,46 @@ def test_where_nothing_can_listen_is_told(run: Run) -> None:
         first.stop()
 
 
+@needs_viser
+def test_paused_training_does_not_wait_for_a_browser_that_was_closed(
+    run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from gsx.experiments.viewer import server
+    from gsx.experiments.viewer.training import TrainingViewer
+
+    shown, client = TrainingViewer(run, "127.0.0.1", 0, share=0.5), MagicMock(client_id=3)
+    try:
+        viewer = shown.viewer
+        viewer.connected(client)
+        viewer.paused = True
+        monkeypatch.setattr(server, "ABSENCE", 0.0)
+        assert viewer.pausing(), "somebody looks"
+        viewer.left(client)
+        viewer.connected(client)  # the page was loaded again
+        assert viewer.pausing()
+        viewer.left(client)
+        shown.gsx_step_finished(run, None)  # type: ignore[arg-type]
+        assert not viewer.paused
+        assert "it goes on" in caplog.text
+    finally:
+        shown.stop()
+
+
+@needs_viser
+def test_a_browser_hears_of_a_path_that_cannot_be_saved(run: Run, tmp_path: Path) -> None:
+    from gsx.experiments.viewer.server import Panel
+
+    viewer, screen, client = MagicMock(), Screen(lambda image: None), MagicMock()
+    viewer.frames.model, viewer.folder, viewer.keyframes = RunModel(run), tmp_path / "gone", []
+    panel = Panel(viewer, client, screen)
+    screen.turn(pose_at(run))
+    panel.add_keyframe()
+    panel.saving(panel.save_path)
+    (title, reason), _ = client.add_notification.call_args
+    assert title == "nothing is saved"
+    assert str(tmp_path / "gone") in reason
+
+
 def test_what_fails_for_a_browser_ends_nothing(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     server = FrameServer(RunModel(run))
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
+from gsx.core.device import clock
 from gsx.core.errors import InputError, TooManyPairs
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.render import Rendering, rasterize
@@ -43,6 +44,8 @@ class TiledRendering:
     """Splats left out because a value of theirs is not finite."""
     windows: int
     """How many were rendered."""
+    gathering: float
+    """Seconds that it took to copy them to the CPU."""
 
     @staticmethod
     def empty(splats: Splats, camera: Camera, depth: bool) -> "TiledRendering":
@@ -55,6 +58,7 @@ class TiledRendering:
             visible=torch.zeros(len(splats), dtype=torch.bool),
             dropped=0,
             windows=0,
+            gathering=0.0,
         )
 
     def put(self, window: Window, part: Rendering) -> None:
@@ -110,9 +114,12 @@ def rasterize_tiled(
     """
     if pixels < 1:
         raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {TILE_PIXELS}")
-    tiled, count, dropped = TiledRendering.empty(splats, camera, depth), 0, 0
+    tiled, count, dropped, gathering = TiledRendering.empty(splats, camera, depth), 0, 0, 0.0
+    device = splats.means.device
     for window in covering(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
         for place, part in renderings(splats, camera, settings, window, background, depth):
+            begun = clock(device)
             tiled.put(place, part)
+            gathering += clock(device) - begun
             count, dropped = count + 1, part.dropped
-    return replace(tiled, windows=count, dropped=dropped)
+    return replace(tiled, windows=count, dropped=dropped, gathering=gathering)

@@ -42,6 +42,9 @@ SPARE, LEAST_ROOM = 1.25, 1024
 """Lists are given so much more room than one of them has needed, and at least so much."""
 ATTEMPTS = 6
 """At finding how much room a picture needs: what one list lacks hides what the next does."""
+MOST_KINDS = 2
+"""Of pictures with a record each, which holds the memory of a step: upright and across, say. Steps of other sizes are
+launched one by one: to record one takes longer."""
 
 
 @runtime_checkable
@@ -154,13 +157,10 @@ def cuda_graph(work: Callable[[], Learnt]) -> tuple[Learnt, Graph]:
 class Recorded:
     """One recorded step."""
 
-    key: Hashable
     inputs: Inputs
     made: Learnt
     graph: Graph
     gradients: dict[str, Tensor]
-    held: Sequence[Tensor]
-    """Tensors of the table that it reads: as long as they are held, no others get their identity."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -174,13 +174,18 @@ class Recorder:
     done: set[Hashable] = field(default_factory=set)
     """What has been done before without being recorded: nothing may be compiled, or copied there once and for all,
     while a step is recorded."""
-    last: Recorded | None = None
+    model: Hashable = None
+    """What all steps that are recorded now have in common."""
+    held: Sequence[Tensor] = ()
+    """Tensors of the table that these read: as long as they are held, no others get their identity."""
+    records: dict[Hashable, Recorded] = field(default_factory=dict)
+    """By kind of picture."""
     broken: bool = False
     """Recording has failed: steps are launched one by one from there on."""
 
     def forget(self) -> None:
         """Let go of what is recorded, and its memory."""
-        self.last = None
+        self.records, self.model, self.held = {}, None, ()
 
     def alike(self, step: int) -> Hashable:
         """What steps have in common that may be recorded together with this one; None: it is not to be recorded."""
@@ -211,41 +216,52 @@ class Recorder:
         return None
 
     def attempt(self, view: ToLearn) -> Learnt | None:
-        """Replay what is recorded, record it, or, the first time, only do it; None where it cannot be recorded."""
+        """Replay what is recorded, record it, or, the first time and where too much is recorded, only do it; None where
+        it cannot be recorded."""
         table, pose = self.backbone.table, view.pose()
         zero_grad(table)
-        same = (self.alike(view.step), view.camera.size, view.camera.frame, view.raster, self.room)
-        way = (*same, dilations_of(view.camera, None, view.raster))
-        held = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
-        key = (way, *(id(tensor) for tensor in held))
-        if self.last is not None and self.last.key == key:
-            return replayed(self.last, table, pose, view)
-        self.forget()
+        rules = (self.alike(view.step), view.raster, self.room)
+        self.keep_for(rules)
+        kind = (view.camera.size, view.camera.frame, dilations_of(view.camera, None, view.raster))
+        if kind in self.records:
+            return replayed(self.records[kind], table, pose, view)
         inputs = Inputs(pose=pose, photograph=view.photograph.clone(), background=view.background.clone())
 
         def work() -> Learnt:
             return self.work(inputs, view)
 
-        if way not in self.done:
+        way = (rules, kind)
+        if way not in self.done or len(self.records) == MOST_KINDS:
             found = work()
             self.done.add(way)
             return found
-        self.last = self.recorded(key, inputs, held, work)
-        return None if self.last is None else replayed(self.last, table, pose, view)
+        record = self.recorded(inputs, work)
+        if record is None:
+            return None
+        self.records[kind] = record
+        return replayed(record, table, pose, view)
 
-    def recorded(
-        self, key: Hashable, inputs: Inputs, held: Sequence[Tensor], work: Callable[[], Learnt]
-    ) -> Recorded | None:
+    def keep_for(self, rules: Hashable) -> None:
+        """Keep what was recorded by these rules on the tensors that the table has now; forget all else."""
+        table = self.backbone.table
+        held = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
+        model = (rules, *(id(tensor) for tensor in held))
+        if model != self.model:
+            self.forget()
+            self.model, self.held = model, held
+
+    def recorded(self, inputs: Inputs, work: Callable[[], Learnt]) -> Recorded | None:
         """A record of the work, which has not been done then; None where that fails."""
         try:
             made, graph = self.record(work)
         except RuntimeError as error:
             self.broken = True
+            self.forget()
             raster_numbers.cache_clear()  # what was to be filled while recorded work runs has nothing in it
             logger.warning("steps are launched one by one: they cannot be recorded here (%s)", first_line(error))
             return None
         found = gradients(self.backbone.table)
-        return Recorded(key=key, inputs=inputs, made=made, graph=graph, gradients=found, held=held)
+        return Recorded(inputs=inputs, made=made, graph=graph, gradients=found)
 
     def work(self, inputs: Inputs, view: ToLearn) -> Learnt:
         """What is recorded; of what differs from view to view it reads the inputs alone."""
@@ -281,15 +297,15 @@ class Recorder:
         )
 
 
-def replayed(last: Recorded, table: ParameterTable, pose: Float[Tensor, "31"], view: ToLearn) -> Learnt:
+def replayed(record: Recorded, table: ParameterTable, pose: Float[Tensor, "31"], view: ToLearn) -> Learnt:
     """A recorded step on this view."""
-    places = last.inputs.pose, last.inputs.photograph, last.inputs.background
+    places = record.inputs.pose, record.inputs.photograph, record.inputs.background
     for place, value in zip(places, (pose, view.photograph, view.background), strict=True):
         place.copy_(value)
-    last.graph.replay()
+    record.graph.replay()
     for name, parameter in named_parameters(table):
-        parameter.grad = last.gradients.get(name)
-    return last.made
+        parameter.grad = record.gradients.get(name)
+    return record.made
 
 
 def learnt_now(found: Learnt, needed: Needed, told: Told) -> Learnt:

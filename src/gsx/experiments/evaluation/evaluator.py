@@ -201,7 +201,7 @@ class Evaluator:
         self.run, self.options = run, options
         self.lpips = load_lpips(options.lpips)
         self.times: list[float] = []
-        """Seconds of each render at the training resolution."""
+        """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}
         """Those renders, as bytes where they are quantised."""
         self.matrices: dict[str, Float[Tensor, "3 4"]] = {}
@@ -259,7 +259,7 @@ class Evaluator:
         self.drawn_from(view)  # what finds it is not part of the time of a render
         begun = time.perf_counter()
         tiled = self.rendered(view)
-        self.times.append(time.perf_counter() - begun)
+        self.times.append(time.perf_counter() - begun - tiled.gathering)
         whole, counted = self.measured(self.fitted(view, tiled.image)), view.counted()
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
         image, truth, judged = blacked(whole, counted), blacked(view.image(), counted), self.judged(view, counted)

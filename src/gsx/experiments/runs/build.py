@@ -16,6 +16,7 @@ from torch import Tensor
 from gsx.core.allocator import keep_freed_memory
 from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
+from gsx.core.device import processor_kind
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
@@ -121,9 +122,9 @@ def hasten_compiling() -> None:
 
 
 def keep_compiled_code() -> None:
-    """Have torch keep what it compiles in an entry of the cache: its own place is lost on restart. Where nothing can be
-    written it stays with that."""
-    folder = cache_folder("compiled", content_key(torch.__version__, platform.python_version()))
+    """Have torch keep what it compiles in an entry of the cache, one for each kind of processor, of which there may be
+    several on a cluster: its own place is lost on restart. Where nothing can be written it stays with that."""
+    folder = cache_folder("compiled", content_key(torch.__version__, platform.python_version(), processor_kind()))
     try:
         (make_folder(folder) / MANIFEST).touch()
     except (InputError, OSError) as error:

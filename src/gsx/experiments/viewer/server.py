@@ -1,5 +1,6 @@
 """A model in a browser: viser shows pictures that our own rasterizer draws, and asks what is to be drawn."""
 
+import logging
 import math
 import socket
 import threading
@@ -19,13 +20,15 @@ from gsx.core.data.camera import upright
 from gsx.core.data.images import write_image
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
-from gsx.core.errors import InputError
+from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.quaternions import quaternions_of
 from gsx.core.packages import require
 from gsx.core.shapes import Float
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
 from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
+
+logger = logging.getLogger(__name__)
 
 LOCAL = "127.0.0.1"
 JPEG_QUALITY = 90
@@ -36,6 +39,8 @@ ARRIVAL = 20.0
 """Seconds that a browser has to arrive at a view."""
 KEYFRAME_SECONDS = 1.0
 """Between two keyframes of a camera path."""
+ABSENCE = 60.0
+"""Seconds without any browser after which training that was paused goes on."""
 
 
 class Viewer:
@@ -48,6 +53,8 @@ class Viewer:
         self.frames, self.title, self.folder = FrameServer(model), title, Path.cwd()
         self.training, self.paused, self.keyframes = training, False, list[Keyframe]()
         self.told = ""
+        self.alone_since: float | None = None
+        """When the last browser left, s; None: one is there, or none ever came."""
         self.panels: dict[int, Panel] = {}
         refuse_port(host, port)
         with redirect_stdout(StringIO()):  # its banner; the address is told by us
@@ -82,6 +89,7 @@ class Viewer:
 
     def connected(self, client: Any) -> None:
         """A browser has come."""
+        self.alone_since = None
         screen = Screen(partial(send, client))
         self.panels[client.client_id] = panel = Panel(self, client, screen)
         client.camera.on_update(lambda camera: panel.moved(camera))
@@ -92,6 +100,16 @@ class Viewer:
         """A browser has gone."""
         self.frames.screens.pop(client.client_id, None)
         self.panels.pop(client.client_id, None)
+        if not self.panels:
+            self.alone_since = time.monotonic()
+
+    def pausing(self) -> bool:
+        """Whether training is to wait; not for ever where the browser that paused it was closed."""
+        away = 0.0 if self.alone_since is None else time.monotonic() - self.alone_since
+        if self.paused and away > ABSENCE:
+            self.paused = False
+            logger.warning("training was paused at %s, where nobody looks any more: it goes on", self.address)
+        return self.paused
 
     def changed(self, told: str) -> None:
         """The model is another now; `told`: how it stands, in words."""
@@ -144,8 +162,9 @@ class Panel:
             self.slider("crop box", "box", 0.02, 1.0, 0.02, 1.0)
         with gui.add_folder("path and pictures", expand_by_default=False):
             gui.add_button("add keyframe").on_click(lambda _: self.add_keyframe())
-            gui.add_button("save path").on_click(lambda _: self.save_path())
-            gui.add_button("snapshot").on_click(lambda _: viewer.frames.jobs.append(self.snapshot))
+            gui.add_button("save path").on_click(lambda _: self.saving(self.save_path))
+            snapshot = gui.add_button("snapshot")
+            snapshot.on_click(lambda _: viewer.frames.jobs.append(lambda: self.saving(self.snapshot)))
         self.tell()
 
     def slider(self, label: str, key: str, least: float, most: float, step: float, value: float) -> None:
@@ -239,6 +258,13 @@ class Panel:
         fov = 2 * math.atan(math.tan(pose.fov / 2) / self.screen.look.zoom)
         frames.append(Keyframe(time=at, position=pose.position, wxyz=pose.wxyz, fov=fov))
         self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
+
+    def saving(self, save: Callable[[], None]) -> None:
+        """Write a file where gsx was started, or say in the browser why that cannot be."""
+        try:
+            save()
+        except (OSError, GsxError) as error:
+            self.notify("nothing is saved", f"{error}; gsx was started in {self.viewer.folder}")
 
     def save_path(self) -> None:
         """Write the keyframes where `gsx render` finds them."""

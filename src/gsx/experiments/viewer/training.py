@@ -28,7 +28,7 @@ class TrainingViewer:
             pass
         self.credit -= frames.spent - spent
         if viewer.paused:
-            viewer.serve(until=lambda: not viewer.paused or run.stopping)
+            viewer.serve(until=lambda: not viewer.pausing() or run.stopping)
         self.before = time.monotonic()
 
     def stop(self) -> None:

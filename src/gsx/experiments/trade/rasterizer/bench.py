@@ -1,7 +1,6 @@
 """One candidate of the rasterizer at a time: drawn, checked against a float64 truth, timed, its memory."""
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.device import clock
 from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
@@ -236,13 +236,6 @@ def stopwatch(action: Callable[[], object], device: torch.device) -> float:
     begun = clock(device)
     action()
     return clock(device) - begun
-
-
-def clock(device: torch.device) -> float:
-    """Seconds, after the device has done all it was asked to."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 class PeakMemory:
