@@ -20,6 +20,7 @@ from torch._inductor.output_code import CompiledFxGraph
 
 from gsx.core import kept_code
 from gsx.core.compiling import available, compile_rows, compiled_once, settled, with_last
+from gsx.core.errors import CompilerError
 from gsx.core.kept_code import (
     FOLDER,
     KeptFunction,
@@ -163,6 +164,96 @@ def test_code_is_that_of_all_that_a_function_calls(old: str, new: str, same: boo
     assert old in SOURCE
     digests = [digest_of(module_of(source).weighted) for source in (SOURCE, SOURCE.replace(old, new))]
     assert (digests[0] == digests[1]) is same
+
+
+CLASSES = """
+from functools import cached_property
+from typing import NamedTuple
+
+class Rules(NamedTuple):
+    least: float
+    most: float
+
+class Base:
+    WEIGHT = 2.0
+
+    @staticmethod
+    def shifted(x):
+        return x + 0.25
+
+class Part(Base):
+    inner: Rules
+
+    @property
+    def scaled(self):
+        return self.x * 3.0
+
+    @cached_property
+    def kept(self):
+        return self.x * 5.0
+
+    @classmethod
+    def made(cls, x):
+        return x - 7.0
+
+def closing(offset):
+    def closed(x):
+        return x + offset
+    return closed
+
+moved = closing(11.0)
+
+def weighted(part: Part, *, power=2):
+    return moved(part.scaled) ** power if power in {1, 2, 3} else part.kept
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("self.x * 3.0", "self.x * 4.0", False),
+        ("self.x * 5.0", "self.x * 6.0", False),
+        ("x - 7.0", "x - 8.0", False),
+        ("x + 0.25", "x + 0.5", False),
+        ("WEIGHT = 2.0", "WEIGHT = 3.0", False),
+        ("least: float\n    most: float", "most: float\n    least: float", False),
+        ("closing(11.0)", "closing(12.0)", False),
+        ("power=2", "power=3", False),
+        ("class Part", "# a remark\nclass Part", True),
+    ],
+)
+def test_code_is_that_of_all_that_its_arguments_are(old: str, new: str, same: bool) -> None:
+    """Properties, what is closed over, fields in their order: all that a function computes by."""
+    assert old in CLASSES
+    digests = [digest_of(module_of(source).weighted) for source in (CLASSES, CLASSES.replace(old, new))]
+    assert (digests[0] == digests[1]) is same
+
+
+def test_what_a_killed_linker_left_is_made_again(tmp_path: Path) -> None:
+    """Whole libraries stay, and those that somebody is making."""
+    from filelock import FileLock
+    from torch._C import __file__ as whole
+
+    libraries = {name: tmp_path / "ab" / f"{name}.main.so" for name in ("whole", "empty", "short", "header", "made")}
+    content = Path(whole).read_bytes()
+    (tmp_path / "ab").mkdir()
+    ends = {"whole": len(content), "empty": 0, "short": len(content) // 2, "header": 40, "made": 1000}
+    for name, library in libraries.items():
+        library.write_bytes(content[: ends[name]])
+    (tmp_path / "locks").mkdir()
+    with FileLock(tmp_path / "locks" / "made.lock"):
+        kept_code.without_torn_libraries(tmp_path)
+    assert {name for name, library in libraries.items() if library.exists()} == {"whole", "made"}
+
+
+def test_what_cannot_be_compiled_any_more_is_told(folder: Path) -> None:
+    """A disk that is full by now, say: the compiler worked when it was tried."""
+    never = module_of("def weighted(x, y):\n    return ((7.25 * x).exp() + y[:, :1]).sum(1)").weighted
+    with (
+        torch._inductor.config.patch({"cpp.cxx": ("/bin/false",)}),
+        pytest.raises(CompilerError, match="weighted cannot be compiled .*compiler.*rasterizer=eager"),
+    ):
+        compile_rows(never)(*rows(6))
 
 
 def test_code_of_sizes_that_torch_takes_for_others_lies_beside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

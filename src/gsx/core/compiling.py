@@ -1,6 +1,7 @@
 """Whether anything can be compiled on this machine, and compiling for sizes that vary."""
 
 import functools
+import os
 import types
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.core.errors import CompilerError
 from gsx.core.kept_code import KeptFunction, flat, record, recording
 
 Result = TypeVar("Result")
@@ -140,13 +142,31 @@ class CompiledOnce:
     def found(self, arguments: tuple[Any, ...], directly: bool = False) -> Callable[..., Any]:
         """The code that holds for these arguments; `directly`: by `Code.direct_for`."""
         if not flat(arguments[:1])[0].is_cpu:
-            return self.traced()
+            return self.by_torch
         if record(self.kept, arguments):
             return self.kept.function
         code = self.kept.code_for(arguments)
         if code is None:
-            return self.traced()
+            return self.by_torch
         return code.direct_for(arguments) if directly else code.run
+
+    def by_torch(self, *arguments: Any) -> Any:
+        """The function through torch.compile.
+
+        Raises:
+            CompilerError: it cannot be compiled, though others could.
+        """
+        try:
+            return self.traced()(*arguments)
+        except Exception as error:
+            if not type(error).__module__.startswith(("torch._inductor", "torch._dynamo")):
+                raise
+            reason = str(error).partition("raised:\n")[2] or str(error)  # torch names its backend first
+            raise CompilerError(
+                f"{self.kept.function.__name__} cannot be compiled ({reason.splitlines()[0]}): see to space and memory, also "
+                f"in {os.environ.get('TORCHINDUCTOR_CACHE_DIR', 'the folder for temporary files')}, and go on, or "
+                "give rasterizer=eager"
+            ) from error
 
 
 def settled(function: Callable[..., None]) -> Callable[..., None]:

@@ -17,6 +17,10 @@ class InputError(GsxError):
     """A file or folder given to gsx cannot be used."""
 
 
+class CompilerError(GsxError):
+    """What was compiled on this machine before cannot be now: a full disk, or a compiler that was killed."""
+
+
 class TooManyPairs(InputError):
     """A picture needs more splat-tile pairs than `rasterizer.max_pairs`; smaller pieces of it may not."""
 

@@ -13,6 +13,8 @@ import logging
 import os
 import platform
 import shutil
+import struct
+import sys
 import threading
 import time
 import types
@@ -104,22 +106,57 @@ PLAIN = (int, float, str, tuple, list, dict)
 
 def parts_of(value: Any, seen: set[int]) -> Iterator[object]:
     """What a function's results depend on beside its arguments: byte code, constants, and those of all that it calls
-    in gsx; of classes their functions."""
+    in gsx; of classes what they hold."""
     value = inspect.unwrap(value) if callable(value) else value
     if id(value) in seen:
         return
     seen.add(id(value))
     if isinstance(value, types.FunctionType):
-        yield from code_parts(value.__code__, value.__globals__, seen)
-        for default in value.__defaults__ or ():
-            yield repr(default)
-            yield from parts_of(type(default), seen)
+        yield from function_parts(value, seen)
     elif isinstance(value, type) and value.__module__.startswith("gsx."):
-        for member in vars(value).values():
-            if isinstance(member, types.FunctionType):
-                yield from parts_of(member, seen)
+        yield from class_parts(value, seen)
     elif isinstance(value, PLAIN) and " at 0x" not in repr(value):
         yield repr(value)
+
+
+def function_parts(function: types.FunctionType, seen: set[int]) -> Iterator[object]:
+    """`parts_of` of byte code, of what is given or closed over, and of classes that arguments are of."""
+    yield from code_parts(function.__code__, function.__globals__, seen)
+    for given in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *held_by(function)):
+        if " at 0x" not in repr(given):
+            yield repr(given)
+        yield from parts_of(given, seen)
+        yield from parts_of(type(given), seen)
+    for kind in function.__annotations__.values():
+        if isinstance(kind, type):
+            yield from parts_of(kind, seen)
+
+
+def held_by(function: types.FunctionType) -> Iterator[object]:
+    """What a function closes over."""
+    for cell in function.__closure__ or ():
+        with suppress(ValueError):  # an empty one
+            yield cell.cell_contents
+
+
+def class_parts(kind: type, seen: set[int]) -> Iterator[object]:
+    """`parts_of` of a class: its fields in their order, its functions and properties, its constants; and of the classes
+    that it comes from, and that its fields are of."""
+    fields = vars(kind).get("__annotations__", {})
+    yield list(fields)
+    for other in (*kind.__bases__, *(field for field in fields.values() if isinstance(field, type))):
+        yield from parts_of(other, seen)
+    for name, member in vars(kind).items():
+        own = function_of(member)
+        if isinstance(own, types.FunctionType) or not name.startswith("__"):
+            yield name
+            yield from parts_of(own, seen)
+
+
+def function_of(member: Any) -> Any:
+    """What a property, a cached one, a class method or a static one calls; any other member as it is."""
+    wrapped = (getattr(member, name, None) for name in ("fget", "func", "__func__"))
+    return next((own for own in wrapped if own is not None), member)
 
 
 def code_parts(code: types.CodeType, known: dict[str, Any], seen: set[int]) -> Iterator[object]:
@@ -130,10 +167,10 @@ def code_parts(code: types.CodeType, known: dict[str, Any], seen: set[int]) -> I
         if isinstance(constant, types.CodeType):
             yield from code_parts(constant, known, seen)
         else:
-            yield repr(constant)
+            yield repr(sorted(constant, key=repr) if isinstance(constant, frozenset) else constant)
     for name in code.co_names:
         value = known.get(name)
-        if getattr(value, "__module__", "gsx.").startswith("gsx."):
+        if (getattr(value, "__module__", None) or "gsx.").startswith("gsx."):
             yield from parts_of(value, seen)
 
 
@@ -204,6 +241,37 @@ def save(made: Any, file: Path) -> None:
         logger.info("compiled code is not kept in %s: %s", file, first_line(error))
 
 
+# -- what a compiler that was killed leaves ----------------------------------------------------------------------------
+
+
+def is_torn(library: Path) -> bool:
+    """Whether the end of a library is missing, where its table of sections lies (ELF-64); of other systems' libraries
+    only whether there is anything."""
+    with library.open("rb") as file:
+        head, size = file.read(64), os.fstat(file.fileno()).st_size
+    if not head.startswith(b"\x7fELF\x02") or len(head) < 64:
+        return not head or head.startswith(b"\x7fELF")
+    begin, (width, number) = int.from_bytes(head[40:48], sys.byteorder), struct.unpack("=2H", head[58:62])
+    return begin == 0 or size < begin + width * number
+
+
+@functools.cache
+def without_torn_libraries(folder: Path) -> None:
+    """Remove what a linker left that was killed: torch takes whatever is there for whole. Once in a process; what
+    others are making is left to them."""
+    from filelock import FileLock, Timeout
+
+    for library in folder.glob("*/*.so"):
+        lock = folder / "locks" / f"{library.name.split('.')[0]}.lock"  # torch's own
+        with suppress(OSError, Timeout):
+            if is_torn(library):
+                lock.parent.mkdir(exist_ok=True)
+                with FileLock(lock, timeout=0):
+                    if is_torn(library):
+                        logger.info("%s is not whole: it is made again", library)
+                        library.unlink()
+
+
 # -- functions ---------------------------------------------------------------------------------------------------------
 
 
@@ -258,7 +326,10 @@ class KeptFunction:
     def file(self, arguments: tuple[Any, ...]) -> Path | None:
         """Where code for arguments such as these is kept; None where none is."""
         folder = place()
-        return folder / f"{self.key(arguments)}.bin" if folder is not None and self.works else None
+        if folder is None or not self.works:
+            return None
+        without_torn_libraries(folder.parent)
+        return folder / f"{self.key(arguments)}.bin"
 
     def found(self, file: Path, arguments: tuple[Any, ...]) -> tuple[Code | None, Path]:
         """(code from the disk, if one holds; else None, and where to keep what will). For a few sizes, above all those

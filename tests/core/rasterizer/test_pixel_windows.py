@@ -208,6 +208,19 @@ def test_weights_and_light_left_make_one() -> None:
     assert 0 < float(most.max()) <= 0.99
 
 
+def test_formats_are_those_that_are_asked_for() -> None:
+    """What blending rounds, seen by one splat after the other: in float64 next to nothing of it is left."""
+    single, camera = changed(soft_splats(count=60), dtype=torch.float32), front_camera()
+    exact = rasterize(changed(single, dtype=torch.float64), camera, WINDOW).image
+    off = [
+        float((rasterize(single, camera, replace(WINDOW, evaluation=form)).image - exact).abs().mean())
+        for form in ("float32", "float64")
+    ]
+    assert off[1] < off[0] / 2, off
+    rendering = rasterize(single, camera, replace(WINDOW, evaluation="float64"), max_weight=True)
+    assert rendering.image.dtype == rendering.screen.max_weights.dtype == torch.float32
+
+
 def test_gradients_of_the_last_splat_are_finite_differences() -> None:
     """What a splat does to windows behind it is left out as published; nothing is behind the last one."""
     splats, camera = soft_splats(count=2), front_camera(20, 16)

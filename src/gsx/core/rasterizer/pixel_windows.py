@@ -22,6 +22,7 @@ from gsx.core.rasterizer.composite import sum_by_splat
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.path import compiles
+from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
@@ -353,19 +354,12 @@ def composite_windows(
     The gradient is the published one: that a splat moves the windows of those behind it is left out, which the paper's
     training does as well.
     """
-    most = means.new_zeros(len(intersections.splats)) if max_weight else None
-    blended = WindowComposite.apply(
-        means,
-        screen.covariances,
-        screen.log_opacities,
-        channels,
-        absgrad,
-        screen.conic_factors.detach(),
-        intersections,
-        grid,
-        settings,
-        most,
-    )
+    exact = Precision.of(settings, means.dtype).exact
+    most = means.new_zeros(len(intersections.splats), dtype=exact) if max_weight else None
+    given = means, screen.covariances, screen.log_opacities, channels, absgrad, screen.conic_factors.detach()
+    in_format = [None if values is None else values.to(exact) for values in given]
+    blended = WindowComposite.apply(*in_format, intersections, grid, settings, most).to(means.dtype)
     if most is None:
         return blended, None
-    return blended, means.new_zeros(len(means)).scatter_reduce_(0, intersections.splats, most, "amax")
+    largest = most.new_zeros(len(means)).scatter_reduce_(0, intersections.splats, most, "amax")
+    return blended, largest.to(means.dtype)

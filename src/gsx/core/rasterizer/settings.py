@@ -70,7 +70,8 @@ class RasterSettings:
     alpha_max: Share = 0.99
     """Alphas are clamped here (3D-GS, renderCUDA)."""
     transmittance_stop: Share = 1e-4
-    """A pixel ends before the splat that would take its transmittance below (3D-GS, renderCUDA)."""
+    """A pixel ends before the splat that would take its transmittance below (3D-GS, renderCUDA); with pixel=window
+    behind it (Gaussian Blending)."""
     cull: str = "published"
     """`published`: a splat reaches only the 16 px tiles of its 3-sigma square, as 3D-GS draws it.
     `tight`: it reaches every pixel where its alpha is at least alpha_min (the better rule: no truncation)."""
