@@ -2,6 +2,9 @@
 # make test: set up what the tests need as well, run them.
 PYTHON ?= python3
 VENV ?= .venv
+ifneq ($(words $(VENV)),1)
+$(error VENV='$(VENV)' must be one word: make takes others for folders of their own)
+endif
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
@@ -54,7 +57,9 @@ lint: $(READY_DEV) site
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# setuptools would pack whatever an earlier build has left
 wheel: $(READY_DEV)
+	rm -rf build/lib build/bdist.*
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
 
 $(READY): pyproject.toml constraints.txt

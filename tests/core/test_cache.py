@@ -13,6 +13,7 @@ from gsx.core.cache import (
     IN_USE,
     MANIFEST,
     cache_folder,
+    cache_root,
     content_key,
     enlist,
     entries,
@@ -201,3 +202,16 @@ def test_where_nothing_can_be_written_the_cache_is_used_all_the_same(
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "file" / "cache"))
     with in_use():
         assert trim(0) == []
+
+
+def test_where_there_is_no_home_a_place_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that is run by a number without a name."""
+    for name in ("GSX_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    with pytest.raises(InputError, match="GSX_CACHE"):
+        cache_root()
+
+
+def homeless(path: Path) -> Path:
+    raise RuntimeError("Could not determine home directory.")

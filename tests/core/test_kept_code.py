@@ -251,7 +251,7 @@ def test_what_cannot_be_compiled_any_more_is_told(folder: Path) -> None:
     never = module_of("def weighted(x, y):\n    return ((7.25 * x).exp() + y[:, :1]).sum(1)").weighted
     with (
         torch._inductor.config.patch({"cpp.cxx": ("/bin/false",)}),
-        pytest.raises(CompilerError, match="weighted cannot be compiled .*compiler.*rasterizer=eager"),
+        pytest.raises(CompilerError, match=r"weighted cannot be compiled .*compiler.*rasterizer=eager"),
     ):
         compile_rows(never)(*rows(6))
 

@@ -18,7 +18,7 @@ def explained(error: BaseException) -> int:
     if isinstance(error, OSError):
         return complain(os_sentence(error))
     if isinstance(error, KeyboardInterrupt):
-        say("\ngsx: interrupted before a checkpoint was due; nothing half-written is left\n", as_error=True)
+        say("\ngsx: interrupted; nothing half-written is left\n", as_error=True)
         return INTERRUPTED
     raise error
 
@@ -70,7 +70,8 @@ def os_sentence(error: OSError) -> str:
     """A failure of the file system with its remedy."""
     where = f" ({error.filename})" if error.filename else ""
     remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
-    return f"{error.strerror or error}{where}: {remedy}, or choose a writable place, for example output=FOLDER"
+    place = "a writable place: output=FOLDER to train, --to FOLDER where a command has that"
+    return f"{error.strerror or error}{where}: {remedy}, or choose {place}"
 
 
 def set_up_logging() -> None:

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import gsx
 from gsx.core.errors import InputError
-from gsx.core.files import own_mark
+from gsx.core.files import at_home, own_mark
 from gsx.core.locks import lock
 
 logger = logging.getLogger(__name__)
@@ -31,12 +31,21 @@ KEY_LETTERS = 16  # 64 bits of the digest: collisions are out of reach for any n
 
 
 def cache_root() -> Path:
-    """$GSX_CACHE, else $XDG_CACHE_HOME/gsx, else ~/.cache/gsx (XDG base directories)."""
+    """$GSX_CACHE, else $XDG_CACHE_HOME/gsx, else ~/.cache/gsx (XDG base directories).
+
+    Raises:
+        InputError: there is no home folder to find it in.
+    """
     if own := os.environ.get("GSX_CACHE"):
-        return Path(own).expanduser()
+        return at_home(own)
     if shared := os.environ.get("XDG_CACHE_HOME"):
-        return Path(shared).expanduser() / "gsx"
-    return Path.home() / ".cache" / "gsx"
+        return at_home(shared) / "gsx"
+    found = at_home("~/.cache/gsx")
+    if not found.is_absolute():
+        raise InputError(
+            "this user has no home folder, and so no cache: let GSX_CACHE name a folder that can be written"
+        )
+    return found
 
 
 def cache_folder(kind: str, key: str) -> Path:

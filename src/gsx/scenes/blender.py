@@ -17,6 +17,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.files import at_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.scenes.duplicates import refuse_shared
@@ -74,7 +75,7 @@ def load(options: BlenderOptions) -> Scene:
     """
     if options.split != "json":
         raise ConfigError(f"scene.split is '{short(options.split)}', but transforms_*.json hold the split: use json.")
-    folder = Path(options.path).expanduser()
+    folder = at_home(options.path)
     train_file, test_file = folder / "transforms_train.json", _test_file(folder)
     train_shots, train_notes = read_shots(train_file, options.missing)
     test_shots, test_notes = read_shots(test_file, options.missing)

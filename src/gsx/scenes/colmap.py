@@ -13,7 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
-from gsx.core.files import is_file
+from gsx.core.files import at_home, is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.adjust import WHEN, adjusted, fit_line
@@ -60,7 +60,7 @@ def load(options: ColmapOptions) -> Scene:
         InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
     """
     refuse_other("adjust", options.adjust, WHEN)
-    path = Path(options.path).expanduser()
+    path = at_home(options.path)
     folder, notes = find_model(path)
     model, adjustment = adjusted(read_model(folder), options.adjust)
     return build(model, path / options.images, options, [*notes, *adjustment])
@@ -72,7 +72,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
     Raises:
         InputError: as `load`.
     """
-    path = Path(options.path).expanduser()
+    path = at_home(options.path)
     present = present_images(model, photos, options.missing)
     shots = [shot_of(model, image, photos) for image in present]
     views = views_of(shots, options)

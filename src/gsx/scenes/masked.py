@@ -12,7 +12,7 @@ from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
-from gsx.core.files import is_file
+from gsx.core.files import at_home, is_file
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.undistort import StoredUndistortion
 
@@ -48,7 +48,7 @@ def mask_of(
 
 def folder_of(options: SceneOptions) -> Path:
     """Where masks are looked for: in the scene's folder, or beside it where that may be the photographs' own."""
-    path = Path(options.path).expanduser()
+    path = at_home(options.path)
     own, beside = path / FOLDER, path.parent / FOLDER
     photographs = options.name == "photos" and not (path / IMAGES).is_dir()
     return beside if photographs and not own.is_dir() else own
@@ -77,7 +77,7 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
         raise InputError(
             "scene.masks=alpha, but no photograph has alpha: leave it out, or give files in a folder 'masks'"
         )
-    own = folder.parent == Path(options.path).expanduser()
+    own = folder.parent == at_home(options.path)
     if options.masks == "auto" and own and folder.is_dir() and any(map(is_file, folder.rglob("*.*"))):
         raise InputError(
             f"None of the masks in '{folder}' has the name of a photograph: call that of a.jpg a.jpg.png or a.png, or "

@@ -13,6 +13,7 @@ from gsx.core.data.images import image_size
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
+from gsx.core.files import at_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
@@ -49,7 +50,7 @@ def load(options: PhotosOptions) -> Scene:
             cannot be reconstructed.
     """
     refuse_unknown(options)
-    path = Path(options.path).expanduser()
+    path = at_home(options.path)
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
     notes += passed_over(path, folder)

@@ -17,7 +17,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import is_file
+from gsx.core.files import at_home, is_file
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
@@ -298,7 +298,7 @@ def provenance(options: SceneOptions, views: Sequence[View], **details: Any) -> 
     """What an evaluation has to say about its images, for `Scene.provenance`."""
     return {
         "format": options.name,
-        "path": Path(options.path).expanduser().resolve().name,
+        "path": at_home(options.path).resolve().name,
         "principal_point": options.principal_point,
         "downscale": options.downscale,
         "max_width": options.max_width,

@@ -19,6 +19,7 @@ from gsx.core.data.resize import Size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
+from gsx.core.files import at_home
 from gsx.core.ranges import Points, Seed
 from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.masked import mask_notes
@@ -72,7 +73,7 @@ def load(options: TransformsOptions) -> Scene:
     Raises:
         InputError: a file is missing or damaged, a camera cannot be used, or there are fewer than two training images.
     """
-    file = _file(Path(options.path).expanduser())
+    file = _file(at_home(options.path))
     content, frames = read_frames(file)
     present, notes = present_frames(file.parent, frames, file, options.missing)
     shots = [_shot({**content, **frame}, photo, file) for frame, photo in present]

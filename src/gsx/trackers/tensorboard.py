@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from gsx.core.data.images import read_image
-from gsx.core.files import read_json
+from gsx.core.files import at_home, read_json
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Range
@@ -46,7 +46,7 @@ class TensorBoard:
         begun = any(folder.glob("events.out.tfevents.*"))
         self.writer = SummaryWriter(str(folder), purge_step=run.step + 1 if begun else None)
         self.sent = len(run.curves) if begun else 0
-        self.writer.add_text("config", indented((run.folder / "config.yaml").read_text()), run.step)
+        self.writer.add_text("config", indented((run.folder / "config.yaml").read_text(encoding="utf-8")), run.step)
         self.send(run)
 
     @hookimpl
@@ -95,7 +95,7 @@ def events_folder(run: Run, folder: str) -> Path:
     if not folder:
         return run.folder / "tensorboard"
     own, output = run.folder.resolve(), Path(run.config["output"]).resolve()
-    return Path(folder).expanduser() / (own.relative_to(output) if own.is_relative_to(output) else own.name)
+    return at_home(folder) / (own.relative_to(output) if own.is_relative_to(output) else own.name)
 
 
 def pictures(renders: Path, count: int) -> dict[str, Path]:

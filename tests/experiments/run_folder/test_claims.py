@@ -125,6 +125,9 @@ def test_a_lock_of_another_user_has_a_sentence_of_its_own(tmp_path: Path, monkey
     monkeypatch.setattr("gsx.experiments.run_folder.claims.os.open", refused)  # root may open everything
     with pytest.raises(InputError, match=rf"is {owner}'s: have them take it away, or share .* \(chmod g\+w\)"):
         claimed(tmp_path).__enter__()
+    (tmp_path / LOCK).unlink()  # nobody's fault but one's own
+    with pytest.raises(InputError, match=r"cannot be written to .*: chmod u\+w"):
+        claimed(tmp_path).__enter__()
 
 
 def test_without_locks_a_run_goes_on_and_says_so_and_a_shared_name_is_refused(

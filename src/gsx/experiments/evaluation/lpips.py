@@ -8,13 +8,13 @@ network expects [-1, 1] (3D-GS, metrics.py): `input_range` selects, and the name
 import hashlib
 import logging
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 
 from gsx.core.errors import InputError
+from gsx.core.files import at_home
 from gsx.core.shapes import Float
 
 logger = logging.getLogger(__name__)
@@ -98,8 +98,8 @@ def load_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
         InputError: the file is missing or no state dict.
     """
     try:
-        data = Path(path).expanduser().read_bytes()
-        weights = torch.load(Path(path).expanduser(), map_location="cpu", weights_only=True)
+        data = at_home(path).read_bytes()
+        weights = torch.load(at_home(path), map_location="cpu", weights_only=True)
         if not isinstance(weights, dict):
             raise TypeError(f"it holds a {type(weights).__name__}, not a state dict")
     except Exception as error:

@@ -111,6 +111,8 @@ def opened(path: Path, folder: Path) -> IO[str]:
     try:
         number = os.open(path, flags, 0o666)
     except PermissionError as error:
+        if not path.exists() and mine(folder):
+            raise InputError(f"{folder} cannot be written to ({error.strerror}): chmod u+w {folder}") from error
         raise InputError(
             f"{known} is {owner(path)}'s: have them take it away, or share {folder} with you (chmod g+w)"
         ) from error
@@ -124,6 +126,11 @@ def opened(path: Path, folder: Path) -> IO[str]:
         os.close(number)
         raise InputError(f"{known} is no file of its own, but a link, pipe or device: remove it")
     return os.fdopen(number, "r+", encoding="utf-8")
+
+
+def mine(path: Path) -> bool:
+    """Whether it belongs to who runs this."""
+    return os.name == "posix" and path.stat().st_uid == os.geteuid()
 
 
 def owner(path: Path) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.cache import content_key, file_stamp
+from gsx.core.files import at_home
 from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
@@ -62,7 +63,7 @@ def folder_stamp(config: dict[str, Any]) -> str:
     scene = part(config, "scene")
     if not scene.get("path"):
         return ""
-    path = Path(str(scene["path"])).expanduser()
+    path = at_home(str(scene["path"]))
     if not path.exists():
         return f"absent: {path}"
     folder = path if path.is_dir() else path.parent

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError, command
+from gsx.core.files import at_home
 from gsx.core.plugins import Component, Plugins
 from gsx.experiments.run_folder.files import BEGUN
 from gsx.experiments.runs.capture import capture_lines
@@ -47,7 +48,7 @@ class Findings:
 def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[str]:
     """Lines about a folder: format, cameras, images, points, how good the capture is, problems and the command to train
     it. A `patient` one loads what takes minutes, too. Never raises."""
-    path, found = Path(path).expanduser(), Findings()
+    path, found = at_home(path), Findings()
     loaders: Readable = []
 
     def formats() -> Iterator[str]:

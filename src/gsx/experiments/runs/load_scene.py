@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from gsx.core.data.disturbed import Disturbable, disturbed
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import file_count
+from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import Settings
@@ -85,7 +84,7 @@ def count_notes(settings: Settings) -> list[str]:
     if not (published and path):
         return []
     images = getattr(settings.scene.options, "images", "") or "images"
-    found, compared = file_count(Path(path).expanduser() / images), "figures cannot be compared with published ones"
+    found, compared = file_count(at_home(path) / images), "figures cannot be compared with published ones"
     return [] if found == published else [f"{images}/ holds {found} files, published are {published}: {compared}."]
 
 

@@ -129,7 +129,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         if "${" in text:  # an escaped one; it would be looked up when the run's configuration is read
             raise ConfigError(f"{key} is '{text}'; a run's configuration holds no ${{...}}: name it otherwise")
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
-        raw["scene"]["path"] = str(Path(str(raw["scene"]["path"])).expanduser().resolve())
+        raw["scene"]["path"] = str(at_home(str(raw["scene"]["path"])).resolve())
     if (file := splat_file(raw.get("init"))) is not None and suffix_of(file):
         raw["init"] = str(at_home(file).resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}

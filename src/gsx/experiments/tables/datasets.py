@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gsx.core.files import file_count
+from gsx.core.files import at_home, file_count
 
 
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     """What keeps a scene from being trained; empty if it is all there."""
-    folder = root.expanduser() / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
+    folder = at_home(root) / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
     if folder is None:
         return ""
     if not folder.is_dir():

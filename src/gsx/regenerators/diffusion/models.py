@@ -12,6 +12,7 @@ import torch
 
 from gsx.core.cache import content_key, source_digest
 from gsx.core.errors import InputError, TrainingError, first_line
+from gsx.core.files import at_home
 from gsx.regenerators.diffusion.model_specs import ModelSpec
 from gsx.regenerators.diffusion.options import DiffusionOptions
 
@@ -29,7 +30,7 @@ def located(options: DiffusionOptions, spec: ModelSpec) -> Path:
     Raises:
         InputError: it is not on this machine, is another model, or damaged. The message says what to do.
     """
-    folder = Path(options.model).expanduser()
+    folder = at_home(options.model)
     if not folder.is_dir():
         folder = snapshot(options, spec)
     inspect(folder, options, spec)
