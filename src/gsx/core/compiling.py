@@ -164,8 +164,8 @@ class CompiledOnce:
             reason = str(error).partition("raised:\n")[2] or str(error)  # torch names its backend first
             folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR", "the folder for temporary files")
             raise CompilerError(
-                f"{self.kept.function.__name__} cannot be compiled ({reason.splitlines()[0]}): see to space and memory, "
-                f"also in {folder}, and go on, or give rasterizer=eager"
+                f"{self.kept.function.__name__} cannot be compiled ({reason.splitlines()[0]}): see to space and "
+                f"memory, also in {folder}, and go on, or give rasterizer=eager"
             ) from error
 
 
