@@ -327,11 +327,11 @@ def steps(
     begun: Callable[[], None] = lambda: None,
     recorded: Tally | None = None,
     broken: bool = False,
+    sizes: bool = False,
 ) -> list[Tensor]:
     """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
-    be recorded; `broken`: which fails."""
+    be recorded; `broken`: which fails; `sizes`: of photographs of three sizes."""
     loaded, losses = plugins(), list[Tensor]()
-    sizes, words = "--sizes" in words, [word for word in words if word != "--sizes"]
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
         scene = load_scene(settings)
@@ -351,12 +351,18 @@ class Case:
     words: list[str]
     recorded: bool
     broken: bool
+    sizes: bool
 
     @classmethod
     def of(cls, words: list[str]) -> "Case":
         """From words of the command line."""
-        flags = {word for word in words if word in ("--recorded", "--broken")}
-        return cls([w for w in words if w not in flags], recorded=bool(flags), broken="--broken" in flags)
+        flags = {word for word in words if word.startswith("--")}
+        return cls(
+            [word for word in words if word not in flags],
+            recorded=bool(flags & {"--recorded", "--broken"}),
+            broken="--broken" in flags,
+            sizes="--sizes" in flags,
+        )
 
     @property
     def count(self) -> int:
@@ -365,16 +371,16 @@ class Case:
 
     def on_cpu(self) -> list[Tensor]:
         """Losses there."""
-        return steps([*self.words, "rasterizer=eager"], torch.device("cpu"))
+        return steps([*self.words, "rasterizer=eager"], torch.device("cpu"), sizes=self.sizes)
 
     def on_device(self, tally: Tally, own: list[Tensor]) -> dict[str, Any]:
         """Losses of all kinds, and counts of the last step."""
         words = [*self.words, "rasterizer=compiled"]
         recorded, tally.failed, tally.made = tally if self.recorded else None, 0, 0
-        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.broken)}
+        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.broken, self.sizes)}
         counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy()}
         counts |= {"failed": tally.failed, "made": tally.made}
-        found |= {"unrecorded": steps(words, DEVICE, self.count)} if recorded else {}
+        found |= {"unrecorded": steps(words, DEVICE, self.count, sizes=self.sizes)} if recorded else {}
         return {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()} | counts
 
 

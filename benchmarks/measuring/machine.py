@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 import gsx
+from gsx.core.device import device_name
 
 ROOT = Path(__file__).parents[2]
 BUSY = 0.3
@@ -21,7 +22,7 @@ BUSY = 0.3
 def describe_machine(device: torch.device) -> dict[str, Any]:
     """Lasting facts: processor, threads, versions, compiler."""
     facts = {
-        "cpu": cpu_model(),
+        "cpu": device_name(torch.device("cpu")),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "vectors": torch.backends.cpu.get_cpu_capability(),
@@ -33,14 +34,6 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "gsx": gsx.__version__,
     }
     return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
-
-
-def cpu_model() -> str:
-    """The processor's name as the system gives it."""
-    table = Path("/proc/cpuinfo")
-    lines = table.read_text().splitlines() if table.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def compiler() -> str:

@@ -151,21 +151,6 @@ def test_another_last_argument_is_another_function(folder: Path) -> None:
     assert len(list(folder.glob("*.bin"))) == 2
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "same"),
-    [
-        ("FACTOR = 3.0", "FACTOR = 4.0", False),
-        ("x * FACTOR", "x / FACTOR", False),
-        ("** power", "** (power + 1)", False),
-        ("def inner", "# a remark\n\ndef inner", True),
-    ],
-)
-def test_code_is_that_of_all_that_a_function_calls(old: str, new: str, same: bool) -> None:
-    assert old in SOURCE
-    digests = [digest_of(module_of(source).weighted) for source in (SOURCE, SOURCE.replace(old, new))]
-    assert (digests[0] == digests[1]) is same
-
-
 CLASSES = """
 from functools import cached_property
 from typing import NamedTuple
@@ -209,23 +194,27 @@ def weighted(part: Part, *, power=2):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "same"),
+    ("source", "old", "new", "same"),
     [
-        ("self.x * 3.0", "self.x * 4.0", False),
-        ("self.x * 5.0", "self.x * 6.0", False),
-        ("x - 7.0", "x - 8.0", False),
-        ("x + 0.25", "x + 0.5", False),
-        ("WEIGHT = 2.0", "WEIGHT = 3.0", False),
-        ("least: float\n    most: float", "most: float\n    least: float", False),
-        ("closing(11.0)", "closing(12.0)", False),
-        ("power=2", "power=3", False),
-        ("class Part", "# a remark\nclass Part", True),
+        (SOURCE, "FACTOR = 3.0", "FACTOR = 4.0", False),
+        (SOURCE, "x * FACTOR", "x / FACTOR", False),
+        (SOURCE, "** power", "** (power + 1)", False),
+        (SOURCE, "def inner", "# a remark\n\ndef inner", True),
+        (CLASSES, "self.x * 3.0", "self.x * 4.0", False),
+        (CLASSES, "self.x * 5.0", "self.x * 6.0", False),
+        (CLASSES, "x - 7.0", "x - 8.0", False),
+        (CLASSES, "x + 0.25", "x + 0.5", False),
+        (CLASSES, "WEIGHT = 2.0", "WEIGHT = 3.0", False),
+        (CLASSES, "least: float\n    most: float", "most: float\n    least: float", False),
+        (CLASSES, "closing(11.0)", "closing(12.0)", False),
+        (CLASSES, "power=2", "power=3", False),
+        (CLASSES, "class Part", "# a remark\nclass Part", True),
     ],
 )
-def test_code_is_that_of_all_that_its_arguments_are(old: str, new: str, same: bool) -> None:
-    """Properties, what is closed over, fields in their order: all that a function computes by."""
-    assert old in CLASSES
-    digests = [digest_of(module_of(source).weighted) for source in (CLASSES, CLASSES.replace(old, new))]
+def test_code_is_that_of_all_that_a_function_computes_by(source: str, old: str, new: str, same: bool) -> None:
+    """What it calls, properties, what is closed over, fields in their order."""
+    assert old in source
+    digests = [digest_of(module_of(text).weighted) for text in (source, source.replace(old, new))]
     assert (digests[0] == digests[1]) is same
 
 

@@ -57,8 +57,8 @@ def clock(device: torch.device) -> float:
 
 def machine_stamp(device: torch.device) -> tuple[object, ...]:
     """What decides, beside code and settings, on the last bits of a result: torch, threads, device."""
-    kind = () if device.type == "cuda" else processor_kind()
-    return torch.__version__, torch.get_num_threads(), device_name(device), *kind
+    kind = device_name(device) if device.type == "cuda" else processor_kind()
+    return torch.__version__, torch.get_num_threads(), kind
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:

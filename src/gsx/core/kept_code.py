@@ -258,18 +258,15 @@ def is_torn(library: Path) -> bool:
 @functools.cache
 def without_torn_libraries(folder: Path) -> None:
     """Remove what a linker left that was killed: torch takes whatever is there for whole. Once in a process; what
-    others are making is left to them."""
-    from filelock import FileLock, Timeout
-
+    others are making is left to them, by the lock that torch has of it."""
     for library in folder.glob("*/*.so"):
-        lock = folder / "locks" / f"{library.name.split('.')[0]}.lock"  # torch's own
-        with suppress(OSError, Timeout):
-            if is_torn(library):
-                lock.parent.mkdir(exist_ok=True)
-                with FileLock(lock, timeout=0):
-                    if is_torn(library):
-                        logger.info("%s is not whole: it is made again", library)
-                        library.unlink()
+        with suppress(OSError):
+            if not is_torn(library):
+                continue
+            with made_by_one(folder / "locks" / library.name.partition(".")[0]) as alone:
+                if alone and is_torn(library):
+                    logger.info("%s is not whole: it is made again", library)
+                    library.unlink()
 
 
 # -- functions ---------------------------------------------------------------------------------------------------------
