@@ -491,6 +491,13 @@ def test_a_multirun_over_processes_is_compared_within_its_rounds() -> None:
     assert together["ratio"] == "2.00 (1.25 to 3.00)"  # 10/5, 30/10, 20/16
 
 
+def test_shared_cores_are_compared_within_a_round() -> None:
+    import shared_cores
+
+    row = shared_cores.row_of("another run", {"default": [30.0, 10.0, 80.0], "brief": [10.0, 8.0, 20.0]})
+    assert (row["default"], row["brief"], row["ratio"]) == (30.0, 10.0, "3.00 (1.25 to 4.00)")
+
+
 def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
