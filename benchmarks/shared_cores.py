@@ -1,8 +1,7 @@
-"""Training while another program wants the cores, too: python benchmarks/shared_cores.py
+"""Training while another program wants the cores, too: python benchmarks/shared_cores.py --against REVISION
 
-Threads of a step wait for each other, turning as long as GNU OpenMP does by default, or as long as gsx has them
-(core/threads.py): alone, beside a program that keeps one core busy, and two runs at once. Ways take turns, round by
-round; ratios hold within a round. Wants an otherwise idle machine.
+Alone, beside a program that keeps one core busy, and two runs at once (core/threads.py). Both revisions take turns,
+round by round; ratios hold within a round. Wants an otherwise idle machine.
 """
 
 import argparse
@@ -18,18 +17,16 @@ from typing import Any
 
 import torch
 
-from gsx.core.threads import SPINS
-from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.machine import ROOT, describe_machine, shown_command, told_load
+from measuring.results import read_sections, stamped, text_table, write_results
+from measuring.revisions import checked_out
 from measuring.runs import train
 
 RESULTS = Path(__file__).parent / "results"
 RUN = ("iterations=150", "rasterizer=compiled", "backbone=gs3d", "training.test_points=0", "eval.zoom=[1]",
        "eval.flight=false", "device=cpu")  # fmt: skip
-WAYS = {"default": {SPINS: "300000"}, "brief": dict[str, str]()}
-"""Environments: GNU OpenMP's default (its manual, GOMP_SPINCOUNT), and what gsx sets."""
 COLUMNS = [
-    *(["beside", "beside the run"], ["default", "OpenMP's default, s"], ["brief", "gsx, s"]),
+    *(["beside", "beside the run"], ["before", "before, s"], ["now", "now, s"]),
     ["ratio", "times as fast"],
 ]
 NOTE = f"`gsx {' '.join(RUN)}`, seconds of training, medians of rounds."
@@ -45,12 +42,12 @@ def busy() -> Iterator[None]:
             program.kill()
 
 
-def seconds(folder: Path, environment: Mapping[str, str], runs: int) -> float:
+def seconds(folder: Path, source: Path, runs: int) -> float:
     """Seconds of training of the slowest of so many runs at once."""
 
     def one(number: int) -> float:
         own = folder / str(number)
-        return float(train(own, RUN, environment, log=own.with_suffix(".log"))["train_seconds"])
+        return float(train(own, RUN, {"PYTHONPATH": str(source)}, log=own.with_suffix(".log"))["train_seconds"])
 
     folder.mkdir(parents=True)
     with ThreadPoolExecutor(runs) as pool:
@@ -65,41 +62,49 @@ BESIDE: dict[str, tuple[int, Callable[[], AbstractContextManager[None]]]] = {
 """How many runs, and what else there is meanwhile."""
 
 
-def measured(rounds: int) -> dict[str, dict[str, list[float]]]:
-    """Seconds by what is beside the run and by way; what is compiled is compiled before."""
-    found: dict[str, dict[str, list[float]]] = {beside: {way: [] for way in WAYS} for beside in BESIDE}
+def measured(sources: Mapping[str, Path], rounds: int) -> dict[str, dict[str, list[float]]]:
+    """Seconds by what is beside the run and by revision; what is compiled is compiled before."""
+    found: dict[str, dict[str, list[float]]] = {beside: {which: [] for which in sources} for beside in BESIDE}
     with TemporaryDirectory() as folder:
-        seconds(Path(folder) / "first", {}, 1)
+        for which, source in sources.items():
+            seconds(Path(folder) / f"first {which}", source, 1)
         for number in range(rounds):
             for beside, (runs, meanwhile) in BESIDE.items():
-                for way, environment in WAYS.items():
+                for which, source in sources.items():
                     with meanwhile():
-                        taken = seconds(Path(folder) / f"{number} {beside} {way}", environment, runs)
-                    found[beside][way].append(taken)
-                    print(f"round {number + 1}, beside {beside}, {way}: {taken:.1f} s", flush=True)
+                        taken = seconds(Path(folder) / f"{number} {beside} {which}", source, runs)
+                    found[beside][which].append(taken)
+                    print(f"round {number + 1}, beside {beside}, {which}: {taken:.1f} s", flush=True)
     return found
 
 
 def row_of(beside: str, times: Mapping[str, Sequence[float]]) -> dict[str, Any]:
     """Medians over rounds, and the ratio, which holds within a round."""
-    ratios = [before / now for before, now in zip(times["default"], times["brief"], strict=True)]
+    ratios = [before / now for before, now in zip(times["before"], times["now"], strict=True)]
     told = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
-    medians = {way: round(statistics.median(taken), 1) for way, taken in times.items()}
-    return {"beside": beside, **medians, "ratio": told, "rounds": {way: list(taken) for way, taken in times.items()}}
+    medians = {which: round(statistics.median(taken), 1) for which, taken in times.items()}
+    return {
+        "beside": beside,
+        **medians,
+        "ratio": told,
+        "rounds": {which: list(taken) for which, taken in times.items()},
+    }
 
 
 def main(words: Sequence[str]) -> None:
     """Measure and write results/shared_cores_cpu.{md,json}."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", required=True, help="a revision to compare with")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the table")
     given = parser.parse_args(words)
     machine, load = describe_machine(torch.device("cpu")), told_load()
     read_sections(given.to / "shared_cores_cpu.json")  # what cannot be added to is refused before measuring
-    rows = [row_of(beside, times) for beside, times in measured(given.rounds).items()]
-    table: Section = stamped(
-        "Shared cores", COLUMNS, rows, [NOTE], load, shown_command(words, "benchmarks/shared_cores.py")
-    )
+    with checked_out(given.against) as before:
+        found = measured({"before": before, "now": ROOT / "src"}, given.rounds)
+    rows = [row_of(beside, times) for beside, times in found.items()]
+    notes, command = [NOTE, f"Before: revision {given.against}."], shown_command(words, "benchmarks/shared_cores.py")
+    table = stamped("Shared cores", COLUMNS, rows, notes, load, command)
     write_results(given.to, "shared_cores_cpu", machine, {"demo": table})
     print(text_table(table))
 

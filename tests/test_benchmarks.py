@@ -494,8 +494,8 @@ def test_a_multirun_over_processes_is_compared_within_its_rounds() -> None:
 def test_shared_cores_are_compared_within_a_round() -> None:
     import shared_cores
 
-    row = shared_cores.row_of("another run", {"default": [30.0, 10.0, 80.0], "brief": [10.0, 8.0, 20.0]})
-    assert (row["default"], row["brief"], row["ratio"]) == (30.0, 10.0, "3.00 (1.25 to 4.00)")
+    row = shared_cores.row_of("another run", {"before": [30.0, 10.0, 80.0], "now": [10.0, 8.0, 20.0]})
+    assert (row["before"], row["now"], row["ratio"]) == (30.0, 10.0, "3.00 (1.25 to 4.00)")
 
 
 def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(

@@ -22,7 +22,6 @@ from gsx import __version__
 from gsx.cli.dispatch import VERBS, main
 from gsx.core.data.images import write_image
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.threads import CHOSEN
 
 GSX = [sys.executable, "-m", "gsx"]
 FEW = ("scene.points=100", "scene.train_views=3")
@@ -200,17 +199,6 @@ def test_hydra_s_own_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
 def test_completion_can_be_installed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["-sc", "install=bash"]) == 0
     assert "complete " in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(("chosen", "expected"), [({}, "2000"), ({"GOMP_SPINCOUNT": "77"}, "77")])
-def test_threads_that_wait_give_up_their_core_soon_unless_users_choose(chosen: dict[str, str], expected: str) -> None:
-    own = {name: value for name, value in os.environ.items() if name not in CHOSEN} | chosen
-    command = [sys.executable, "-m", "gsx", "explain", "iterations"]
-    told = subprocess.run(command, env=own | {"OMP_DISPLAY_ENV": "verbose"}, capture_output=True, text=True).stderr
-    found = re.findall(r"GOMP_SPINCOUNT = '(\d+)'", told)
-    if not found:
-        pytest.skip("torch's threads are not GNU OpenMP's here")
-    assert set(found) == {expected}
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")

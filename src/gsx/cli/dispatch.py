@@ -15,7 +15,6 @@ from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.processes import processes
-from gsx.core.threads import wait_briefly
 
 HELP = """\
 gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.
@@ -57,7 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files as they are, whatever their bytes
-    wait_briefly()
     if processes() > 1:
         from gsx.core.training.distributed import as_one
 

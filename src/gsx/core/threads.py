@@ -1,20 +1,96 @@
-"""How long the threads of a loop wait for each other before they give up their core."""
+"""Threads that wait for each other, on cores that other programs want, too.
 
-import os
+Each of a step's hundreds of short loops ends when all of its threads have. GNU OpenMP has those that are ready turn in
+circles for longer than a scheduler's slice, which is fastest alone; but where another program has taken a core, they
+keep from it the very thread that they wait for. It lets them sleep early only while a process has more threads than
+there are cores: so a process whose threads wait for cores is given some that do nothing.
+"""
 
-SPINS = "GOMP_SPINCOUNT"
-"""GNU OpenMP's turns of waiting, by default 300,000: several times as long as a scheduler lets anyone wait."""
-TURNS = "2000"
-"""Ours (benchmarks/shared_cores.py)."""
-CHOSEN = (SPINS, "OMP_WAIT_POLICY")
-"""Variables by which users choose for themselves."""
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+
+logger = logging.getLogger(__name__)
+
+TASKS = Path("/proc/self/task")
+"""Linux tells there of each thread for how long it has run, and waited for a core (schedstat), ns."""
+EVERY = 1.0
+"""Seconds between looks."""
+MANY, FEW = 0.1, 0.03
+"""Threads that wait for a core, on average, where others want it, and where nobody does. By hand on two cores, beside
+another program: 1, and 0.4 with idle threads; alone: below 0.01."""
+GRAIN = 1 << 15
+"""Numbers for which torch takes another thread (ATen, at::internal::GRAIN_SIZE)."""
+Times: TypeAlias = dict[str, int]
+"""For how long each thread has waited for a core, ns."""
 
 
-def wait_briefly() -> None:
-    """For the rest of this process, and for those that it starts; before torch is imported, which reads it.
+@contextmanager
+def yielding_cores() -> Iterator[None]:
+    """Watch whether this process's threads wait for cores; while they do, they sleep early where they wait for each
+    other. No result depends on it. Where the system tells nothing, or there is one thread, nothing happens."""
+    if torch.get_num_threads() == 1 or not times():
+        yield
+        return
+    ended = threading.Event()
+    watcher = threading.Thread(target=watch, args=(ended,), name="gsx cores", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
 
-    A training step has hundreds of short loops, and each ends when all of its threads have. Where another program wants
-    one of the cores, a thread that waits keeps it from the one it waits for.
-    """
-    if not any(name in os.environ for name in CHOSEN):
-        os.environ[SPINS] = TURNS
+
+def watch(ended: threading.Event) -> None:
+    """Add idle threads while cores are scarce, until `ended`."""
+    before, begun, scarce = times(), time.perf_counter(), False
+    with ExitStack() as stack:
+        while not ended.wait(EVERY):
+            now, looked = times(), time.perf_counter()
+            threads = waiting(before, now) / (looked - begun)
+            before, begun = now, looked
+            if not scarce and threads > MANY:
+                logger.info("other programs want the cores, too: this takes longer")
+                stack.enter_context(idle_threads())
+            elif scarce and threads < FEW:
+                stack.close()
+            scarce = threads > (FEW if scarce else MANY)
+
+
+def times() -> Times:
+    """Of each thread of this process; empty where the system does not tell."""
+    found = Times()
+    for file in TASKS.glob("*/schedstat"):
+        with suppress(OSError, IndexError, ValueError):  # a thread may end meanwhile
+            found[file.parent.name] = int(file.read_text().split()[1])
+    return found
+
+
+def waiting(before: Times, now: Times) -> float:
+    """For how long threads, taken together, have waited for a core in between, seconds."""
+    return sum(now[thread] - before[thread] for thread in before.keys() & now.keys()) / 1e9
+
+
+@contextmanager
+def idle_threads() -> Iterator[None]:
+    """As many threads as torch has, all asleep: OpenMP counts another team."""
+    ended = threading.Event()
+
+    def lead() -> None:
+        torch.zeros(GRAIN * torch.get_num_threads()).add_(1)  # a loop of its own, whose threads stay with this one
+        ended.wait()
+
+    leader = threading.Thread(target=lead, name="gsx idle", daemon=True)
+    leader.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        leader.join()

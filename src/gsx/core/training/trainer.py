@@ -20,6 +20,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
+from gsx.core.threads import yielding_cores
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
 from gsx.core.training.captures import judge_photographs
 from gsx.core.training.evidence import window_errors
@@ -33,6 +34,7 @@ from gsx.core.training.run import Run, Step
 logger = logging.getLogger(__name__)
 
 
+@yielding_cores()
 def train(run: Run, plugins: Plugins) -> None:
     """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
     plugins.emit.gsx_run_started(run=run)

@@ -6,6 +6,7 @@ from typing import Any
 
 from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
+from gsx.core.threads import yielding_cores
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.experiments.evaluation.remarks import remarks_of
@@ -20,6 +21,7 @@ from gsx.experiments.runs.settings import Settings
 logger = logging.getLogger(__name__)
 
 
+@yielding_cores()
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run."""
     options, begun = settings.evaluation, time.perf_counter()

@@ -1,0 +1,92 @@
+"""Cores that others want, too."""
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsx.core import threads
+
+SLEEPS = """
+import time, torch
+from contextlib import nullcontext
+from pathlib import Path
+from gsx.core.threads import GRAIN, idle_threads
+
+def sleeps():
+    lines = (line for task in Path("/proc/self/task").iterdir() for line in (task / "status").read_text().splitlines())
+    return sum(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt"))
+
+def loops():
+    before = sleeps()
+    for _ in range(300):
+        numbers.add_(1)
+        begun = time.perf_counter()
+        while time.perf_counter() < begun + 2e-4:
+            pass
+    return sleeps() - before
+
+torch.set_num_threads(2)
+numbers = torch.zeros(4 * GRAIN)
+loops()
+free = loops()
+with idle_threads():
+    time.sleep(0.2)
+    shared = loops()
+time.sleep(0.2)
+print(free, shared, loops())
+"""
+"""Prints how often threads fell asleep in 300 short loops: alone, with idle threads, and without them again."""
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) > 2, reason="two threads are too few for these cores")
+@pytest.mark.skipif(not threads.times(), reason="the system does not tell how long threads wait")
+def test_threads_that_wait_for_each_other_sleep_while_there_are_idle_ones() -> None:
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    found = subprocess.run([sys.executable, "-c", SLEEPS], env=own, capture_output=True, text=True, check=True).stdout
+    free, shared, again = map(int, found.split())
+    assert shared > 200 > 100 > max(free, again)
+
+
+def test_cores_are_scarce_from_much_waiting_until_there_is_next_to_none(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    waits = [0.0, 0.0, 0.1, 0.5, 0.1, 0.0, 0.3]  # seconds that two threads have waited in each second
+    there = [0, 0, 0, 1, 1, 0, 1]
+    told, seen, clock = iter(waits), list[int](), [0.0]
+    total = [0.0]
+
+    def times() -> threads.Times:
+        total[0] += next(told)
+        return {"1": int(total[0] * 5e8), "2": int(total[0] * 5e8), str(len(seen) + 7): 10**12}
+
+    class Ended(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            seen.append(sum(thread.name == "gsx idle" for thread in threading.enumerate()))
+            clock[0] += 1
+            return len(seen) > len(waits) - 1
+
+    monkeypatch.setattr(threads, "times", times)
+    monkeypatch.setattr(threads.time, "perf_counter", lambda: clock[0])
+    threads.watch(Ended())
+    assert seen == there
+    assert not any(thread.name == "gsx idle" for thread in threading.enumerate())
+    assert len(caplog.records) == 2
+
+
+def test_a_system_that_does_not_tell_is_left_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(threads, "TASKS", tmp_path / "missing")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with threads.yielding_cores():
+        assert not any(thread.name == "gsx cores" for thread in threading.enumerate())
+    monkeypatch.setattr(threads, "TASKS", tmp_path)
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / "schedstat").write_text("5 7 9\n")
+    with threads.yielding_cores():
+        assert sum(thread.name == "gsx cores" for thread in threading.enumerate()) == 1
+    assert not any(thread.name == "gsx cores" for thread in threading.enumerate())
