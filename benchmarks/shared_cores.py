@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -60,6 +61,8 @@ BESIDE: dict[str, tuple[int, Callable[[], AbstractContextManager[None]]]] = {
     "another run": (2, nullcontext),
 }
 """How many runs, and what else there is meanwhile."""
+TURNS = {"nothing": 4}
+"""Times that each revision is measured in a round, once elsewhere: alone there is least to tell apart."""
 
 
 def measured(sources: Mapping[str, Path], rounds: int) -> dict[str, dict[str, list[float]]]:
@@ -70,9 +73,9 @@ def measured(sources: Mapping[str, Path], rounds: int) -> dict[str, dict[str, li
             seconds(Path(folder) / f"first {which}", source, 1)
         for number in range(rounds):
             for beside, (runs, meanwhile) in BESIDE.items():
-                for which, source in sources.items():
+                for turn, (which, source) in product(range(TURNS.get(beside, 1)), sources.items()):
                     with meanwhile():
-                        taken = seconds(Path(folder) / f"{number} {beside} {which}", source, runs)
+                        taken = seconds(Path(folder) / f"{number} {turn} {beside} {which}", source, runs)
                     found[beside][which].append(taken)
                     print(f"round {number + 1}, beside {beside}, {which}: {taken:.1f} s", flush=True)
     return found
