@@ -1,4 +1,5 @@
 # gsx on CPU: docker build -t gsx . && docker run --rm -v "$PWD:/data" -w /data gsx scene=demo
+# Files that are yours, and compiled code that is kept: --user "$(id -u):$(id -g)" -e GSX_CACHE=/data/.gsx_cache
 # On an NVIDIA GPU: --build-arg TORCH_INDEX=https://pypi.org/simple, and `docker run --gpus all`.
 FROM python:3.11-slim
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu

@@ -566,6 +566,12 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: [*OVERRIDES, "iterations=1", "folder='~/x'"],
         f"folder is '~/x', which would be below this folder: give folder={Path.home() / 'x'}",
     ),
+    "compact with a place of its own": (
+        lambda t: ["compact", str(run_of_old(t / "run")), f"output={t / 'o'}"],
+        "--to FOLDER says where the smaller run goes",
+    ),
+    "a photograph of no run": (lambda t: ["photographs"], "the following arguments are required: RUN. See"),
+    "an export of no run": (lambda t: ["export"], "the following arguments are required: RUN. See"),
     "trade with a place of its own": (
         lambda t: ["trade", "training", f"output={t / 'o'}", "--to", str(t / "t")],
         "runs go below --to FOLDER",

@@ -28,6 +28,12 @@ def test_what_fails_half_way_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("a.txt", b"whole")]
 
 
+def test_what_cannot_be_written_is_named_as_it_was_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as error:
+        replace_file(tmp_path / "missing" / "report.html", b"whole")
+    assert error.value.filename == str(tmp_path / "missing" / "report.html")
+
+
 def test_no_cell_is_a_formula_and_numbers_stay_numbers() -> None:
     rows = [
         {"run": "=cmd|' /C calc'!A1", "psnr": -1.5, "more": "left out"},

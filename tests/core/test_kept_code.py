@@ -120,6 +120,9 @@ def test_other_arguments_get_other_code(folder: Path, monkeypatch: pytest.Monkey
             assert len(names) == number
             assert agrees(function, *given)
             assert len(names) == number
+        monkeypatch.setattr(torch, "get_default_dtype", lambda: torch.float64)  # of numbers that name none
+        assert agrees(function, x, y)
+        assert len(names) == number + 1
 
 
 def test_gradients_are_those_of_the_function_when_code_is_found(folder: Path) -> None:

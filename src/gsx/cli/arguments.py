@@ -1,7 +1,7 @@
 """Parsers of verbs, whose mistakes are errors of ours."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,11 +17,22 @@ def is_override(word: str) -> bool:
     return not word.startswith((".", "/", "~/")) and (word.startswith(("-", "+", "~")) or "=" in word)
 
 
+PLACES = ("output", "folder", "reuse")
+"""What says where a run is trained."""
+
+
+def refuse_taken(verb: str, overrides: Sequence[str], remedies: Mapping[str, str]) -> None:
+    """Raise ConfigError for an override of what a verb's own flags say; `remedies` by key."""
+    for word in overrides:
+        if remedy := remedies.get(word.lstrip("+~").partition("=")[0]):
+            raise ConfigError(f"{verb} does not take '{word}': {remedy}")
+
+
 def run_arguments(verb: str, arguments: list[str], description: str, flags: str = "") -> tuple[Path, list[str]]:
     """The run folder and the overrides after it; `flags`: others that the verb has, for its help."""
     parser = Parser(prog=f"gsx {verb}", usage=f"%(prog)s RUN [KEY=VALUE ...]{flags}", description=description)
     parser.add_argument("run", metavar="RUN", help="run folder")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
+    parser.add_overrides("values that take the place of the run's own")
     given = parser.parse_args(arguments)
     if "=" in given.run and not Path(given.run).exists():
         raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
@@ -30,6 +41,11 @@ def run_arguments(verb: str, arguments: list[str], description: str, flags: str 
 
 class Parser(argparse.ArgumentParser):
     """Mistakes become errors of ours: one sentence, without the usage text."""
+
+    def add_overrides(self, told: str) -> None:
+        """KEY=VALUE, as many as there are, as `overrides`."""
+        # argparse calls required what has no default
+        self.add_argument("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=told)
 
     def error(self, message: str) -> NoReturn:
         """Raise ConfigError."""

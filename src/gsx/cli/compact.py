@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, positive, refuse_beyond, whole
+from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_taken, whole
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
 
@@ -19,7 +19,7 @@ def verb_compact(arguments: list[str]) -> int:
         "both. FILE: of any program, with the scene that judges it (scene=colmap scene.path=FOLDER).",
     )
     parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder or splat file")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values in place of the run's own")
+    parser.add_overrides("values in place of the run's own")
     parser.add_argument(
         "--max-drop-db",
         type=positive(float),
@@ -31,6 +31,7 @@ def verb_compact(arguments: list[str]) -> int:
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="new run folder (RUN_compact)")
     given = parser.parse_intermixed_args(arguments)
     refuse_beyond("gsx compact --steps", given.steps or 0, Range(0, MOST_STEPS))
+    refuse_taken("gsx compact", given.overrides, dict.fromkeys(PLACES, "--to FOLDER says where the smaller run goes"))
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
     from gsx.experiments.compact.compact import compact

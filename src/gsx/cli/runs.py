@@ -54,7 +54,7 @@ def verb_photographs(arguments: list[str]) -> int:
     )
     parser = Parser(prog="gsx photographs", description=told)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that take the place of the run's own")
+    parser.add_overrides("values that take the place of the run's own")
     parser.add_argument("--worst", type=positive(int), default=10, help="photographs that are shown (10)")
     if not arguments and Path("photographs").is_dir():
         raise InputError("gsx photographs RUN judges a run's photographs: to train from that folder, gsx ./photographs")
@@ -152,8 +152,8 @@ def verb_export(arguments: list[str]) -> int:
         "or .html, one page with a viewer in it that opens from disk."
     )
     parser = Parser(prog="gsx export", description=told)
-    parser.add_argument("run", type=Path, help="run folder")
-    parser.add_argument("file", type=Path, nargs="?", help="splat file to write (RUN/point_cloud.ply)")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     parser.add_argument(
         "--bake",

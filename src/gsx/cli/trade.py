@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import Parser, different_numbers, new_folder, not_negative, positive, refuse_beyond, whole
+from gsx.cli.arguments import (
+    PLACES,
+    Parser,
+    different_numbers,
+    new_folder,
+    not_negative,
+    positive,
+    refuse_beyond,
+    refuse_taken,
+    whole,
+)
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.ranges import Range
 
@@ -65,7 +75,7 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
         description="Train a composition, and with it what could be had instead: fewer primitives or steps, other "
         "resolutions, filters, colours, levels, pseudo details (conf/trade). Compare, and answer a wish.",
     )
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="the composition to start from")
+    parser.add_overrides("the composition to start from")
     add = parser.add_argument
     add("--budget-mb", type=positive(float), metavar="MB", help="wish: a splat file of at most so many 10^6 bytes")
     add("--max-drop-db", type=not_negative, metavar="DB", help="wish: at most so much lost at any zoom")
@@ -78,10 +88,8 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
     given = parser.parse_intermixed_args(arguments)
     if given.trades == "":
         raise ConfigError("--trades names none: give some, or leave it out for all of them")
-    for word in given.overrides:
-        if word.startswith(("output=", "folder=", "reuse=", "seed=")):
-            remedy = "--seeds A,B,... says which" if word.startswith("seed=") else "runs go below --to FOLDER"
-            raise ConfigError(f"gsx trade training does not take '{word}': {remedy}")
+    remedies = dict.fromkeys(PLACES, "runs go below --to FOLDER") | {"seed": "--seeds A,B,... says which"}
+    refuse_taken("gsx trade training", given.overrides, remedies)
     return given
 
 

@@ -387,9 +387,10 @@ def known_to_torch(settings: dict[str, Any]) -> dict[str, Any]:
 
 def modes(arguments: tuple[Any, ...]) -> tuple[object, ...]:
     """What code depends on beside what arguments are: whether gradients of one of them are followed, how many threads
-    there are, and whether torch is to be deterministic."""
+    there are, whether torch is to be deterministic, and the format of numbers that name none."""
     followed = torch.is_grad_enabled() and learns(arguments)
-    return followed, torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    return followed, torch.get_num_threads(), deterministic, torch.get_default_dtype()
 
 
 def learns(value: Any) -> bool:

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -211,6 +212,6 @@ def test_sigterm_leaves_a_checkpoint_and_its_own_exit_code(tmp_path: Path) -> No
     begun.send_signal(signal.SIGTERM)
     said = begun.communicate(timeout=60)[1]
     assert begun.returncode == -signal.SIGTERM, said
-    assert "stopped at step" in said
+    assert re.search(r"stopped at step \d+ by SIGTERM; go on with: gsx resume run\n", said), said
     assert list((tmp_path / "run" / "checkpoints").glob("step_*.json"))
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"

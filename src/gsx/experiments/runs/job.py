@@ -46,11 +46,11 @@ def logged_to(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def interruptible(run: "Run") -> Iterator[object]:
+def interruptible(run: "Run", onwards: str) -> Iterator[object]:
     """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
 
     The signals by which a cluster takes a machine back (STOPPING) end training, too; they may come again until the
-    checkpoint is written. Then the first is sent again, to whoever waited for it before.
+    checkpoint is written. Then the first is sent again, to whoever waited for it before; the log says how to go `onwards`.
 
     Yields a listener that takes the handlers away when training is over. Threads but the main one hear no signals.
     """
@@ -79,7 +79,8 @@ def interruptible(run: "Run") -> Iterator[object]:
     finally:
         give_back(*before)
     if received and received[0] in STOPPING and not run.complete:
-        logger.info("stopped at step %d by %s", run.step, signal.Signals(received[0]).name)
+        name = signal.Signals(received[0]).name
+        logger.info("stopped at step %d by %s; go on with: %s", run.step, name, onwards)
         signal.raise_signal(received[0])
         raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
 
@@ -139,7 +140,7 @@ def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
 
     onwards = way_on(run, settings)
     try:
-        with interruptible(run) as listener, loaded.listening([listener]), logged_to(run.folder):
+        with interruptible(run, onwards) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded)
     except KeyboardInterrupt:
         say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
