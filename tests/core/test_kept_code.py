@@ -120,8 +120,11 @@ def test_other_arguments_get_other_code(folder: Path, monkeypatch: pytest.Monkey
             assert len(names) == number
             assert agrees(function, *given)
             assert len(names) == number
-        monkeypatch.setattr(torch, "get_default_dtype", lambda: torch.float64)  # of numbers that name none
-        assert agrees(function, x, y)
+        torch.set_default_dtype(torch.float64)  # of numbers that name none
+        try:
+            assert agrees(function, x, y)
+        finally:
+            torch.set_default_dtype(torch.float32)
         assert len(names) == number + 1
 
 
