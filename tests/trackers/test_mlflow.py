@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -184,7 +185,7 @@ def test_a_store_that_breaks_ends_no_run(empty: Path, tmp_path: Path, caplog: py
         @hookimpl
         def gsx_step_finished(self, run: Run) -> None:
             if run.step == 5:
-                with sqlite3.connect(tmp_path / "mlflow.db") as connection:
+                with closing(sqlite3.connect(tmp_path / "mlflow.db")) as connection, connection:
                     connection.execute("drop table metrics")
 
     shutil.copy(empty, tmp_path / "mlflow.db")
