@@ -87,7 +87,7 @@ def test_peak_memory_that_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("None\n")
     assert "peak memory n/a" in done.stderr
-    assert " MB  ETA" not in done.stderr
+    assert " splats  " not in done.stderr, "megabytes follow"
 
 
 @pytest.mark.parametrize("wait", [False, True])

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from io import TextIOWrapper
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import pytest
@@ -62,7 +62,7 @@ def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(words(tmp_path / "run", *FEW, "iterations=2")) == 0
     captured = capsys.readouterr()
     assert captured.out.strip() == str(tmp_path / "run" / "report.html")
-    assert re.search(r"step 2/2 .* it/s .* loss .* PSNR .* splats .* MB .* ETA", captured.err)
+    assert re.search(r"step 2/2 .* it/s .* ETA .* loss .* PSNR .* splats .* MB", captured.err)
     assert "plan of densify" in (tmp_path / "run" / "log.txt").read_text() + captured.err
 
 
@@ -222,6 +222,14 @@ def test_text_of_any_command_that_cannot_be_written_is_one_sentence(
         monkeypatch.setattr(sys, "stdout", full)
         assert main(asked.split()) == 2
     assert [line[:8] for line in capsys.readouterr().err.splitlines()] == ["gsx: No "]
+
+
+def test_names_of_files_are_written_whatever_letters_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    with TextIOWrapper(written := BytesIO(), encoding="ascii", write_through=True) as ascii_only:
+        monkeypatch.setattr(sys, "stdout", ascii_only)
+        assert main(["--version"]) == 0
+        ascii_only.write("l\xe4ufe-\u65e5\udce4\n")  # the last is a byte that is no text
+        assert written.getvalue().endswith(b"l\\xe4ufe-\\u65e5\xe4\n")
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:

@@ -1,6 +1,8 @@
 """Compiled functions that are kept on disk: what another process finds there, and what it must not take for its own."""
 
 import os
+import secrets
+import shutil
 import subprocess
 import sys
 import time
@@ -251,6 +253,22 @@ def test_what_cannot_be_compiled_any_more_is_told(folder: Path) -> None:
         compile_rows(never)(*rows(6))
 
 
+def test_a_compiler_that_was_killed_is_asked_once_more(folder: Path, tmp_path: Path) -> None:
+    """By a Ctrl-C, which all of a terminal's programs hear, or for want of memory. Torch would not ask again."""
+    compiler, broken = tmp_path / "g++", tmp_path / "broken"
+    compiler.write_text(
+        f'#!/bin/sh\ncase "$*" in *.main.cpp*) [ -e {broken} ] && rm {broken} && kill -9 $$;; esac\n'
+        f'exec {shutil.which("g++")} "$@"\n'
+    )
+    compiler.chmod(0o755)
+    broken.touch()
+    source = f"def weighted(x, y):\n    return x * 3.25 + {secrets.randbits(30)}.5 + y"  # nobody has compiled that
+    fresh, (x, y) = module_of(source).weighted, rows(6)
+    with torch._inductor.config.patch({"cpp.cxx": (str(compiler),)}):
+        torch.testing.assert_close(compile_rows(fresh)(x, y), fresh(x, y))
+    assert not broken.exists(), "it was not asked at all"
+
+
 def test_code_of_sizes_that_torch_takes_for_others_lies_beside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A window of 11 leaves one row of 11: torch makes code for such."""
     sizes = [(3, 40, 50), (3, 11, 50), (3, 30, 20), (3, 11, 11)]
@@ -311,6 +329,7 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
     (file,) = [kept.file(arguments) for kept, arguments, _ in calls]
     with made_by_one(file), file.with_suffix(".lock").open():  # whoever else makes it
         make_ahead(calls)
+    make_ahead(calls, stopping=lambda: True)
     assert lacking(calls)
     make_ahead(calls)
     assert not lacking(calls)

@@ -1,5 +1,6 @@
 """The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
 
+import codecs
 import io
 import sys
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from gsx.cli.arguments import RESUME_FLAGS, is_override
 from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
-from gsx.cli.messages import discard_unwritten, explained, set_up_logging, unheard
+from gsx.cli.messages import as_bytes, discard_unwritten, explained, set_up_logging, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
@@ -54,8 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
     141 nobody reads on (`| head`)."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="surrogateescape")  # names of files as they are, whatever their bytes
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
+        codecs.register_error("names", as_bytes)
+        sys.stdout.reconfigure(errors="names")
     if processes() > 1:
         from gsx.core.training.distributed import as_one
 

@@ -74,6 +74,24 @@ def os_sentence(error: OSError) -> str:
     return f"{error.strerror or error}{where}: {remedy}, or choose {place}"
 
 
+def as_bytes(error: UnicodeError) -> tuple[bytes, int]:
+    """What standard output has no letters for: bytes of names of files as they are, all else as escapes.
+
+    Raises:
+        UnicodeError: it was to be read.
+    """
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    letters = error.object[error.start : error.end]
+    return b"".join(map(byte_or_escape, letters)), error.end
+
+
+def byte_or_escape(letter: str) -> bytes:
+    """A byte that Python took for no text (PEP 383), or the escape of a letter."""
+    number = ord(letter) - 0xDC00
+    return bytes([number]) if 0x80 <= number <= 0xFF else letter.encode("ascii", "backslashreplace")
+
+
 def set_up_logging() -> None:
     """Plain messages of gsx on standard error, warnings marked."""
 

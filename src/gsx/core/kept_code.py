@@ -345,7 +345,11 @@ class KeptFunction:
         Raises:
             ValueError: it does not hold for these arguments.
         """
-        made = self.compile(arguments)
+        try:
+            made = self.compile(arguments)
+        except Exception:  # the C++ compiler may have been killed, or its folder removed: once more, then it is told
+            forget_failures()
+            made = self.compile(arguments)
         code = code_of(made)
         if not code.holds(self.named(arguments)):
             raise ValueError("its code does not hold for what it was made for")
@@ -378,6 +382,14 @@ class KeptFunction:
     def checks(self, guard: Any) -> bool:
         """Whether one of torch's conditions is checked at every call."""
         return guard.guard_type in self.checked
+
+
+def forget_failures() -> None:
+    """Torch remembers for the rest of a process which source did not compile; that of others is found on disk."""
+    from torch._inductor import codecache
+
+    for name in ("CppCodeCache", "CppPythonBindingsCodeCache"):
+        getattr(getattr(codecache, name, None), "cache", dict[str, object]()).clear()
 
 
 def known_to_torch(settings: dict[str, Any]) -> dict[str, Any]:
@@ -571,9 +583,12 @@ def file_of(call: Call) -> Path | None:
         return function.file(arguments)
 
 
-def make_ahead(calls: Sequence[Call]) -> None:
-    """Have code for these calls made and kept, where it is not; what others are making is left to them."""
+def make_ahead(calls: Sequence[Call], stopping: Callable[[], bool] = lambda: False) -> None:
+    """Have code for these calls made and kept, where it is not, until `stopping`; what others are making is left to
+    them."""
     for call in calls:
+        if stopping():
+            return
         file, (function, arguments, gradients) = file_of(call), call
         if file is None or file.exists():
             continue

@@ -22,7 +22,7 @@ TASKS = Path("/proc/self/task")
 """Linux tells there of each thread for how long it has run, and waited for a core (schedstat), ns."""
 EVERY = 1.0
 """Seconds between looks."""
-MANY, FEW = 0.1, 0.03
+MANY, FEW = 0.25, 0.05
 """Threads that wait for a core, on average, where others want it, and where nobody does. By hand on two cores, beside
 another program: 1, and 0.4 with idle threads; alone: below 0.01."""
 GRAIN = 1 << 15
@@ -40,24 +40,28 @@ def yielding_cores() -> Iterator[None]:
         return
     ended = threading.Event()
     watcher = threading.Thread(target=watch, args=(ended,), name="gsx cores", daemon=True)
-    watcher.start()
     try:
+        with suppress(RuntimeError):  # no thread more is allowed
+            watcher.start()
         yield
     finally:
         ended.set()
-        watcher.join()
+        if watcher.is_alive():
+            watcher.join()
 
 
 def watch(ended: threading.Event) -> None:
     """Add idle threads while cores are scarce, until `ended`."""
-    before, begun, scarce = times(), time.perf_counter(), False
+    before, begun, scarce, told = times(), time.perf_counter(), False, False
     with ExitStack() as stack:
         while not ended.wait(EVERY):
             now, looked = times(), time.perf_counter()
             threads = waiting(before, now) / (looked - begun)
             before, begun = now, looked
             if not scarce and threads > MANY:
-                logger.info("other programs want the cores, too: this takes longer")
+                if not told:
+                    logger.info("cores are shared with others: this takes longer")
+                told = True
                 stack.enter_context(idle_threads())
             elif scarce and threads < FEW:
                 stack.close()
@@ -88,9 +92,11 @@ def idle_threads() -> Iterator[None]:
         ended.wait()
 
     leader = threading.Thread(target=lead, name="gsx idle", daemon=True)
-    leader.start()
+    with suppress(RuntimeError):  # no thread more is allowed
+        leader.start()
     try:
         yield
     finally:
         ended.set()
-        leader.join()
+        if leader.is_alive():
+            leader.join()

@@ -13,6 +13,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer.reference import render_reference
 
 
 def scene(count: int = 200, seed: int = 0, channels: int = 3) -> Splats:
@@ -52,6 +53,14 @@ def test_render_of_a_crop_is_the_crop_of_the_render_bit_for_bit(window: tuple[in
     whole, part = rasterize(scene(), camera(), rules).image, rasterize(scene(), camera().crop(*window), rules).image
     x0, y0, x1, y1 = max(left, 0), max(top, 0), min(left + width, 83), min(top + height, 61)
     assert torch.equal(part[:, y0 - top : y1 - top, x0 - left : x1 - left], whole[:, y0:y1, x0:x1])
+
+
+@pytest.mark.parametrize("cull", ["published", "tight"])
+@pytest.mark.parametrize("window", [(-20, -9, 60, 50), (70, 50, 40, 40)])
+def test_beyond_the_frame_a_crop_is_that_of_the_truth(window: tuple[int, int, int, int], cull: str) -> None:
+    cropped, rules = camera().crop(*window), RasterSettings(cull=cull)
+    truth = render_reference(scene(), cropped, rules)[0]
+    assert torch.allclose(rasterize(scene(), cropped, rules).image.double(), truth, atol=1e-5)
 
 
 def test_zoomed_render_averages_back_to_the_render() -> None:

@@ -19,6 +19,7 @@ from raster_scenes import (
     truth_of,
 )
 
+from gsx.core.compiling import available
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.composite import composite, make_blocks, make_tables
@@ -196,6 +197,17 @@ def test_channels_of_any_magnitude_fit_16_bits(accumulation: str) -> None:
     assert all(torch.isfinite(value.grad).all() and value.grad.abs().max() > 0 for value in vars(live).values())
     empty = rasterize(changed(splats, colours=torch.zeros_like(splats.colours)), front_camera(), rules)
     assert float(empty.image.abs().max()) == 0
+
+
+@pytest.mark.parametrize("path", ["eager", "compiled"] if available() else ["eager"])
+@pytest.mark.parametrize("accumulation", ["float16", "bfloat16", "float64"])
+def test_where_nothing_is_seen_the_picture_is_empty(accumulation: str, path: str) -> None:
+    camera, rules = front_camera(20, 15), RasterSettings(accumulation=accumulation, path=path)
+    behind = random_splats(seed=0)
+    behind = replace(behind, means=behind.means - 1e3 * camera.rotation[2].to(behind.means))
+    rendering = rasterize(behind, camera, rules)
+    assert not rendering.alpha.any()
+    assert rendering.image.dtype == behind.means.dtype
 
 
 @pytest.mark.parametrize("evaluation", ["float16", "bfloat16", "float32", "float64"])

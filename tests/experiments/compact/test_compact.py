@@ -408,7 +408,7 @@ def test_a_splat_file_is_made_smaller(folder: Path, tmp_path: Path) -> None:
     [
         (["nowhere"], "does not exist: give a run folder or a splat file"),
         (["{folder}", "--max-drop-db", "0"], "is no number above 0"),
-        (["{folder}", "--to", "{folder}"], "is not empty"),
+        (["{folder}", "--to", "{folder}"], "is not empty: give another with --to FOLDER"),
         (["{folder}/point_cloud.ply"], "needs the photographs to compare with"),
     ],
 )

@@ -17,6 +17,7 @@ from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
 from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.reports.page import address
 from gsx.experiments.reports.pictures import spread
 from gsx.experiments.reports.report import report_on
 from gsx.experiments.run_folder.files import read_run, runs_below
@@ -586,3 +587,8 @@ def test_folders_with_only_the_root_in_common_need_a_place(folders: Path, monkey
 def test_the_variant_of_a_run(tmp_path: Path) -> None:
     assert read_run(make_run(tmp_path / "a", {"variant": "octree_ub"})).variant == "octree_ub"
     assert read_run(make_run(tmp_path / "b")).variant == "gs3d"
+
+
+def test_addresses_of_files_have_their_bytes() -> None:
+    assert address("a b/l\udce4ufe.html") == "a%20b/l%E4ufe.html"  # a byte that is no text
+    assert address("läufe") == "l%C3%A4ufe"

@@ -165,5 +165,5 @@ def test_a_run_under_way_is_neither_resumed_nor_begun_again(tmp_path: Path, caps
     assert second.codes == [2, 2]
     said = capsys.readouterr().err
     assert f"{folder} is in use by process {os.getpid()} on " in said
-    assert f"folder={folder} is not empty" in said
+    assert f"'{folder}' is not empty" in said
     assert not (folder / LOCK).exists()

@@ -21,12 +21,13 @@ from gsx.augmenters.redraw import Redrawer
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core import files
-from gsx.core.errors import TrainingError
+from gsx.core.errors import CompilerError, TrainingError
 from gsx.core.files import remove_partial, replacing
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint, trainer
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import read_run, state_of
+from gsx.experiments.runs import execute as execution
 from gsx.experiments.runs import verified
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.job import train
@@ -92,6 +93,19 @@ def test_an_error_between_steps_keeps_the_last_one(tmp_path: Path, whole: Path) 
         execute(run, settings, loaded)
     assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == ["step_0000005"]
     assert_ends_as(run.folder, whole)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), CompilerError("blend cannot be compiled")])
+def test_what_ends_while_code_is_made_can_be_gone_on_with(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    warm = execution.warm
+    monkeypatch.setattr(execution, "warm", at_call(1, warm, error))
+    with pytest.raises(type(error)):
+        tiny_run(tmp_path / "run", SHORT)
+    monkeypatch.setattr(execution, "warm", warm)
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
+    assert_ends_as(tmp_path / "run", whole)
 
 
 def test_half_a_step_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,13 @@
 """What people see while they wait."""
 
 import io
+import os
 from pathlib import Path
 
 import pytest
 
 from gsx.experiments.runs import progress
-from gsx.experiments.runs.progress import Countdown, clock
+from gsx.experiments.runs.progress import Countdown, Line, clock
 
 
 class Terminal(io.StringIO):
@@ -60,6 +61,17 @@ def test_on_a_terminal_one_line_is_written_over(time: Clock, monkeypatch: pytest
     assert [line.split("  ETA ")[1].strip() for line in lines[1:4]] == ["9:00", "8:00", "7:00"]
     assert terminal.getvalue().count("\n") == 1, "the last line is left standing"
     assert len(lines[1]) <= len(lines[10])
+
+
+def test_a_line_is_not_longer_than_its_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", terminal := Terminal())
+    monkeypatch.setattr(terminal, "fileno", lambda: 2)
+    monkeypatch.setattr("os.get_terminal_size", lambda number: os.terminal_size((21, 9)))
+    Line().show("step 12/900  4.9 it/s  ETA 3:05")
+    assert terminal.getvalue() == "\rstep 12/900  4.9 it/"
+    monkeypatch.setattr("sys.stderr", elsewhere := io.StringIO())
+    Line().show("step 12/900  4.9 it/s  ETA 3:05")
+    assert elsewhere.getvalue() == "step 12/900  4.9 it/s  ETA 3:05\n"
 
 
 def test_parts_that_are_larger_take_longer(time: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,7 +108,7 @@ def test_no_step_needs_what_is_not_compiled_before(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
     monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
     ahead = list[Call]()
-    monkeypatch.setattr(rasterizer_path, "make_ahead", ahead.extend)
+    monkeypatch.setattr(rasterizer_path, "make_ahead", lambda calls, stopping: ahead.extend(calls))
     monkeypatch.setattr(rasterizer_path, "helper", lambda *_: nullcontext())
     settings = tiny_settings(tmp_path / "run", *given.split(), "rasterizer=compiled")
     run = start(settings, plugins())

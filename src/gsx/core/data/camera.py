@@ -122,7 +122,8 @@ class Camera:
         return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """The window with its upper left corner at pixel (left, top); it may reach past the raster.
+        """The window with its upper left corner at pixel (left, top); it may reach past the raster, where nothing is
+        drawn by `cull=published`, as by 3D-GS, and all by `cull=tight`.
 
         Raises:
             InputError: it has no pixels.

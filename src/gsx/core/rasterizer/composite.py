@@ -336,7 +336,7 @@ def composite(
             means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights
         )
     # 16 bits hold neither a depth of 1e5 nor a colour of 1e-6: blend what lies within 1
-    units = power_of_two_above(torch.cat([channels, torch.zeros_like(channels[:1])]).detach().abs().amax(0))
+    units = power_of_two_above(torch.cat([channels, channels.new_zeros(1, channels.shape[1])]).detach().abs().amax(0))
     blended = Composite.apply(
         means, conic_factors, log_opacities, channels / units, absgrad, blocks, grid, settings, max_weights
     )

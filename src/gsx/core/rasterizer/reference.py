@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, Frame
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
@@ -69,9 +69,9 @@ def compensation(roots: Float[Tensor, "N 5 2"]) -> Float[Tensor, "N"]:
 
 
 def windows(
-    means: Float[Tensor, "N 2"], covariances: Float[Tensor, "N 2 2"], xy: Float[Tensor, "H W 2"]
+    means: Float[Tensor, "N 2"], covariances: Float[Tensor, "N 2 2"], xy: Float[Tensor, "H W 2"], frame: Frame
 ) -> Bool[Tensor, "N H W"]:
-    """Pixels inside the 16 px tiles that the published 3-sigma square touches (3D-GS, forward.cu)."""
+    """Pixels inside those of the frame's 16 px tiles that the published 3-sigma square touches (3D-GS, forward.cu)."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     middle = (a + c) / 2
     largest = middle + torch.sqrt((middle**2 - (a * c - b * b)).clamp_min(0.1))
@@ -79,7 +79,8 @@ def windows(
     first = torch.trunc((means - 0.5 - radius) / WINDOW_TILE)[:, None, None]
     last = torch.trunc((means - 0.5 + radius + WINDOW_TILE - 1) / WINDOW_TILE)[:, None, None]
     tile = torch.floor(xy / WINDOW_TILE)
-    return ((tile >= first) & (tile < last)).all(-1)
+    tiles = torch.ceil(torch.tensor([frame.width, frame.height]) / WINDOW_TILE)
+    return ((tile >= first.clamp(min=0)) & (tile < last.minimum(tiles))).all(-1)
 
 
 def alpha_maps(
@@ -108,7 +109,7 @@ def alpha_maps(
     clamped = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()  # straight-through (3D-GS, backward.cu)
     keep = clamped >= settings.alpha_min
     if settings.cull == "published":
-        keep = keep & windows(means, roots.mT @ roots, xy)
+        keep = keep & windows(means, roots.mT @ roots, xy, camera.frame)
     return torch.where(keep, clamped, 0.0), rows
 
 

@@ -50,6 +50,7 @@ FILE_STEPS = 2000
 """Of a run that a splat file stands at the end of: its learning rates are those of such a run's last step."""
 SHARE = 0.1
 """Of a run's steps that are taken to learn on, where nothing is said."""
+ELSEWHERE = "give another with --to FOLDER"
 NAME, COMPARED = "compact.json", "compared"
 """What was tried; folder of the page with the model before and after."""
 
@@ -62,7 +63,7 @@ def compact(
     Raises:
         ConfigError, InputError: the folder is in use, the target is neither or not finished, or a file has no scene.
     """
-    refuse_used(str(to))
+    refuse_used(str(to), ELSEWHERE)
     run, settings = opened(target, overrides, plugins)
     with claimed_anew(to):
         warm(run, settings)
@@ -103,7 +104,7 @@ def claimed_anew(to: Path) -> Iterator[None]:
     to.mkdir(parents=True, exist_ok=True)
     try:
         with claimed(to):
-            refuse_used(str(to))
+            refuse_used(str(to), ELSEWHERE)
             yield
     finally:
         if not there and not any(path.name != LOCK for path in to.iterdir()):

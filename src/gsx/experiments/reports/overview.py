@@ -8,14 +8,13 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import csv_text, remove_partial, replace_text
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
-from gsx.experiments.reports.page import template
+from gsx.experiments.reports.page import address, template
 from gsx.experiments.reports.same_scene import told_apart
 from gsx.experiments.reports.side_by_side import pictures_of
 from gsx.experiments.run_folder.files import (
@@ -133,7 +132,7 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
     report = run.folder / "report.html"
     return {
         "run": place(run.folder, folder),
-        "link": quote(place(report, folder)) if report.is_file() else "",
+        "link": address(place(report, folder)) if report.is_file() else "",
         "state": state,
         "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values()) if word)),
         "scene": run.scene,

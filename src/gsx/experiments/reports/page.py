@@ -1,8 +1,10 @@
 """What the HTML pages share: templates of this package, and numbers as words."""
 
+import os
 from functools import cache
 from importlib.resources import files
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
 
@@ -41,6 +43,11 @@ def time_unit(seconds: float) -> tuple[str, int]:
     return ("hours", 3600) if seconds > 7200 else ("minutes", 60) if seconds > 180 else ("seconds", 1)
 
 
+def address(path: str) -> str:
+    """A path as the address of a link, whatever its bytes."""
+    return quote(os.fsencode(path))
+
+
 @cache
 def template(name: str) -> jinja2.Template:
     """A template below `experiments`: what is not marked as safe is escaped, missing figures show as n/a."""
@@ -51,5 +58,11 @@ def template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"fixed": fixed, "signed": signed, "duration": duration, "compact": compact}
+    environment.filters |= {
+        "address": address,
+        "fixed": fixed,
+        "signed": signed,
+        "duration": duration,
+        "compact": compact,
+    }
     return environment.get_template(name)

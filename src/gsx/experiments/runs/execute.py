@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from gsx.core.cache import cache_root, trim
-from gsx.core.errors import LostModel, TrainingError, first_line
+from gsx.core.errors import CompilerError, LostModel, TrainingError, first_line
 from gsx.core.files import remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
@@ -59,7 +59,6 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     trackers = build_trackers(settings.trackers)
     remove_partial(cache_root())
     announce(run, plugins)
-    warm(run, settings)
     status(run, "running")
     log = MetricsLog(settings.evaluation)
     listeners: list[object] = [
@@ -75,6 +74,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         general = settings.general
         listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
     try:
+        warm(run, settings)
         with (
             viewed(run, settings) as viewers,
             plugins.listening([*listeners, *viewers]),
@@ -121,9 +121,10 @@ def keep_what_there_is(run: Run, error: BaseException) -> None:
     What cannot be written now is told in the log; the error itself is what matters.
     """
     kept = run.step in map(checkpoint.step_of, checkpoint.sidecars(run.folder / "checkpoints"))
+    nothing = run.step == 0 and not isinstance(error, KeyboardInterrupt | CompilerError)  # who says how to go on
     reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
     with told_of(f"the checkpoint of step {run.step}"):
-        if not (kept or run.changing or run.step == 0 or isinstance(error, LostModel)):
+        if not (kept or nothing or run.changing or isinstance(error, LostModel)):
             checkpoint.save(run)
     with told_of("its status"):
         status(run, "failed", reason)

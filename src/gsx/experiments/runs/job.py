@@ -50,7 +50,8 @@ def interruptible(run: "Run", onwards: str) -> Iterator[object]:
     """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
 
     The signals by which a cluster takes a machine back (STOPPING) end training, too; they may come again until the
-    checkpoint is written. Then the first is sent again, to whoever waited for it before; the log says how to go `onwards`.
+    checkpoint is written. Then the first is sent again, to whoever waited for it before; the log says how to go
+    `onwards`.
 
     Yields a listener that takes the handlers away when training is over. Threads but the main one hear no signals.
     """

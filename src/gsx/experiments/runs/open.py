@@ -48,13 +48,14 @@ OF_TRAINING = ("iterations", "length", "seed", "init", "reuse", "warm_start_at",
 """How long a run is trained, from what, and where it goes: nothing of what it shows once it is there."""
 
 
-def refuse_used(folder: str) -> None:
-    """Raise InputError if the run folder asked for exists and holds something."""
+def refuse_used(folder: str, remedy: str = "") -> None:
+    """Raise InputError if the run folder asked for exists and holds something; `remedy`: of what does not train."""
     path = Path(folder)
     if folder and path.exists() and not path.is_dir():
         raise InputError(f"'{folder}' is a file, no folder for a run: choose another place")
     if folder and path.exists() and any(one.name != LOCK for one in path.iterdir()):
-        raise InputError(f"folder={folder} is not empty: choose another, or go on with `{command('resume', folder)}`")
+        remedy = remedy or f"choose another, or go on with `{command('resume', folder)}`"
+        raise InputError(f"'{folder}' is not empty: {remedy}")
 
 
 def new_folder(settings: Settings, scene: Scene) -> Path:

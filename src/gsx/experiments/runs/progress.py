@@ -1,6 +1,7 @@
 """Progress for people and files: one live line on a terminal, plain lines elsewhere, metrics.jsonl."""
 
 import json
+import os
 import sys
 import time
 from contextlib import suppress
@@ -46,10 +47,18 @@ class Line:
     def show(self, text: str) -> None:
         """Write over the last line on a terminal, below it elsewhere."""
         end, start = ("", "\r") if self.live else ("\n", "")
+        text = text[: self.room()]
         with suppress(OSError):  # its terminal was closed
             self.stream.write(start + text.ljust(self.width if self.live else 0) + end)
             self.stream.flush()
         self.width = len(text)
+
+    def room(self) -> int | None:
+        """Letters that a terminal has for it, since what wraps is not written over; None where there is no end."""
+        with suppress(OSError, ValueError):  # no terminal
+            columns = os.get_terminal_size(self.stream.fileno()).columns
+            return columns - 1 if columns > 1 else None
+        return None
 
     def end(self) -> None:
         """Leave the last line standing."""
@@ -117,11 +126,11 @@ class Progress:
     def line(self, run: Run) -> str:
         """The line as shown."""
         a, primitives, memory = self.averages, len(run.backbone.table), peak_memory_mb(run.device)
-        megabytes = "" if memory is None else f"{memory:,.0f} MB  "
+        megabytes = "" if memory is None else f"  {memory:,.0f} MB"
         return (
-            f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  loss {a['loss']:.4f}  "
-            f"PSNR {a['psnr']:.2f}  {primitives:,} splats  {megabytes}"
-            f"ETA {clock((run.iterations - run.step) / a['speed'])}"
+            f"step {run.step}/{run.iterations}  {a['speed']:.1f} it/s  "
+            f"ETA {clock((run.iterations - run.step) / a['speed'])}  "
+            f"loss {a['loss']:.4f}  PSNR {a['psnr']:.2f}  {primitives:,} splats{megabytes}"
         )
 
 

@@ -82,18 +82,30 @@ def warm(run: Run, settings: Settings, helped: bool = True) -> None:
     if compiles(run.raster, run.device.type):
         logger.info("compiling the rasterizer once; later runs find it on disk ...")
         learnt = Learnt(sh_degree=sh_degree(settings), absolute_gradient=run.backbone.absolute_gradient)
-        logger.info("compiled in %.0f s", compile_now(run.raster, learnt, run.device, helped))
+        seconds = compile_now(run.raster, learnt, run.device, helped, lambda: run.stopping)
+        if not run.stopping:
+            logger.info("compiled in %.0f s", seconds)
 
 
-def compile_now(settings: RasterSettings, learnt: Learnt, device: torch.device, helped: bool = False) -> float:
-    """Learn from a small picture, so that all loops get compiled, unless all are kept; returns the seconds it took."""
+def compile_now(
+    settings: RasterSettings,
+    learnt: Learnt,
+    device: torch.device,
+    helped: bool = False,
+    stopping: Callable[[], bool] = lambda: False,
+) -> float:
+    """Learn from a small picture, so that all loops get compiled, unless all are kept or it is to stop; returns the
+    seconds it took."""
     begun = time.perf_counter()
     calls = needed(settings, learnt, device)
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
         with helper(settings, learnt.sh_degree) if helped else nullcontext():
             common = set(map(file_of, of_any_backbone(calls, settings, learnt)))
-            make_ahead(sorted(calls, key=lambda call: file_of(call) in common))  # first what nobody helps with
-            learn_little(settings, learnt, device)
+            make_ahead(
+                sorted(calls, key=lambda call: file_of(call) in common), stopping
+            )  # first what nobody helps with
+            if not stopping():
+                learn_little(settings, learnt, device)
     return time.perf_counter() - begun
 
 
@@ -142,6 +154,7 @@ def begun(settings: RasterSettings, sh_degree: int) -> subprocess.Popen[bytes] |
             stdin=subprocess.PIPE,  # by its end the process knows that this one is gone
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            start_new_session=True,  # a Ctrl-C is for this one, which ends the other
         )
     except OSError as error:
         logger.info("this process compiles alone (%s)", first_line(error))
