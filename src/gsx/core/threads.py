@@ -58,14 +58,14 @@ def watch(ended: threading.Event) -> None:
             now, looked = times(), time.perf_counter()
             threads = waiting(before, now) / (looked - begun)
             before, begun = now, looked
-            if not scarce and threads > MANY:
-                if not told:
-                    logger.info("cores are shared with others: this takes longer")
+            was, scarce = scarce, threads > (FEW if scarce else MANY)
+            if scarce and not told:
+                logger.info("cores are shared with others: this takes longer")
                 told = True
+            if scarce and not was:
                 stack.enter_context(idle_threads())
-            elif scarce and threads < FEW:
+            elif was and not scarce:
                 stack.close()
-            scarce = threads > (FEW if scarce else MANY)
 
 
 def times() -> Times:

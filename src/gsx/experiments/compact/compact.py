@@ -51,6 +51,7 @@ FILE_STEPS = 2000
 SHARE = 0.1
 """Of a run's steps that are taken to learn on, where nothing is said."""
 ELSEWHERE = "give another with --to FOLDER"
+"""What to do about a folder in use."""
 NAME, COMPARED = "compact.json", "compared"
 """What was tried; folder of the page with the model before and after."""
 
