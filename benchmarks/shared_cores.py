@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from measuring.machine import ROOT, describe_machine, shown_command, told_load
-from measuring.results import read_sections, stamped, text_table, write_results
+from measuring.results import ratios_told, read_sections, stamped, text_table, write_results
 from measuring.revisions import checked_out
 from measuring.runs import train
 
@@ -83,13 +83,11 @@ def measured(sources: Mapping[str, Path], rounds: int) -> dict[str, dict[str, li
 
 def row_of(beside: str, times: Mapping[str, Sequence[float]]) -> dict[str, Any]:
     """Medians over rounds, and the ratio, which holds within a round."""
-    ratios = [before / now for before, now in zip(times["before"], times["now"], strict=True)]
-    told = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
     medians = {which: round(statistics.median(taken), 1) for which, taken in times.items()}
     return {
         "beside": beside,
         **medians,
-        "ratio": told,
+        "ratio": ratios_told(times["before"], times["now"]),
         "rounds": {which: list(taken) for which, taken in times.items()},
     }
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, read_sections, stamped, text_table, write_results
+from measuring.results import Section, ratios_told, read_sections, stamped, text_table, write_results
 from measuring.runs import gsx
 
 RESULTS = Path(__file__).parent / "results"
@@ -57,10 +57,8 @@ def section(times: Mapping[str, Sequence[float]], load: float, command: str) -> 
     alone = next(iter(times.values()))
     rows: list[dict[str, Any]] = []
     for way, taken in times.items():
-        ratios = [before / now for before, now in zip(alone, taken, strict=True)]
-        told = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
         row = {"way": way, "seconds": f"{statistics.median(taken):.1f}", "rounds": list(taken)}
-        rows.append(row | ({} if taken is alone else {"ratio": told}))
+        rows.append(row | ({} if taken is alone else {"ratio": ratios_told(alone, taken)}))
     columns = [["way", "way"], ["seconds", "seconds"], ["ratio", "times as fast"]]
     note = f"`gsx -m {' '.join(SWEEP)}`, medians of {len(alone)} rounds."
     return stamped(f"{RUNS} runs", columns, rows, [note], load, command)

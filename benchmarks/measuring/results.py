@@ -2,6 +2,7 @@
 
 import html
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -31,6 +32,12 @@ def stamped(
     when = datetime.now().strftime("%Y-%m-%d %H:%M")
     table = {"title": title, "columns": columns, "rows": rows, "notes": notes}
     return table | {"date": when, "commit": commit(), "load": load, "command": command}
+
+
+def ratios_told(before: Sequence[float], now: Sequence[float]) -> str:
+    """The median of ratios that each hold within a round, and between which they lie."""
+    ratios = [old / new for old, new in zip(before, now, strict=True)]
+    return f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
 
 
 def cell(value: Any) -> str:

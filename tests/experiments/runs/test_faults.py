@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -72,17 +73,32 @@ def at_call(number: int, function: Callable[..., Any], error: BaseException) -> 
     return failing
 
 
-@pytest.mark.parametrize("error", [torch.OutOfMemoryError("none"), KeyboardInterrupt(), OSError(5, "unreadable")])
+@pytest.mark.parametrize(
+    ("module", "name", "call", "error"),
+    [
+        (trainer, "photometric", 6, torch.OutOfMemoryError("none")),
+        (trainer, "photometric", 6, KeyboardInterrupt()),
+        (trainer, "photometric", 6, OSError(5, "unreadable")),
+        (execution, "warm", 1, KeyboardInterrupt()),  # while code is compiled: before the first step
+        (execution, "warm", 1, CompilerError("blend cannot be compiled")),
+    ],
+)
 def test_an_error_within_a_step_keeps_the_step_before(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    tmp_path: Path,
+    whole: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: ModuleType,
+    name: str,
+    call: int,
+    error: BaseException,
 ) -> None:
-    photometric = trainer.photometric
-    monkeypatch.setattr(trainer, "photometric", at_call(6, photometric, error))
-    with pytest.raises(type(error)):
-        tiny_run(tmp_path / "run", SHORT)
-    monkeypatch.setattr(trainer, "photometric", photometric)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, at_call(call, getattr(module, name), error))
+        with pytest.raises(type(error)):
+            tiny_run(tmp_path / "run", SHORT)
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
-    assert [path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.json")] == ["step_0000005"]
+    kept = [path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.json")]
+    assert kept == [f"step_{call - 1:07d}"]
     assert_ends_as(tmp_path / "run", whole)
 
 
@@ -93,19 +109,6 @@ def test_an_error_between_steps_keeps_the_last_one(tmp_path: Path, whole: Path) 
         execute(run, settings, loaded)
     assert [path.stem for path in (run.folder / "checkpoints").glob("*.json")] == ["step_0000005"]
     assert_ends_as(run.folder, whole)
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), CompilerError("blend cannot be compiled")])
-def test_what_ends_while_code_is_made_can_be_gone_on_with(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    warm = execution.warm
-    monkeypatch.setattr(execution, "warm", at_call(1, warm, error))
-    with pytest.raises(type(error)):
-        tiny_run(tmp_path / "run", SHORT)
-    monkeypatch.setattr(execution, "warm", warm)
-    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
-    assert_ends_as(tmp_path / "run", whole)
 
 
 def test_half_a_step_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,9 +101,8 @@ def compile_now(
     if lacking(calls):  # on a GPU there are no calls: all has been compiled by now
         with helper(settings, learnt.sh_degree) if helped else nullcontext():
             common = set(map(file_of, of_any_backbone(calls, settings, learnt)))
-            make_ahead(
-                sorted(calls, key=lambda call: file_of(call) in common), stopping
-            )  # first what nobody helps with
+            own_first = sorted(calls, key=lambda call: file_of(call) in common)  # what nobody helps with
+            make_ahead(own_first, stopping)
             if not stopping():
                 learn_little(settings, learnt, device)
     return time.perf_counter() - begun
