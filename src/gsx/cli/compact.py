@@ -5,6 +5,7 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_taken, whole
+from gsx.core.collector import loading
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
 
@@ -34,7 +35,8 @@ def verb_compact(arguments: list[str]) -> int:
     refuse_taken("gsx compact", given.overrides, dict.fromkeys(PLACES, "--to FOLDER says where the smaller run goes"))
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
-    from gsx.experiments.compact.compact import compact
+    with loading():
+        from gsx.experiments.compact.compact import compact
 
     target = given.target.resolve()
     to = given.to or target.with_name(f"{target.name.split('.')[0] if target.is_file() else target.name}_compact")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, new_folder
+from gsx.core.collector import loading
 from gsx.core.errors import InputError, nearest
 
 
@@ -14,7 +15,8 @@ def verb_report(arguments: list[str]) -> int:
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
     given = parser.parse_args(arguments)
-    from gsx.experiments.reports.report import report_on
+    with loading():
+        from gsx.experiments.reports.report import report_on
 
     if given.to and given.to.exists():
         new_folder(given.to)  # or it is a file
@@ -35,7 +37,8 @@ def verb_scenes(arguments: list[str]) -> int:
         help="find the poses of photographs that have none, which takes minutes, and judge the coverage",
     )
     given = parser.parse_args(arguments)
-    from gsx.experiments.runs.inspect import describe
+    with loading():
+        from gsx.experiments.runs.inspect import describe
 
     lines = describe(given.path, plugins(), given.poses)
     sys.stdout.write("\n".join(lines) + "\n")
@@ -51,8 +54,9 @@ def verb_datasets(arguments: list[str]) -> int:
     )
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
     arguments = parser.parse_args(arguments).words
-    from gsx.experiments.runs.compose import Compositions
-    from gsx.experiments.tables.datasets import described
+    with loading():
+        from gsx.experiments.runs.compose import Compositions
+        from gsx.experiments.tables.datasets import described
 
     overrides = [word for word in arguments if "=" in word]
     with Compositions(plugins()) as compositions:
@@ -76,7 +80,8 @@ def verb_explain(arguments: list[str]) -> int:
     parser.add_argument("key", metavar="KEY", help="for example training.supersample, backbone, backbone=scaffold")
     parser.add_overrides("in this composition instead of the default")
     given = parser.parse_args(arguments)
-    from gsx.experiments.runs.explain import explain
+    with loading():
+        from gsx.experiments.runs.explain import explain
 
     sys.stdout.write("\n".join(explain(given.key, given.overrides, plugins())) + "\n")
     return 0
@@ -87,9 +92,10 @@ def verb_plugins(arguments: list[str]) -> int:
     Parser(prog="gsx plugins", description="What is installed, from where, and what failed to load.").parse_args(
         arguments
     )
-    from gsx.core.plugins import KINDS
+    with loading():
+        from gsx.core.plugins import KINDS
 
-    loaded = plugins()
+        loaded = plugins()
     for kind in KINDS:
         parts = [f"{name} ({loaded.registry.find(kind, name).provider})" for name in loaded.registry.names(kind)]
         sys.stdout.write(f"{kind + ':':13} {', '.join(parts) or '-'}\n")

@@ -9,6 +9,7 @@ from pathlib import Path
 from gsx.builtin import plugins
 from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
+from gsx.core.collector import loading
 from gsx.core.errors import InputError
 from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.ranges import Range
@@ -29,7 +30,8 @@ def verb_eval(arguments: list[str]) -> int:
     folder, overrides = run_arguments("eval", arguments, told)
     if suffix_of(folder) and not folder.is_dir():
         return evaluate_file(folder, overrides)
-    from gsx.experiments.runs.again import evaluate_again
+    with loading():
+        from gsx.experiments.runs.again import evaluate_again
 
     evaluate_again(folder, plugins(), overrides)
     sys.stdout.write(f"{folder / 'report.html'}\n")
@@ -38,8 +40,9 @@ def verb_eval(arguments: list[str]) -> int:
 
 def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
     """gsx eval FILE scene=... [KEY=VALUE ...]"""
-    from gsx.experiments.runs.compose import compose
-    from gsx.experiments.runs.start_file import composition_of
+    with loading():
+        from gsx.experiments.runs.compose import compose
+        from gsx.experiments.runs.start_file import composition_of
 
     folders: list[Path] = []
     code = train(compose(composition_of(path, overrides), loaded := plugins()), loaded, folders)
@@ -59,7 +62,8 @@ def verb_photographs(arguments: list[str]) -> int:
     if not arguments and Path("photographs").is_dir():
         raise InputError("gsx photographs RUN judges a run's photographs: to train from that folder, gsx ./photographs")
     given = parser.parse_intermixed_args(arguments)
-    from gsx.experiments.runs.photographs import judge_photographs, lines
+    with loading():
+        from gsx.experiments.runs.photographs import judge_photographs, lines
 
     findings = judge_photographs(given.run, plugins(), given.worst, given.overrides)
     for line in lines(findings, given.worst):
@@ -95,10 +99,17 @@ def verb_render(arguments: list[str]) -> int:
 
 def rendered(given: argparse.Namespace) -> Path:
     """Carry out `gsx render`; returns the file or folder written."""
-    from gsx.core.files import remove_partial
-    from gsx.experiments.runs.open import open_run
-    from gsx.experiments.runs.render import file_pictures, render_orbit, render_path, render_test_views, run_pictures
-    from gsx.experiments.viewer.camera_path import read_camera_path
+    with loading():
+        from gsx.core.files import remove_partial
+        from gsx.experiments.runs.open import open_run
+        from gsx.experiments.runs.render import (
+            file_pictures,
+            render_orbit,
+            render_path,
+            render_test_views,
+            run_pictures,
+        )
+        from gsx.experiments.viewer.camera_path import read_camera_path
 
     way = read_camera_path(given.path) if given.path else None
     if given.target.is_file():
@@ -128,7 +139,8 @@ def verb_view(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
-    from gsx.experiments.runs.view import view_file, view_run
+    with loading():
+        from gsx.experiments.runs.view import view_file, view_run
 
     def announce(address: str) -> None:
         logger.info("Ctrl-C ends it")
@@ -166,11 +178,12 @@ def verb_export(arguments: list[str]) -> int:
     parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
     given = parser.parse_args(arguments)
-    from gsx.core.files import remove_partial
-    from gsx.experiments.reports.report import write_report
-    from gsx.experiments.runs.export import export, is_page, losses, refuse_export
-    from gsx.experiments.runs.open import open_run
-    from gsx.experiments.runs.render import view_named
+    with loading():
+        from gsx.core.files import remove_partial
+        from gsx.experiments.reports.report import write_report
+        from gsx.experiments.runs.export import export, is_page, losses, refuse_export
+        from gsx.experiments.runs.open import open_run
+        from gsx.experiments.runs.render import view_named
 
     if given.file:
         refuse_export(given.file)

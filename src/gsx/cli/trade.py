@@ -18,6 +18,7 @@ from gsx.cli.arguments import (
     refuse_taken,
     whole,
 )
+from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.ranges import Range
 
@@ -111,14 +112,15 @@ def verb_trade(arguments: list[str]) -> int:
 def trade_training(arguments: list[str]) -> int:
     """gsx trade training [KEY=VALUE ...] ..."""
     given = training_arguments(arguments)
-    from gsx.experiments.runs.build import choose_device
-    from gsx.experiments.runs.compose import Compositions
-    from gsx.experiments.runs.job import train
-    from gsx.experiments.trade.machine import machine
-    from gsx.experiments.trade.training.measure import Trial, known, measured
-    from gsx.experiments.trade.training.page import write_trade
-    from gsx.experiments.trade.training.settings import settings_of
-    from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, table
+    with loading():
+        from gsx.experiments.runs.build import choose_device
+        from gsx.experiments.runs.compose import Compositions
+        from gsx.experiments.runs.job import train
+        from gsx.experiments.trade.machine import machine
+        from gsx.experiments.trade.training.measure import Trial, known, measured
+        from gsx.experiments.trade.training.page import write_trade
+        from gsx.experiments.trade.training.settings import settings_of
+        from gsx.experiments.trade.training.wishes import Wish, advice, advice_lines, table
 
     loaded, wanted = plugins(), given.trades.split(",") if given.trades is not None else []
     with Compositions(loaded) as compositions:
@@ -145,11 +147,12 @@ def trade_training(arguments: list[str]) -> int:
 def trade_rasterizer(arguments: list[str]) -> int:
     """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
     given = trade_arguments(arguments)
-    from gsx.experiments.trade.rasterizer.advice import advice_lines, table
-    from gsx.experiments.trade.rasterizer.knobs import check_knobs
-    from gsx.experiments.trade.rasterizer.measure import sweep, usable_paths
-    from gsx.experiments.trade.rasterizer.page import write_trade
-    from gsx.experiments.trade.rasterizer.subject import open_subject
+    with loading():
+        from gsx.experiments.trade.rasterizer.advice import advice_lines, table
+        from gsx.experiments.trade.rasterizer.knobs import check_knobs
+        from gsx.experiments.trade.rasterizer.measure import sweep, usable_paths
+        from gsx.experiments.trade.rasterizer.page import write_trade
+        from gsx.experiments.trade.rasterizer.subject import open_subject
 
     knobs, loaded = check_knobs(given.knobs), plugins()
     views, combinations = (2, 4) if given.target else (1, 1)

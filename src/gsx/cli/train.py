@@ -11,7 +11,7 @@ from typing import Any
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
-from gsx.core.collector import collecting_nothing
+from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.core.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
@@ -43,7 +43,7 @@ def verb_train(arguments: list[str]) -> int:
             raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
     if flags:
         return hand_to_hydra(arguments)
-    with collecting_nothing():
+    with loading():
         from gsx.experiments.runs.compose import compose
         from gsx.experiments.tables.sweep import is_table
 
@@ -76,9 +76,10 @@ def fill_table(arguments: list[str]) -> int:
 
 def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
-    from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
-    from gsx.experiments.runs.launched import waiting_for_all
-    from gsx.experiments.tables.sweep import is_table
+    with loading():
+        from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
+        from gsx.experiments.runs.launched import waiting_for_all
+        from gsx.experiments.tables.sweep import is_table
 
     if is_table(arguments) and {"-m", "--multirun"} & set(arguments):
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
@@ -181,12 +182,13 @@ def verb_resume(arguments: list[str]) -> int:
     )
     words = [word for word in arguments if word not in RESUME_FLAGS]
     folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
-    from gsx.core.cache import in_use
-    from gsx.experiments.run_folder.claims import claimed
-    from gsx.experiments.run_folder.files import read_run, reported, state_of
-    from gsx.experiments.runs.history import go_on
-    from gsx.experiments.runs.open import open_run, refuse_other
-    from gsx.experiments.runs.settings import write_config
+    with loading():
+        from gsx.core.cache import in_use
+        from gsx.experiments.run_folder.claims import claimed
+        from gsx.experiments.run_folder.files import read_run, reported, state_of
+        from gsx.experiments.runs.history import go_on
+        from gsx.experiments.runs.open import open_run, refuse_other
+        from gsx.experiments.runs.settings import write_config
 
     loaded = plugins()
     refuse_other(folder)

@@ -1,6 +1,7 @@
 """Python's collector of reference cycles, where it costs and finds next to nothing."""
 
 import gc
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,3 +17,15 @@ def collecting_nothing() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """`collecting_nothing` while a program imports torch and all else: its objects stay, and are never walked through
+    again, of which half comes where Python ends. Where torch is there already there are other objects, too, which are
+    to be collected: then nothing more."""
+    first = "torch" not in sys.modules
+    with collecting_nothing():
+        yield
+        if first:
+            gc.freeze()
