@@ -22,6 +22,7 @@ from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
+from gsx.core.rasterizer.sorting import sorted_stably
 from gsx.core.shapes import Float, Int
 
 WINDOW_REACH = 1.25
@@ -110,7 +111,7 @@ def intersect_tiles(
     grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings)
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
-    order = torch.argsort(bits, stable=True)
+    order = sorted_stably(bits)[1]
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
     heights, placed, sides = in_order(order, found.first, found.last, *shapes)
     starts = heights.cumsum(0) - heights  # apart: compiled, a long running sum is one of a single group of threads
@@ -185,7 +186,7 @@ def sorted_pairs(
     tiles = pair_tiles(line, row, begin, widths.cumsum(0, dtype=torch.int32) - widths, columns)
     if needed is not None:
         tiles = torch.where(torch.arange(len(tiles), device=tiles.device) < needed[1], tiles, columns * rows)
-    tiles, slots = torch.sort(tiles.to(narrow), stable=True)
+    tiles, slots = sorted_stably(tiles.to(narrow))
     splats = order.int().index_select(0, rank).index_select(0, line).index_select(0, slots)
     if needed is not None:
         splats = torch.where(tiles < columns * rows, splats, len(order))
