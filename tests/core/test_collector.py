@@ -1,6 +1,7 @@
 """The collector of cycles is off while a program starts."""
 
 import gc
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -33,3 +34,10 @@ def test_what_a_program_loads_is_never_walked_through_but_nothing_that_is_made_l
     with loading():
         pass
     assert kept == [False], "before the collector may walk once"
+
+
+def test_what_complains_of_objects_that_stay_is_imported_where_it_is_used() -> None:
+    sources = list((Path(__file__).parents[2] / "src" / "gsx").rglob("*.py"))
+    lines = [line for source in sources for line in source.read_text().splitlines() if "import OpenImageIO" in line]
+    assert lines
+    assert all(line.startswith("    ") for line in lines)

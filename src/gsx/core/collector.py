@@ -23,7 +23,10 @@ def collecting_nothing() -> Iterator[None]:
 def loading() -> Iterator[None]:
     """`collecting_nothing` while a program imports torch and all else: its objects stay, and are never walked through
     again, of which half comes where Python ends. Where torch is there already there are other objects, too, which are
-    to be collected: then nothing more."""
+    to be collected: then nothing more.
+
+    OpenImageIO must come later: its binding complains of objects that are still there in the end.
+    """
     first = "torch" not in sys.modules
     with collecting_nothing():
         yield
