@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.experiments.evaluation.evaluator import EvalOptions
-from gsx.experiments.runs.compose import Compositions, compose
+from gsx.experiments.runs.compose import Compositions, compose, compose_raw
 from gsx.experiments.runs.settings import Settings, read_config, typed, write_config
 from gsx.scenes.options import SceneOptions
 
@@ -61,6 +61,21 @@ def test_every_file_of_what_is_chosen_apart_composes_and_fits_its_schema() -> No
                 asked.count("augmenter"),
                 asked.count("tracker"),
             )
+
+
+def test_what_is_asked_of_one_composition_is_composed_once_and_nobody_changes_it(monkeypatch) -> None:
+    words, asked = ["backbone=mip_splatting", "iterations=100"], list[tuple[str, ...]]()
+    own = compose(words, plugins()).resolved
+    place = "gsx.experiments.runs.compose.compose_raw"
+    monkeypatch.setattr(place, lambda words: asked.append(words) or compose_raw(words))
+    with Compositions(plugins()) as compositions:
+        first = compositions.settings(words)
+        compositions.node(words, "training")["batch"] = 7
+        first.resolved["training"]["batch"] = 7
+        assert compositions.value(words, "training.batch") == 1
+        assert compositions.settings(words).resolved == own
+        assert compositions.value([*words, "training.batch=2"], "training.batch") == 2
+    assert asked == [tuple(words), (*words, "training.batch=2")]
 
 
 def test_presets_win_over_the_scene_and_the_command_line_over_presets() -> None:

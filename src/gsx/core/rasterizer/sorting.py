@@ -6,8 +6,8 @@ from torch import Tensor
 from gsx.core.shapes import Int
 
 BY_DIGITS = 1 << 15
-"""Numbers from which torch sorts by their digits on a CPU: five times as fast as the comparisons by which it sorts fewer
-(ATen, native/cpu/SortingKernel.cpp; its grain size)."""
+"""Keys from which torch sorts by their digits on a CPU, in a fifth of the time that comparing them takes, as it does
+with fewer (ATen, native/cpu/SortingKernel.cpp; its grain size)."""
 WORTH_FILLING = BY_DIGITS // 5
 """From here on fewer are sooner sorted with as many more."""
 

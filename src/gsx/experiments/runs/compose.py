@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 from itertools import islice
 from pathlib import Path
@@ -31,6 +32,8 @@ LAUNCHERS = {
     "submitit_local": ("hydra-submitit-launcher", "slurm"),
 }
 """Package and extra of each launcher beside Hydra's own."""
+MOST_KEPT = 16
+"""Compositions of a session, a MB each, that are there when they are asked for again."""
 
 
 @contextmanager
@@ -63,6 +66,7 @@ class Compositions:
 
     def __init__(self, plugins: Plugins) -> None:
         self.plugins, self.session = plugins, hydra_session(plugins)
+        self.lately = lru_cache(MOST_KEPT)(compose_raw)
 
     def __enter__(self) -> "Compositions":
         self.session.__enter__()
@@ -71,22 +75,26 @@ class Compositions:
     def __exit__(self, *error: Any) -> None:
         self.session.__exit__(*error)
 
+    def composed(self, overrides: Sequence[str]) -> DictConfig:
+        """What `compose_raw` makes, once of overrides that are asked for several times; it is not to be changed."""
+        return self.lately(tuple(overrides))
+
     def settings(self, overrides: Sequence[str]) -> Settings:
         """One composition, checked; see `compose`."""
-        return settings_from(compose_raw(overrides), self.plugins)
+        return settings_from(self.composed(overrides), self.plugins)
 
     def node(self, overrides: Sequence[str], key: str) -> dict[str, Any]:
         """One node of a composition as plain values, unchecked; empty where there is none."""
-        found = OmegaConf.select(compose_raw(overrides), key)
+        found = OmegaConf.select(self.composed(overrides), key)
         return OmegaConf.to_container(found, resolve=True) if isinstance(found, DictConfig) else {}  # type: ignore
 
     def keys(self, overrides: Sequence[str]) -> list[str]:
         """Dotted keys of a composition."""
-        return list(dotted(OmegaConf.to_container(compose_raw(overrides), resolve=False)))
+        return list(dotted(OmegaConf.to_container(self.composed(overrides), resolve=False)))
 
     def value(self, overrides: Sequence[str], key: str) -> Any:
         """One value of a composition."""
-        return OmegaConf.select(compose_raw(overrides), key)
+        return OmegaConf.select(self.composed(overrides), key)
 
     def choices(self, group: str) -> list[str]:
         """Options of a group."""
@@ -94,7 +102,7 @@ class Compositions:
 
     def values(self, overrides: Sequence[str]) -> Any:
         """A whole composition as plain values, unchecked."""
-        return OmegaConf.to_container(compose_raw(overrides), resolve=True)
+        return OmegaConf.to_container(self.composed(overrides), resolve=True)
 
     def groups(self) -> list[str]:
         """Configuration groups, nested ones included."""
