@@ -6,7 +6,7 @@ launch, though it may be several.
 
     python tests/stand_in_gpu.py CASE [/ CASE]...   # steps on the CPU, then there: losses and counts of each case
 
-A CASE is [--recorded|--broken] [--sizes] OVERRIDES; --sizes: photographs are of three.
+A CASE is [--recorded|--broken|--second-broken] [--sizes] OVERRIDES; --sizes: photographs are of three.
 """
 
 import json
@@ -46,9 +46,9 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
         "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "narrow", "diagonal",
         "_local_scalar_dense"}  # fmt: skip
 """Operations that launch nothing."""
-STEPS, RECORDED, BROKEN = 4, 15, 5
-"""Steps taken; steps where some are recorded: density control changes the model at the 12th of them; and where none
-can be."""
+STEPS, RECORDED, SIZES, BROKEN = 4, 15, 9, 5
+"""Steps taken; steps where some are recorded: density control changes the model at the 6th and 12th of them; where
+photographs are of three sizes; and where none can be."""
 ROOM = ListSizes(rows=1 << 12, pairs=1 << 14, blocks=1 << 12, longest=1 << 8)
 """More than any list of the tiny scene needs."""
 
@@ -65,6 +65,8 @@ class Tally:
     """Recordings that did."""
     made: int = 0
     """Recordings."""
+    replayed: int = 0
+    """How often."""
     recording: bool = False
     """A graph is recorded or replayed: the host has no part in it."""
 
@@ -290,6 +292,7 @@ class Again:
         return [*(value.detach() for value in shown), *(value.grad for value in moved), *found.values()]
 
     def replay(self) -> None:
+        self.tally.replayed += 1
         assert self.reads() == self.read, "a graph is replayed on a table that it was not recorded with"
         zero_grad(self.table)
         places = self.tensors(self.made, self.gradients)
@@ -298,11 +301,12 @@ class Again:
                 place.copy_(value)
 
 
-def recording(run: Run, tally: Tally, broken: bool, roomy: bool) -> Recorder:
-    """A recorder whose graphs are no graphs, or cannot be made; `roomy`: it need not find how much room lists need."""
+def recording(run: Run, tally: Tally, most: int | None, roomy: bool) -> Recorder:
+    """A recorder whose graphs are no graphs, of which `most` can be made; `roomy`: it need not find how much room lists
+    need."""
 
     def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
-        if broken:
+        if tally.made == most:
             work()
             tally.failed += 1
             raise RuntimeError("operation not permitted when stream is capturing")
@@ -326,17 +330,17 @@ def steps(
     count: int = STEPS,
     begun: Callable[[], None] = lambda: None,
     recorded: Tally | None = None,
-    broken: bool = False,
+    most: int | None = None,
     sizes: bool = False,
 ) -> list[Tensor]:
     """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
-    be recorded; `broken`: which fails; `sizes`: of photographs of three sizes."""
+    be recorded; `most`: which fails after so many; `sizes`: of photographs of three sizes."""
     loaded, losses = plugins(), list[Tensor]()
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
         scene = load_scene(settings)
         run = build.build(settings, in_three_sizes(scene) if sizes else scene, Path(folder), training=True)
-        run.recorder = recording(run, recorded, broken, roomy=sizes) if recorded else None
+        run.recorder = recording(run, recorded, most, roomy=sizes) if recorded else None
         with loaded.listening([Guard()]):
             for _ in range(count):
                 begun()
@@ -350,7 +354,8 @@ class Case:
 
     words: list[str]
     recorded: bool
-    broken: bool
+    most: int | None
+    """Kinds of steps that can be recorded; None: all."""
     sizes: bool
 
     @classmethod
@@ -359,15 +364,15 @@ class Case:
         flags = {word for word in words if word.startswith("--")}
         return cls(
             [word for word in words if word not in flags],
-            recorded=bool(flags & {"--recorded", "--broken"}),
-            broken="--broken" in flags,
+            recorded=bool(flags & {"--recorded", "--broken", "--second-broken"}),
+            most=0 if "--broken" in flags else 1 if "--second-broken" in flags else None,
             sizes="--sizes" in flags,
         )
 
     @property
     def count(self) -> int:
         """Steps."""
-        return BROKEN if self.broken else RECORDED if self.recorded else STEPS
+        return BROKEN if self.most == 0 else SIZES if self.sizes else RECORDED if self.recorded else STEPS
 
     def on_cpu(self) -> list[Tensor]:
         """Losses there."""
@@ -376,10 +381,10 @@ class Case:
     def on_device(self, tally: Tally, own: list[Tensor]) -> dict[str, Any]:
         """Losses of all kinds, and counts of the last step."""
         words = [*self.words, "rasterizer=compiled"]
-        recorded, tally.failed, tally.made = tally if self.recorded else None, 0, 0
-        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.broken, self.sizes)}
+        recorded, tally.failed, tally.made, tally.replayed = tally if self.recorded else None, 0, 0, 0
+        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.most, self.sizes)}
         counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy()}
-        counts |= {"failed": tally.failed, "made": tally.made}
+        counts |= {"failed": tally.failed, "made": tally.made, "replayed": tally.replayed}
         found |= {"unrecorded": steps(words, DEVICE, self.count, sizes=self.sizes)} if recorded else {}
         return {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()} | counts
 

@@ -43,6 +43,14 @@ def test_tilde_in_the_variable_is_the_home_folder(tmp_path: Path, monkeypatch: p
     assert cache_folder("a", "b") == tmp_path / "kept" / "a" / "b"
 
 
+@pytest.mark.parametrize("name", ["GSX_CACHE", "XDG_CACHE_HOME"])
+def test_a_home_folder_that_there_is_not_is_no_folder_here(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSX_CACHE", raising=False)
+    monkeypatch.setenv(name, "~nosuchuser/c")
+    with pytest.raises(InputError, match=r"would be ~nosuchuser/c.*let GSX_CACHE name a folder"):
+        cache_folder("a", "b")
+
+
 def test_naming_a_folder_does_not_create_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
     assert not cache_folder("sfm", "k").exists()

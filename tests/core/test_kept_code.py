@@ -243,12 +243,16 @@ def test_what_a_killed_linker_left_is_made_again(tmp_path: Path) -> None:
     assert {name for name, library in libraries.items() if library.exists()} == {"whole", "made"}
 
 
-def test_what_cannot_be_compiled_any_more_is_told(folder: Path) -> None:
+def test_what_cannot_be_compiled_any_more_is_told(folder: Path, tmp_path: Path) -> None:
     """A disk that is full by now, say: the compiler worked when it was tried."""
+    full = tmp_path / "g++"
+    says = "echo 'cannot write x.so: No space left on device' >&2; exit 1"
+    full.write_text(f'#!/bin/sh\ncase "$*" in *.main.cpp*) {says};; esac\nexec {shutil.which("g++")} "$@"\n')
+    full.chmod(0o755)
     never = module_of("def weighted(x, y):\n    return ((7.25 * x).exp() + y[:, :1]).sum(1)").weighted
     with (
-        torch._inductor.config.patch({"cpp.cxx": ("/bin/false",)}),
-        pytest.raises(CompilerError, match=r"weighted cannot be compiled .*compiler.*rasterizer=eager"),
+        torch._inductor.config.patch({"cpp.cxx": (str(full),)}),
+        pytest.raises(CompilerError, match=r"weighted cannot be compiled \(.*No space left.*\): .*rasterizer=eager"),
     ):
         compile_rows(never)(*rows(6))
 

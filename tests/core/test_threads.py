@@ -43,7 +43,6 @@ print(free, shared, loops())
 """Prints how often threads fell asleep in 300 short loops: alone, with idle threads, and without them again."""
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) > 2, reason="two threads are too few for these cores")
 @pytest.mark.skipif(not threads.times(), reason="the system does not tell how long threads wait")
 def test_threads_that_wait_for_each_other_sleep_while_there_are_idle_ones() -> None:
     own = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
@@ -72,11 +71,26 @@ def test_cores_are_scarce_from_much_waiting_until_there_is_next_to_none(
             return len(seen) > len(waits) - 1
 
     monkeypatch.setattr(threads, "times", times)
+    monkeypatch.setattr(threads, "teams_needed", lambda: 1)
     monkeypatch.setattr(threads.time, "perf_counter", lambda: clock[0])
     threads.watch(Ended())
     assert seen == there
     assert not any(thread.name == "gsx idle" for thread in threading.enumerate())
     assert len(caplog.records) == 1, "it is said once"
+
+
+@pytest.mark.parametrize(
+    ("cores", "own", "teams"), [(2, 2, 1), (3, 2, 2), (4, 2, 3), (8, 2, 7), (16, 8, 2), (8, 16, 1)]
+)
+def test_so_many_teams_are_idle_that_openmp_counts_more_threads_than_cores(
+    cores: int, own: int, teams: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GNU OpenMP counts the threads that it has begun, all but the first of a team, and the process's first one."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: own)
+    assert threads.teams_needed() == teams
+    assert 1 + (1 + teams) * (own - 1) > cores
+    assert teams == 1 or 1 + teams * (own - 1) <= cores
 
 
 def test_a_system_that_does_not_tell_is_left_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

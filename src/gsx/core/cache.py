@@ -36,14 +36,13 @@ def cache_root() -> Path:
     Raises:
         InputError: there is no home folder to find it in.
     """
-    if own := os.environ.get("GSX_CACHE"):
-        return at_home(own)
-    if shared := os.environ.get("XDG_CACHE_HOME"):
-        return at_home(shared) / "gsx"
-    found = at_home("~/.cache/gsx")
-    if not found.is_absolute():
+    below = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    given = os.environ.get("GSX_CACHE") or f"{below}/gsx"
+    found = at_home(given)
+    if str(found).startswith("~"):
         raise InputError(
-            "this user has no home folder, and so no cache: let GSX_CACHE name a folder that can be written"
+            f"the cache would be {given}, and there is no such home folder: let GSX_CACHE name a folder that can be "
+            "written"
         )
     return found
 

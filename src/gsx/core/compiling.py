@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.errors import CompilerError
+from gsx.core.errors import CompilerError, first_line
 from gsx.core.kept_code import KeptFunction, flat, record, recording
 
 Result = TypeVar("Result")
@@ -41,8 +41,14 @@ def complaint(device: str) -> str:
     try:
         compile_rows(test_of_the_compiler)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
-        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+        return reason_of(error.__cause__ or error)
     return ""
+
+
+def reason_of(error: BaseException) -> str:
+    """In one line why torch could not compile: what the C++ compiler says, or what torch's backend raised."""
+    told = (str(error).partition(mark)[2].strip() for mark in ("Output:\n", "raised:\n"))
+    return next(filter(None, told), first_line(error)).splitlines()[0]
 
 
 def test_of_the_compiler(x: Tensor) -> Tensor:
@@ -161,10 +167,9 @@ class CompiledOnce:
         except Exception as error:
             if not type(error).__module__.startswith(("torch._inductor", "torch._dynamo")):
                 raise
-            reason = str(error).partition("raised:\n")[2] or str(error)  # torch names its backend first
             folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR", "the folder for temporary files")
             raise CompilerError(
-                f"{self.kept.function.__name__} cannot be compiled ({reason.splitlines()[0]}): see to space and "
+                f"{self.kept.function.__name__} cannot be compiled ({reason_of(error)}): see to space and "
                 f"memory, also in {folder}, and go on, or give rasterizer=eager"
             ) from error
 

@@ -142,7 +142,7 @@ def held_by(function: types.FunctionType) -> Iterator[object]:
 def class_parts(kind: type, seen: set[int]) -> Iterator[object]:
     """`parts_of` of a class: its fields in their order, its functions and properties, its constants; and of the classes
     that it comes from, and that its fields are of."""
-    fields = vars(kind).get("__annotations__", {})
+    fields = inspect.get_annotations(kind)
     yield list(fields)
     for other in (*kind.__bases__, *(field for field in fields.values() if isinstance(field, type))):
         yield from parts_of(other, seen)

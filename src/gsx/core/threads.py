@@ -2,11 +2,12 @@
 
 Each of a step's hundreds of short loops ends when all of its threads have. GNU OpenMP has those that are ready turn in
 circles for longer than a scheduler's slice, which is fastest alone; but where another program has taken a core, they
-keep from it the very thread that they wait for. It lets them sleep early only while a process has more threads than
-there are cores: so a process whose threads wait for cores is given some that do nothing.
+keep from it the very thread that they wait for. It lets them sleep early only while it counts more threads of its own
+in a process than there are cores: so a process whose threads wait for cores is given as many more, which do nothing.
 """
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -60,7 +61,7 @@ def watch(ended: threading.Event) -> None:
             before, begun = now, looked
             was, scarce = scarce, threads > (FEW if scarce else MANY)
             if scarce and not told:
-                logger.info("cores are shared with others: this takes longer")
+                logger.info("more threads want cores than there are: this takes longer")
                 told = True
             if scarce and not was:
                 stack.enter_context(idle_threads())
@@ -82,21 +83,30 @@ def waiting(before: Times, now: Times) -> float:
     return sum(now[thread] - before[thread] for thread in before.keys() & now.keys()) / 1e9
 
 
+def teams_needed() -> int:
+    """Teams of as many threads as torch has, beside its own, with which OpenMP counts more threads than cores. It
+    counts those that it has begun: all but the first of a team, and one more."""
+    cores, begun = len(os.sched_getaffinity(0)), max(1, torch.get_num_threads() - 1)
+    return max(1, -(-(cores - begun) // begun))
+
+
 @contextmanager
 def idle_threads() -> Iterator[None]:
-    """As many threads as torch has, all asleep: OpenMP counts another team."""
+    """Threads that are asleep, so many that OpenMP counts more than there are cores."""
     ended = threading.Event()
 
     def lead() -> None:
         torch.zeros(GRAIN * torch.get_num_threads()).add_(1)  # a loop of its own, whose threads stay with this one
         ended.wait()
 
-    leader = threading.Thread(target=lead, name="gsx idle", daemon=True)
+    leaders = [threading.Thread(target=lead, name="gsx idle", daemon=True) for _ in range(teams_needed())]
     with suppress(RuntimeError):  # no thread more is allowed
-        leader.start()
+        for leader in leaders:
+            leader.start()
     try:
         yield
     finally:
         ended.set()
-        if leader.is_alive():
-            leader.join()
+        for leader in leaders:
+            if leader.is_alive():
+                leader.join()

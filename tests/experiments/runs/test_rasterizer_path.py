@@ -1,8 +1,10 @@
 """What is compiled before the first step, and beside what is drawn: there the settings are handed over when that is
 done, and only then."""
 
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
@@ -128,6 +130,9 @@ def test_no_step_needs_what_is_not_compiled_before(tmp_path: Path, monkeypatch: 
 class Begun:
     """A process that was begun, and what becomes of it."""
 
+    pid = 1 << 30
+    """Nobody's."""
+
     def __init__(self, words: list[str], ended: list[str]) -> None:
         self.words, self.ended = words, ended
 
@@ -188,6 +193,22 @@ def test_a_process_that_cannot_be_begun_is_done_without(
     with caplog.at_level("INFO"), helper(RasterSettings(), 3):
         assert not HELPED.get()
     assert "compiles alone (no memory for another)" in caplog.text
+
+
+@pytest.mark.parametrize("way", ["it is killed", "nobody is there"])
+def test_compilers_of_a_helper_end_with_it(way: str) -> None:
+    code = "import subprocess, sys; from gsx.experiments.runs.rasterizer_path import end_with\n"
+    code += "subprocess.Popen(['sleep', '60']); print(1, flush=True); end_with(sys.stdin.buffer)"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    process = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, **pipes)
+    assert process.stdout.read(2) == b"1\n"
+    begun = time.monotonic()
+    if way == "it is killed":
+        rasterizer_path.kill(process)
+    else:
+        process.communicate()  # until nobody holds the end of the pipe any more
+    assert time.monotonic() - begun < 30
+    assert process.returncode == -signal.SIGKILL
 
 
 def test_a_helper_ends_with_who_began_it() -> None:

@@ -33,6 +33,8 @@ class FixedLists(ListSizes):
 
     lens: Float[Tensor, "16"]
     """`Lens` of the camera, whose pose lies where the splats do; its numbers have been checked."""
+    raster: Int[Tensor, "2 5"]
+    """`raster_numbers` of the camera."""
 
 
 class Needed(NamedTuple):

@@ -72,9 +72,14 @@ class Boxes:
     """Largest s^2 + r^2 at which alpha is still at least alpha_min; negative: nowhere."""
 
 
-@functools.lru_cache(maxsize=64)
-def raster_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: torch.device) -> Int[Tensor, "2 5"]:
+def raster_numbers(camera: Camera, settings: RasterSettings, device: torch.device) -> Int[Tensor, "2 5"]:
     """What `boxes` wants to know of a raster."""
+    return uploaded_numbers(camera.frame, camera.size, TileGrid.of(camera, settings.tile_size), device)
+
+
+@functools.lru_cache(maxsize=64)
+def uploaded_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: torch.device) -> Int[Tensor, "2 5"]:
+    """`raster_numbers`, of which the same are wanted again and again."""
     sides = zip((frame.width, frame.height), (frame.left, frame.top), size, grid.first, grid.shape, strict=True)
     numbers = [
         [-(-whole // WINDOW_TILE), at, at + extent, begin, begin + count] for whole, at, extent, begin, count in sides
@@ -83,7 +88,7 @@ def raster_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: 
 
 
 @torch.no_grad()
-def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Boxes:
+def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings, fixed: FixedLists | None = None) -> Boxes:
     """Boxes of splats on the screen."""
     grid = TileGrid.of(camera, settings.tile_size)
     rules = (
@@ -92,7 +97,7 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> 
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
-    numbers = raster_numbers(camera.frame, camera.size, grid, screen.means.device)
+    numbers = fixed.raster if fixed else raster_numbers(camera, settings, screen.means.device)
     given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
     compiled = len(screen.ids) > 1 and compiles(settings, screen.means.device.type)
     *edges, radii, limits = compiled_boxes(*rules)(*given) if compiled else boxes(*given, *rules)
@@ -108,7 +113,7 @@ def intersect_tiles(
     Raises:
         TooManyPairs: more than `settings.max_pairs` pairs would be needed.
     """
-    grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings)
+    grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings, fixed)
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = sorted_stably(bits)[1]

@@ -31,7 +31,7 @@ from gsx.core.rasterizer import (
     rasterize_fixed,
 )
 from gsx.core.rasterizer.intersections import raster_numbers
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import Float, Int, UInt8
 from gsx.core.training.backbone import Backbone, DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
 from gsx.core.training.photographs import numbers_of
@@ -66,6 +66,8 @@ class Inputs:
     """float64: the camera's `Lens`, rotation, translation and centre."""
     photograph: UInt8[Tensor, "3 H W"]
     background: Float[Tensor, "3"]
+    raster: Int[Tensor, "2 5"]
+    """`raster_numbers` of the kind of picture: the same at every step, and held as long as it is read."""
 
     def camera(self, like: Camera) -> tuple[PlacedCamera, Float[Tensor, "16"]]:
         """(a camera whose pose is read from here, its lens)."""
@@ -180,8 +182,8 @@ class Recorder:
     """Tensors of the table that these read: as long as they are held, no others get their identity."""
     records: dict[Hashable, Recorded] = field(default_factory=dict)
     """By kind of picture."""
-    broken: bool = False
-    """Recording has failed: steps are launched one by one from there on."""
+    most: int = MOST_KINDS
+    """Kinds that are recorded: as many as there were where recording one more has failed."""
 
     def forget(self) -> None:
         """Let go of what is recorded, and its memory."""
@@ -189,7 +191,7 @@ class Recorder:
 
     def alike(self, step: int) -> Hashable:
         """What steps have in common that may be recorded together with this one; None: it is not to be recorded."""
-        if self.broken or not isinstance(self.backbone, Recordable):
+        if self.most == 0 or not isinstance(self.backbone, Recordable):
             return None
         drawn = self.backbone.drawn_alike(step)
         return None if drawn is None else (drawn, self.backbone.absolute_gradient)
@@ -225,13 +227,18 @@ class Recorder:
         kind = (view.camera.size, view.camera.frame, dilations_of(view.camera, None, view.raster))
         if kind in self.records:
             return replayed(self.records[kind], table, pose, view)
-        inputs = Inputs(pose=pose, photograph=view.photograph.clone(), background=view.background.clone())
+        inputs = Inputs(
+            pose=pose,
+            photograph=view.photograph.clone(),
+            background=view.background.clone(),
+            raster=raster_numbers(view.camera, view.raster, view.photograph.device),
+        )
 
         def work() -> Learnt:
             return self.work(inputs, view)
 
         way = (rules, kind)
-        if way not in self.done or len(self.records) == MOST_KINDS:
+        if way not in self.done or len(self.records) == self.most:
             found = work()
             self.done.add(way)
             return found
@@ -255,10 +262,11 @@ class Recorder:
         try:
             made, graph = self.record(work)
         except RuntimeError as error:
-            self.broken = True
-            self.forget()
-            raster_numbers.cache_clear()  # what was to be filled while recorded work runs has nothing in it
-            logger.warning("steps are launched one by one: they cannot be recorded here (%s)", first_line(error))
+            self.most = len(self.records)
+            if not self.most:
+                self.forget()
+            which = "steps of other sizes" if self.most else "steps"
+            logger.warning("%s are launched one by one: they cannot be recorded here (%s)", which, first_line(error))
             return None
         found = gradients(self.backbone.table)
         return Recorded(inputs=inputs, made=made, graph=graph, gradients=found)
@@ -266,7 +274,8 @@ class Recorder:
     def work(self, inputs: Inputs, view: ToLearn) -> Learnt:
         """What is recorded; of what differs from view to view it reads the inputs alone."""
         camera, lens = inputs.camera(view.camera)
-        drawn, fixed = self.backbone.draw(camera, view.step), FixedLists(lens=lens, **vars(self.room))
+        fixed = FixedLists(lens=lens, raster=inputs.raster, **vars(self.room))
+        drawn = self.backbone.draw(camera, view.step)
         colour, absolute = inputs.background, self.backbone.absolute_gradient
         rendering = rasterize_fixed(
             drawn.splats, camera, view.raster, fixed, background=colour, absolute_gradient=absolute

@@ -111,8 +111,8 @@ def opened(path: Path, folder: Path) -> IO[str]:
     try:
         number = os.open(path, flags, 0o666)
     except PermissionError as error:
-        if not path.exists() and mine(folder):
-            raise InputError(f"{folder} cannot be written to ({error.strerror}): chmod u+w {folder}") from error
+        if mine(folder) and not (os.access(folder, os.X_OK) and path.exists()):
+            raise InputError(f"{folder} cannot be written to ({error.strerror}): chmod u+wx {folder}") from error
         raise InputError(
             f"{known} is {owner(path)}'s: have them take it away, or share {folder} with you (chmod g+w)"
         ) from error

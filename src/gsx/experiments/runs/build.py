@@ -123,7 +123,11 @@ def hasten_compiling() -> None:
 
 def keep_compiled_code() -> None:
     """Have torch keep what it compiles in an entry of the cache, one for each kind of processor, of which there may be
-    several on a cluster: its own place is lost on restart. Where nothing can be written it stays with that."""
+    several on a cluster: its own place is lost on restart. Where nothing can be written it stays with that.
+
+    Raises:
+        InputError: there is no cache, for want of a home folder.
+    """
     folder = cache_folder("compiled", content_key(torch.__version__, platform.python_version(), processor_kind()))
     try:
         (make_folder(folder) / MANIFEST).touch()

@@ -3,11 +3,12 @@
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
 from threading import Thread
@@ -138,8 +139,7 @@ def helper(settings: RasterSettings, sh_degree: int) -> Iterator[None]:
         yield
     finally:
         HELPED.reset(token)
-        process.kill()
-        process.communicate()
+        kill(process)
 
 
 def begun(settings: RasterSettings, sh_degree: int) -> subprocess.Popen[bytes] | None:
@@ -170,9 +170,20 @@ def help_compiling(words: str) -> None:
 
 
 def end_with(stream: IO[bytes]) -> None:
-    """End this process when nobody can write to a stream any more."""
+    """End this process, and the compilers that it has begun, when nobody can write to a stream any more."""
     stream.read()
+    if os.name == "posix" and os.getsid(0) == os.getpid():
+        os.killpg(os.getpid(), signal.SIGKILL)
     os._exit(0)
+
+
+def kill(process: subprocess.Popen[bytes]) -> None:
+    """End a process of a session of its own, and the compilers that it has begun."""
+    if os.name == "posix":
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+    process.communicate()
 
 
 def of_any_backbone(calls: Sequence[Call], settings: RasterSettings, learnt: Learnt) -> list[Call]:
