@@ -31,6 +31,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
+from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.experiments.runs.again import evaluate_again
@@ -74,6 +75,7 @@ class TrainedRun:
         """Training and test views with their cameras: `scene.test[0].camera`, `scene.test[0].image()`."""
         return self.run.scene
 
+    @yielding_cores()
     def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
         """The model seen by a camera, or by a view or the camera of the view of that name; colours in [0, 1].
 
@@ -123,6 +125,7 @@ class SplatFile:
     raster: RasterSettings
     """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
 
+    @yielding_cores()
     def render(
         self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
     ) -> Float[Tensor, "3 H W"]:
@@ -172,7 +175,7 @@ def train(*given: str, **values: Any) -> TrainedRun:
         KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
     """
     for word in given:
-        if not (isinstance(word, str) and is_override(word)):
+        if not (isinstance(word, str) and is_override(word) and not word.startswith("-")):
             raise ConfigError(f"gsx.train was given {word!r}: give settings, as 'scene=colmap' and 'scene.path=FOLDER'")
     words, folders = [*given, *overrides(values)], list[Path]()
     if is_table(words) or processes() > 1:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 import torch
@@ -93,6 +94,20 @@ def test_so_many_teams_are_idle_that_openmp_counts_more_threads_than_cores(
     assert teams == 1 or 1 + teams * (own - 1) <= cores
 
 
+@pytest.mark.parametrize("place", [
+    "core.training.trainer.train",
+    *(f"experiments.runs.{name}" for name in ("evaluate.evaluate", "export.export", "export.losses")),
+    *(f"experiments.runs.render.{name}" for name in ("render_test_views", "render_orbit", "render_path")),
+    *(f"experiments.runs.{name}" for name in ("view.view_run", "view.view_file", "photographs.judge_photographs")),
+    *("experiments.compact.compact.compact", "experiments.trade.rasterizer.measure.sweep"),
+    *("api.TrainedRun.render", "api.SplatFile.render"),
+])  # fmt: skip
+def test_all_that_draws_for_long_is_watched(place: str) -> None:
+    function = resolve_name(f"gsx.{place}")
+    within = [getattr(cell.cell_contents, "func", None) for cell in function.__closure__]
+    assert threads.yielding_cores.__wrapped__ in within
+
+
 def test_a_system_that_does_not_tell_is_left_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(threads, "TASKS", tmp_path / "missing")
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
@@ -101,6 +116,6 @@ def test_a_system_that_does_not_tell_is_left_alone(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(threads, "TASKS", tmp_path)
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / "schedstat").write_text("5 7 9\n")
-    with threads.yielding_cores():
+    with threads.yielding_cores(), threads.yielding_cores():
         assert sum(thread.name == "gsx cores" for thread in threading.enumerate()) == 1
     assert not any(thread.name == "gsx cores" for thread in threading.enumerate())

@@ -246,6 +246,23 @@ def test_photos_that_cannot_be_read_are_skipped_and_named(tmp_path: Path) -> Non
         load(options(tmp_path))
 
 
+@pytest.mark.parametrize("behind", [b"", b"\xff\xda of a film \xff\xd9 \xff\xda"])
+def test_a_photo_that_is_cut_is_none(behind: bytes, tmp_path: Path) -> None:
+    """Its head can be read, and COLMAP takes what there is of it. Behind a whole one may lie anything."""
+    noise = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    for name in ("a", "b", "cut"):
+        output = oiio.ImageOutput.create("a.jpg")
+        assert output.open(str(tmp_path / f"{name}.jpg"), oiio.ImageSpec(96, 64, 3, "uint8"))
+        output.write_image(noise)
+        output.close()
+    whole = (tmp_path / "cut.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(whole + behind)
+    (tmp_path / "cut.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    sizes, notes = photos.readable_sizes(tmp_path, find_photos(tmp_path)[1])
+    assert list(sizes) == ["a.jpg", "b.jpg"]
+    assert notes == ["Skipped 1 photos that cannot be read: cut.jpg."]
+
+
 def test_too_many_photos_that_cannot_be_read_are_refused_before_anything_is_reconstructed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

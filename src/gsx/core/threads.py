@@ -21,8 +21,10 @@ logger = logging.getLogger(__name__)
 
 TASKS = Path("/proc/self/task")
 """Linux tells there of each thread for how long it has run, and waited for a core (schedstat), ns."""
-EVERY = 1.0
+EVERY = 0.25
 """Seconds between looks."""
+NAME = "gsx cores"
+"""Of the thread that looks."""
 MANY, FEW = 0.25, 0.05
 """Threads that wait for a core, on average, where others want it, and where nobody does. By hand on two cores, beside
 another program: 1, and 0.4 with idle threads; alone: below 0.01."""
@@ -35,12 +37,14 @@ Times: TypeAlias = dict[str, int]
 @contextmanager
 def yielding_cores() -> Iterator[None]:
     """Watch whether this process's threads wait for cores; while they do, they sleep early where they wait for each
-    other. No result depends on it. Where the system tells nothing, or there is one thread, nothing happens."""
-    if torch.get_num_threads() == 1 or not times():
+    other. No result depends on it. Where the system tells nothing, where there is one thread, and within another such
+    watch, nothing happens."""
+    watched = any(thread.name == NAME for thread in threading.enumerate())
+    if watched or torch.get_num_threads() == 1 or not times():
         yield
         return
     ended = threading.Event()
-    watcher = threading.Thread(target=watch, args=(ended,), name="gsx cores", daemon=True)
+    watcher = threading.Thread(target=watch, args=(ended,), name=NAME, daemon=True)
     try:
         with suppress(RuntimeError):  # no thread more is allowed
             watcher.start()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from gsx.core.cache import cache_folder, content_key, file_stamp
-from gsx.core.data.images import image_size
+from gsx.core.data.images import image_size, read_image
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
@@ -127,6 +127,12 @@ def heic_sentence(folder: Path) -> str:
     )
 
 
+def may_be_cut(photo: Path) -> bool:
+    """Whether a JPEG has no mark of its end behind the begin of its last picture; other bytes behind may look so."""
+    content = photo.read_bytes()
+    return content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda")
+
+
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
     """Sizes of the photos by name, without those that cannot be read, and a note on the latter.
 
@@ -136,7 +142,10 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
     sizes = {}
     for name in photos:
         with suppress(InputError):
-            sizes[name] = image_size(folder / name)
+            size = image_size(folder / name)
+            if may_be_cut(folder / name):
+                read_image(folder / name)
+            sizes[name] = size
     broken = [name for name in photos if name not in sizes]
     if len(sizes) < MIN_PHOTOS:
         raise InputError(f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: export them again.")

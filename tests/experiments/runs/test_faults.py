@@ -102,6 +102,18 @@ def test_an_error_within_a_step_keeps_the_step_before(
     assert_ends_as(tmp_path / "run", whole)
 
 
+def test_a_run_that_asked_for_no_code_goes_eagerly_where_it_cannot_be_compiled(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A disk of the cache that is full, say."""
+    monkeypatch.setattr(execution, "warm", at_call(1, execution.warm, CompilerError("blend cannot be compiled (full)")))
+    tiny_run(tmp_path / "run", (*SHORT, "rasterizer.path=auto", "rasterizer.auto_steps=1"))
+    assert "blend cannot be compiled (full); going on with the eager path" in caplog.text
+    assert json.loads((tmp_path / "run" / "environment.json").read_text())["rasterizer"] == "eager"
+    ends, other = final_tensors(tmp_path / "run"), final_tensors(whole)
+    assert all(torch.equal(ends[name], other[name]) for name in other)
+
+
 def test_an_error_between_steps_keeps_the_last_one(tmp_path: Path, whole: Path) -> None:
     settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
     run = start(settings, loaded)

@@ -1,5 +1,6 @@
 """Pictures that are dear to make, kept in the cache between runs."""
 
+import functools
 import logging
 from pathlib import Path
 
@@ -31,4 +32,10 @@ def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"
         write_image(path, image)
         enlist(path)
     except (OSError, InputError) as error:
-        logger.warning("%s; it is made again next time", error)
+        warn_once(str(error).rstrip("."))
+
+
+@functools.lru_cache(maxsize=16)
+def warn_once(problem: str) -> None:
+    """Say once what keeps pictures from being kept."""
+    logger.warning("%s; pictures are made again next time", problem)

@@ -17,6 +17,7 @@ from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.suffixes import STANDARD
 from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
+from gsx.core.threads import yielding_cores
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
 from gsx.experiments.compact.shrink import (
@@ -56,6 +57,7 @@ NAME, COMPARED = "compact.json", "compared"
 """What was tried; folder of the page with the model before and after."""
 
 
+@yielding_cores()
 def compact(
     target: Path, to: Path, max_drop: float, steps: int | None, overrides: Sequence[str], plugins: Plugins
 ) -> Path:

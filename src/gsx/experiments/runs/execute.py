@@ -3,11 +3,12 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from gsx.core.cache import cache_root, trim
 from gsx.core.errors import CompilerError, LostModel, TrainingError, first_line
-from gsx.core.files import remove_partial, write_json
+from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.guard import Agreement, Guard
@@ -74,7 +75,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         general = settings.general
         listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
     try:
-        warm(run, settings)
+        warm_or_eager(run, settings)
         with (
             viewed(run, settings) as viewers,
             plugins.listening([*listeners, *viewers]),
@@ -92,6 +93,25 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)
+
+
+def warm_or_eager(run: Run, settings: Settings) -> None:
+    """Have compiled what steps need; where that fails at the beginning of a run that left the path to gsx, it goes
+    eagerly.
+
+    Raises:
+        CompilerError: elsewhere.
+    """
+    try:
+        warm(run, settings)
+    except CompilerError as error:
+        left_to_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
+        if not left_to_gsx or run.step > 0 or run.ranks.size > 1:
+            raise
+        logger.warning("%s; going on with the eager path, which is several times slower", error)
+        run.raster = run.backbone.raster = replace(run.raster, path="eager")
+        facts = read_json(run.folder / "environment.json")
+        write_json(run.folder / "environment.json", facts | {"rasterizer": "eager"})
 
 
 @contextmanager

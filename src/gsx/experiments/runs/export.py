@@ -22,6 +22,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
 from gsx.core.shapes import Float
+from gsx.core.threads import yielding_cores
 from gsx.core.training.backbone import Bakeable, WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -47,6 +48,7 @@ class Exported:
     """They stand for a model that has others for every camera."""
 
 
+@yielding_cores()
 def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub", zoom: float = 0) -> Exported | None:
     """Write the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
 
@@ -150,6 +152,7 @@ def render_mode(raster: RasterSettings) -> str:
     return "mip" if raster.compensate else "default"
 
 
+@yielding_cores()
 def losses(
     run: Run, settings: Settings, path: Path, views: Sequence[View], written: Exported, axes: str = "rub"
 ) -> list[str]:

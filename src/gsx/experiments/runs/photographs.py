@@ -18,6 +18,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.quality.sharpness import sharpness
 from gsx.core.quality.shifts import shift_of
 from gsx.core.shapes import Float
+from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
@@ -32,6 +33,7 @@ FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""
 
 
+@yielding_cores()
 def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
     """Findings on all training photographs of a run, worst first; its folder keeps them, with pictures of so many, and
     its report shows them.

@@ -14,6 +14,7 @@ from gsx.core.errors import InputError, nearest
 from gsx.core.files import remove_partial
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.shapes import Float
+from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import file_names
@@ -38,6 +39,7 @@ def view_named(run: Run, name: str) -> View:
     return views[name]
 
 
+@yielding_cores()
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
     """Write every test view at `zoom` times the training resolution as PNG."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -48,6 +50,7 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     without_others(folder, "*.png", names, run.folder)
 
 
+@yielding_cores()
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
     """Animate a closed path around the scene."""
     remove_partial(path.parent, below=False)
@@ -76,6 +79,7 @@ def file_pictures(path: Path) -> Draw:
     return lambda camera: render_gaussians(gaussians, camera, raster, torch.zeros(3))
 
 
+@yielding_cores()
 def render_path(
     way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
 ) -> Path:

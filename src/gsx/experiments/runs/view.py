@@ -9,6 +9,7 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.threads import yielding_cores
 from gsx.core.training import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
@@ -57,6 +58,7 @@ class Watched:
         return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
+@yielding_cores()
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Show a run until Ctrl-C.
 
@@ -73,6 +75,7 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
         viewer.stop()
 
 
+@yielding_cores()
 def view_file(path: Path, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Show a splat file until Ctrl-C; errors as `view_run`."""
     gaussians = read_gaussians(path)
