@@ -31,7 +31,6 @@ OVERRIDES = (
     "scene.samples=1",
     "training.test_points=2",
     "eval.flight=false",
-    "rasterizer.chunk=32",
     "device=cpu",
 )
 
