@@ -7,8 +7,9 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -36,17 +37,20 @@ from gsx.regenerators.diffusion.redraw import Diffusion, PaddedImage, any_pipeli
 from gsx.regenerators.diffusion.sizes import grown
 from gsx.regenerators.diffusion.tuning import closest
 
-pytest.importorskip("diffusers", reason="needs gsx[diffusion]")
-pytest.importorskip("peft", reason="needs gsx[diffusion]")
-
-import tiny_models
-
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:__array__ implementation:DeprecationWarning"
-)  # diffusers with numpy 2.4
+pytestmark = [
+    pytest.mark.skipif(not (find_spec("diffusers") and find_spec("peft")), reason="needs gsx[diffusion]"),
+    pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning"),  # diffusers with numpy 2.4
+]
 
 RECIPES = {"sd_x2_latent": SD_X2_LATENT, "sd_x4": SD_X4, "sdxl_turbo": SDXL_TURBO, "sdxl_turbo_raw": SDXL_TURBO}
 SIZES = [(1, 1), (1, 9), (7, 5), (33, 65), (65, 33), (64, 64), (1080, 1920), (2048, 1365)]
+
+
+def tiny() -> ModuleType:
+    """Tiny ones; their libraries take seconds to import, also in processes that run none of these tests."""
+    import tiny_models
+
+    return tiny_models
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +67,7 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Folders of tiny models."""
-    return tiny_models.save_models(tmp_path_factory.mktemp("models"))
+    return tiny().save_models(tmp_path_factory.mktemp("models"))
 
 
 def role_of(name: str) -> str:
@@ -164,7 +168,7 @@ def phase_shift(image: Tensor, reference: Tensor) -> tuple[int, int]:
 
 def test_the_check_of_phases_sees_a_pixel() -> None:
     """And its direction."""
-    image = tiny_models.pictures(1, 45, 71, torch.Generator().manual_seed(3))[0]
+    image = tiny().pictures(1, 45, 71, torch.Generator().manual_seed(3))[0]
     assert phase_shift(image.roll((1, -2), (1, 2)), image) == (1, -2)
 
 
@@ -249,8 +253,8 @@ def test_the_latent_upscaler_does_not_shift(models: dict[str, Path], tmp_path: P
     """
     upscaler = ready("sd_x2_latent", tmp_path, model=models["sd_x2_latent"])
     pipe = upscaler.pipe
-    vae = tiny_models.autoencoder(1, 1.0)
-    tiny_models.make_transparent(vae)
+    vae = tiny().autoencoder(1, 1.0)
+    tiny().make_transparent(vae)
     pipe.vae = vae
     pipe.vae_scale_factor = 1
 
@@ -261,7 +265,7 @@ def test_the_latent_upscaler_does_not_shift(models: dict[str, Path], tmp_path: P
         return SimpleNamespace(sample=torch.cat([answer, answer[:, :1]], 1))
 
     pipe.unet.forward = known
-    image = tiny_models.pictures(1, 45, 71, torch.Generator().manual_seed(3))[0]
+    image = tiny().pictures(1, 45, 71, torch.Generator().manual_seed(3))[0]
     (result,) = upscaler.regenerate([request(image, 2)])
     assert float((result - as_blocks(image, 2)).abs().max()) <= 1.5 / 255
     assert displacement(result, as_blocks(image, 2)) < 0.01
@@ -431,7 +435,7 @@ def test_a_pipeline_of_ones_own_is_opened_from_its_file(models: dict[str, Path],
         "from diffusers import StableDiffusionXLImg2ImgPipeline\n\n\n"
         "class Greying(StableDiffusionXLImg2ImgPipeline):\n"
         "    def __call__(self, image, **more):\n"
-        "        from types import SimpleNamespace\n\n"
+        "        from types import ModuleType, SimpleNamespace\n\n"
         "        return SimpleNamespace(images=image.mean(1, keepdim=True).expand(-1, 3, -1, -1))\n"
     )
     words = ["regenerator/restore=diffusers_pipeline", f"regenerator.restore.model={models['sdxl_turbo']}"]
@@ -604,7 +608,7 @@ def worn(photos: Tensor) -> list[tuple[Tensor, Tensor]]:
 @pytest.fixture
 def pairs() -> list[tuple[Tensor, Tensor]]:
     """Eight of 32 x 40 px."""
-    return worn(tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1)))
+    return worn(tiny().pictures(8, 32, 40, torch.Generator().manual_seed(1)))
 
 
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
@@ -623,7 +627,7 @@ def test_tuning_lowers_the_error_on_views_it_has_not_seen(
     assert facts["views"] == [f"view{n}" for n in range(8)]
     second = Diffusion(SDXL_TURBO, options)
     assert second.prepare(context_for(tmp_path / "second", pairs)) == figures
-    fresh = worn(tiny_models.pictures(2, 33, 41, torch.Generator().manual_seed(2)))
+    fresh = worn(tiny().pictures(2, 33, 41, torch.Generator().manual_seed(2)))
     for number, (render, photo) in enumerate(fresh):
         asked = request(render, 1, seed=number)
         (one,), (other,) = first.regenerate([asked]), second.regenerate([asked])
@@ -655,7 +659,7 @@ def test_an_adapter_that_beats_the_model_but_not_the_renders_is_not_used(
     models: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Renders a little too dark: tuning brings them back, and what the autoencoder loses is more than that."""
-    photos = tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1))
+    photos = tiny().pictures(8, 32, 40, torch.Generator().manual_seed(1))
     pairs = [((photo - 0.04).clamp(0, 1), photo) for photo in photos]
     tuned = Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *TUNING, model=models["useful"]))
     figures = tuned.prepare(context_for(tmp_path, pairs))
@@ -685,7 +689,7 @@ def test_what_is_closest_to_the_photographs() -> None:
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_tuning_learns_and_measures_on_held_out_renders(dtype: str, models: dict[str, Path], tmp_path: Path) -> None:
     """A run whose own renders are the photographs is not measured on these."""
-    pairs = worn(tiny_models.pictures(8, 32, 40, torch.Generator().manual_seed(1)))
+    pairs = worn(tiny().pictures(8, 32, 40, torch.Generator().manual_seed(1)))
     few = [*TUNING, *(f"regenerator.restore.tuning.{word}" for word in ("steps=2", "crops=4", "halves=0.4"))]
     few.append(f"regenerator.restore.dtype={dtype}")
     given, asked = context_for(tmp_path, pairs), list[float]()

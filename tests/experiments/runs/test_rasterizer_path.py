@@ -195,18 +195,24 @@ def test_a_process_that_cannot_be_begun_is_done_without(
     assert "compiles alone (no memory for another)" in caplog.text
 
 
-@pytest.mark.parametrize("way", ["it is killed", "nobody is there"])
-def test_compilers_of_a_helper_end_with_it(way: str) -> None:
-    code = "import subprocess, sys; from gsx.experiments.runs.rasterizer_path import end_with\n"
-    code += "subprocess.Popen(['sleep', '60']); print(1, flush=True); end_with(sys.stdin.buffer)"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, **pipes)
+HELPER = """
+import subprocess, sys
+from gsx.experiments.runs.rasterizer_path import end_with
+subprocess.Popen(["sleep", "60"])
+print(1, flush=True)
+end_with(sys.stdin.buffer)
+"""
+
+
+@pytest.mark.parametrize(("words", "end"), [
+    (["sh", "-c", "sleep 60 & echo 1; wait"], rasterizer_path.kill),
+    ([sys.executable, "-c", HELPER], subprocess.Popen.communicate),  # nobody is there any more
+])  # fmt: skip
+def test_compilers_of_a_helper_end_with_it(words: list[str], end: Callable[[Any], object]) -> None:
+    process = subprocess.Popen(words, start_new_session=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stdout.read(2) == b"1\n"
     begun = time.monotonic()
-    if way == "it is killed":
-        rasterizer_path.kill(process)
-    else:
-        process.communicate()  # until nobody holds the end of the pipe any more
+    end(process)  # comes back when nobody holds the end of the pipe any more
     assert time.monotonic() - begun < 30
     assert process.returncode == -signal.SIGKILL
 
