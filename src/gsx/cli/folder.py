@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.train import verb_train
+from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
 from gsx.core.gaussians.suffixes import suffix_of
@@ -26,7 +27,9 @@ def train_from(arguments: list[str]) -> int:
     odd = next((word for word in overrides if "=" not in word or word.startswith(("scene=", "scene.path="))), "")
     if odd:
         raise ConfigError(f"gsx {arguments[0]}: '{odd}' does not go with it: it says itself what scene it is")
-    words = scene_words(path, overrides, plugins())
+    with loading():
+        loaded = plugins()
+    words = scene_words(path, overrides, loaded)
     logger.info("%s is %s", path, told(words, path))
     logger.info("%s", command(*words, *overrides))
     return verb_train([*words, *overrides])

@@ -1,6 +1,7 @@
 """Scenes from a folder with nothing but photos: reconstructed once, kept in the cache, then a COLMAP scene."""
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -129,6 +130,10 @@ def heic_sentence(folder: Path) -> str:
 
 def may_be_cut(photo: Path) -> bool:
     """Whether a JPEG has no mark of its end behind the begin of its last picture; other bytes behind may look so."""
+    with photo.open("rb") as file:
+        file.seek(-2, os.SEEK_END)
+        if file.read() == b"\xff\xd9":  # as nearly all end: the rest need not be read
+            return False
     content = photo.read_bytes()
     return content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda")
 

@@ -90,10 +90,9 @@ def uploaded_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device
 @torch.no_grad()
 def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings, fixed: FixedLists | None = None) -> Boxes:
     """Boxes of splats on the screen."""
-    grid = TileGrid.of(camera, settings.tile_size)
     rules = (
         settings.alpha_min,
-        grid.tile,
+        settings.tile_size,
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
