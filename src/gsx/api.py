@@ -26,7 +26,6 @@ from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
-from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings
@@ -43,6 +42,7 @@ from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table
+from gsx.formats.splat_files import read_gaussians
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
 

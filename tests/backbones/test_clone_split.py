@@ -29,8 +29,7 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
-from gsx.core.gaussians.ply import read_ply
-from gsx.core.gaussians.splat_files import splats_of, write_columns
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.density import within_room
@@ -38,6 +37,8 @@ from gsx.core.training.parameter_table import size_of
 from gsx.core.training.resolution import Resolution
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.settings import read_config, write_config
+from gsx.formats.ply import read_ply
+from gsx.formats.splat_files import write_columns
 
 WORDS = ("backbone=octree_gs3d", "backbone.densification=clone_split")
 CONTROL = LevelDensityOptions(update_ratio=0.2, bias_gradient=1.5, bias_step=0.01, shrink=0.6, volume_weight=0.01)

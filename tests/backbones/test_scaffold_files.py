@@ -9,10 +9,11 @@ from test_anchors import NAMES, NEURAL, small_anchors, stir
 
 from gsx.backbones.anchor_grids import LevelGrids
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import read_ply
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import rasterize
+from gsx.formats.ply import read_ply
+from gsx.formats.splat_files import read_gaussians, write_columns, write_gaussians
 
 
 def numbers(prefix: str, count: int) -> list[str]:

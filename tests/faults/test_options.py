@@ -15,9 +15,9 @@ from tiny import OVERRIDES
 from faults.children import Ended, command, in_child, preload
 from faults.record import record, some
 from gsx.builtin import plugins
-from gsx.core.gaussians.ply import read_ply
 from gsx.core.options import flattened
 from gsx.experiments.runs.compose import compose
+from gsx.formats.ply import read_ply
 
 pytestmark = pytest.mark.faults
 

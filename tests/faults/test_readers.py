@@ -24,8 +24,6 @@ from gsx.builtin import plugins
 from gsx.core.data.images import read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import GsxError
-from gsx.core.gaussians.ply import read_ply, write_ply
-from gsx.core.gaussians.splat_files import read_gaussians, write_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.training import checkpoint
 from gsx.experiments.reports.report import write_report
@@ -33,6 +31,8 @@ from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe
 from gsx.experiments.runs.open import open_run
+from gsx.formats.ply import read_ply, write_ply
+from gsx.formats.splat_files import read_gaussians, write_gaussians
 
 pytestmark = pytest.mark.faults
 

@@ -17,11 +17,11 @@ from gsx.builtin import plugins
 from gsx.core.data.images import write_image
 from gsx.core.data.resize import resize
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.ply import write_ply
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
+from gsx.formats.ply import write_ply
 from gsx.scenes.blender import BlenderOptions, box_averaged, load
 
 FOV = 2 * math.atan(0.5)  # the focal length is the width

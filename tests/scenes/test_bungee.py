@@ -15,7 +15,7 @@ from gsx.core.data.camera import look_at
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.ply import write_ply
+from gsx.formats.ply import write_ply
 from gsx.scenes.bungee import (
     BungeeOptions,
     city_points,

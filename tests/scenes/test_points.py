@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import write_ply
+from gsx.formats.ply import write_ply
 from gsx.scenes.points import random_points, read_points
 
 

@@ -14,7 +14,7 @@ from synthetic_colmap import shipped
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import write_ply
+from gsx.formats.ply import write_ply
 from gsx.scenes.transforms import TransformsOptions, load
 
 WIDTH, HEIGHT = 120, 90

@@ -23,12 +23,10 @@ from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.sky import far_away
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
-from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
-from gsx.core.gaussians.splat_files import columns_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
 from gsx.core.shapes import Float, Int
@@ -38,6 +36,7 @@ from gsx.core.training.density import add_statistics, densification_statistics, 
 from gsx.core.training.evidence import some_of
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
+from gsx.formats.splat_files import columns_of
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:

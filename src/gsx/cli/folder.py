@@ -10,8 +10,8 @@ from gsx.cli.train import verb_train
 from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
-from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.plugins import Plugins
+from gsx.formats.suffixes import suffix_of
 
 logger = logging.getLogger("gsx.cli")
 

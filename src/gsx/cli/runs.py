@@ -11,9 +11,9 @@ from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_argume
 from gsx.cli.train import tell_report
 from gsx.core.collector import loading
 from gsx.core.errors import InputError
-from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.ranges import Range
 from gsx.experiments.runs.job import train
+from gsx.formats.suffixes import suffix_of
 
 logger = logging.getLogger("gsx.cli")
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import read_ply
 from gsx.core.shapes import Float, UInt8
+from gsx.formats.ply import read_ply
 
 GREY = 127  # colour of points without one: the published random clouds store this byte
 

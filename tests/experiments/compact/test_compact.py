@@ -17,7 +17,6 @@ from gsx.cli.dispatch import main
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import read_ply
 from gsx.core.plugins import hookimpl
 from gsx.core.quality.metrics import psnr
 from gsx.core.training import evidence
@@ -43,6 +42,7 @@ from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.settings import Settings
+from gsx.formats.ply import read_ply
 
 
 @pytest.fixture(scope="module", autouse=True)

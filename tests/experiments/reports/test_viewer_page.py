@@ -12,12 +12,12 @@ from tiny import tiny_run
 
 from gsx.builtin import plugins
 from gsx.core.data.images import read_image
-from gsx.core.gaussians.splat_files import write_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.render import render
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.open import open_run
+from gsx.formats.splat_files import write_gaussians
 
 ZOOM = 10
 """Times the tiny pictures, of 48 x 36 px."""

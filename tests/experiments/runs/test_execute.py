@@ -15,13 +15,13 @@ from tiny import final_tensors, tiny_run, tiny_settings
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import CheckpointError, ConfigError, InputError, LostModel
-from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
 from gsx.experiments.runs.evaluate import remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
+from gsx.formats.splat_files import read_gaussians
 
 
 def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:

@@ -13,7 +13,7 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
 from gsx.experiments.run_folder.files import read_run, state_of
@@ -22,6 +22,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.start_file import composition_of
+from gsx.formats.splat_files import read_gaussians, write_gaussians
 
 SCENE = [word for word in OVERRIDES if not word.startswith("backbone")]
 

@@ -14,7 +14,6 @@ from torch.nn.functional import logsigmoid
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.splat_files import write_gaussians
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.reference import render_reference
@@ -39,6 +38,7 @@ from gsx.experiments.trade.rasterizer.knobs import (
 from gsx.experiments.trade.rasterizer.measure import at_pace, resolved, sweep, timed, unsteady, usable_paths
 from gsx.experiments.trade.rasterizer.page import write_trade
 from gsx.experiments.trade.rasterizer.subject import Shot, Subject, framing_cameras, open_subject
+from gsx.formats.splat_files import write_gaussians
 
 
 def row(ratio: float, error: float, knob: str = "chunk", most: float | None = None, **changes: Any) -> Row:

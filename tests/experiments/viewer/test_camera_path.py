@@ -11,9 +11,9 @@ import torch
 from gsx.cli.dispatch import main
 from gsx.core.data.images import read_image
 from gsx.core.errors import InputError
-from gsx.core.gaussians.splat_files import write_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, read_camera_path, write_camera_path
+from gsx.formats.splat_files import write_gaussians
 
 QUARTER = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 """A quarter turn about y."""

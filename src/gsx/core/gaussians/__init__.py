@@ -1,1 +1,1 @@
-"""Gaussians: their parameters, harmonics and rotations, their neighbours, their files."""
+"""Gaussians: their parameters, harmonics and rotations, their neighbours."""

@@ -6,9 +6,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.bands import BAND_0, bands, compiled_contraction, compiled_harmonics, harmonics_along
 from gsx.core.shapes import Float
+
+
+def degree_of(coefficients: int) -> int:
+    """Return the degree of spherical harmonics that have `coefficients` besides the constant one."""
+    return round((coefficients + 1) ** 0.5) - 1
 
 
 def harmonics(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]:

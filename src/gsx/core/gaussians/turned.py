@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsx.core.gaussians.arrays import degree_of
 from gsx.core.gaussians.quaternions import quaternions_of
-from gsx.core.gaussians.sh import harmonics
+from gsx.core.gaussians.sh import degree_of, harmonics
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 

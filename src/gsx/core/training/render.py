@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.sky import far_away
-from gsx.core.gaussians.splat_files import splats_of
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, TiledRendering, rasterize_tiled
 from gsx.core.shapes import Bool, Float

@@ -13,8 +13,6 @@ import torch
 
 from gsx.core.errors import ConfigError, InputError, command, first_line
 from gsx.core.files import read_json, replace_file, write_json
-from gsx.core.gaussians.splat_files import read_gaussians
-from gsx.core.gaussians.suffixes import STANDARD
 from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.threads import yielding_cores
@@ -42,6 +40,8 @@ from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings, write_config
 from gsx.experiments.runs.start_file import composition_of, starting_splats
 from gsx.experiments.runs.verified import verified
+from gsx.formats.splat_files import read_gaussians
+from gsx.formats.suffixes import STANDARD
 
 logger = logging.getLogger(__name__)
 

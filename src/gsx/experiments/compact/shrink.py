@@ -23,9 +23,8 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import TrainingError, first_line
-from gsx.core.gaussians.arrays import degree_of
-from gsx.core.gaussians.sh import colour_of_constant
-from gsx.core.gaussians.splat_files import splats_of
+from gsx.core.gaussians.drawn import splats_of
+from gsx.core.gaussians.sh import colour_of_constant, degree_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr

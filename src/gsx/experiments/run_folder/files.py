@@ -9,9 +9,9 @@ from typing import Any, TypeGuard
 
 from gsx.core.errors import command
 from gsx.core.files import is_file, read_json
-from gsx.core.gaussians.suffixes import suffix_of
 from gsx.experiments.run_folder.heads import checkpoint_problem, newest_checkpoint, splats_problem
 from gsx.experiments.run_folder.renamed import renamed
+from gsx.formats.suffixes import suffix_of
 
 DETAIL_OF = ("render", "enlarged", "photograph")
 """Pictures of a zoom whose explained detail is told, the model's own first."""

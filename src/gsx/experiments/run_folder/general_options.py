@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.options import label, without_effect
 from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Share, Steps
+from gsx.formats.suffixes import SUFFIXES, suffix_of
 
 BEGINNINGS = ("scratch", "warm_start")
 """Values of `init` that are no file; both train the same."""

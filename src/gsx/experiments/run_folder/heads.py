@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gsx.core.errors import InputError
 from gsx.core.files import read_json
-from gsx.core.gaussians.ply import length_of
+from gsx.formats.ply import length_of
 
 MOST_HEADER = 1 << 16
 """Bytes within which the header of a splat file ends."""

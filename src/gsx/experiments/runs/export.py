@@ -12,12 +12,8 @@ from gsx import __version__
 from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import View
 from gsx.core.errors import GsxError
-from gsx.core.gaussians.arrays import arrays_of, gaussians_from
-from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from gsx.core.gaussians.ply import write_whole
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_columns, write_gaussians
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.suffixes import STANDARD, refuse_suffix, suffix_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
@@ -30,6 +26,11 @@ from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
+from gsx.formats.arrays import arrays_of, gaussians_from
+from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.formats.ply import write_whole
+from gsx.formats.splat_files import read_gaussians, write_columns, write_gaussians
+from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
 
 PAGE = ".html"
 """A page with a viewer and the model in it."""

@@ -12,7 +12,6 @@ from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import remove_partial
-from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.shapes import Float
 from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render, render_gaussians
@@ -22,6 +21,7 @@ from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
+from gsx.formats.splat_files import read_gaussians
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import at_home
-from gsx.core.gaussians.suffixes import suffix_of
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share, beyond_range
@@ -30,6 +29,7 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
+from gsx.formats.suffixes import suffix_of
 
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""

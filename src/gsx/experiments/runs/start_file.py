@@ -11,13 +11,13 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.sh import constant_from_colour
-from gsx.core.gaussians.splat_files import compensated, read_gaussians
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
+from gsx.formats.splat_files import compensated, read_gaussians
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsx.core.errors import CheckpointError, InputError
-from gsx.core.gaussians.splat_files import read_gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.threads import yielding_cores
@@ -19,6 +18,7 @@ from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.pictures import FileModel, RunModel
 from gsx.experiments.viewer.server import Viewer
 from gsx.experiments.viewer.training import told_of
+from gsx.formats.splat_files import read_gaussians
 
 EVERY = 2.0
 """Seconds between looks at a run's folder."""

@@ -12,10 +12,9 @@ from torch.nn.functional import logsigmoid
 from gsx.core.data.camera import NEAR, Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.errors import ConfigError, InputError
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.neighbours import mean_square_distance
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.gaussians.suffixes import SUFFIXES, suffix_of
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
@@ -24,6 +23,8 @@ from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
+from gsx.formats.splat_files import read_gaussians
+from gsx.formats.suffixes import SUFFIXES, suffix_of
 
 FILE_SIZE = (640, 480)
 """Raster of the views of a splat file, px."""

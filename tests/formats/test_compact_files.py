@@ -16,16 +16,17 @@ from PIL import Image
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import arrays_of
-from gsx.core.gaussians.clusters import nearest_number, number_book, vector_book
-from gsx.core.gaussians.compressed_ply import encode_compressed_ply, packed_11_10_11
-from gsx.core.gaussians.glb import encode_glb
-from gsx.core.gaussians.ply import elements_of
-from gsx.core.gaussians.sog import encode_sog, mean_words, quaternion_bytes, signed_log
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.spz import encode_spz
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.formats.arrays import arrays_of
+from gsx.formats.clusters import nearest_number, number_book, vector_book
+from gsx.formats.compressed_ply import encode_compressed_ply, packed_11_10_11
+from gsx.formats.glb import encode_glb
+from gsx.formats.ply import elements_of
+from gsx.formats.sog import encode_sog, mean_words, quaternion_bytes, signed_log
+from gsx.formats.splat_files import read_gaussians, write_gaussians
+from gsx.formats.spz import encode_spz
 
 KINDS = (".compressed.ply", ".spz", ".sog", ".glb")
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.splat_files import compensated, read_gaussians, write_gaussians
 from gsx.core.gaussians.splats import Gaussians
+from gsx.formats.splat_files import compensated, read_gaussians, write_gaussians
 
 C0 = 0.28209479177387814
 VALUES = {"x": 1.0, "y": -2.0, "z": 0.5, "opacity": 0.847298, "scale_0": -4.60517, "scale_1": -3.91202,

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from gsx.core.errors import InputError
+from gsx.core.gaussians.sh import degree_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float, Int
 
@@ -30,11 +31,6 @@ class Arrays:
     def degree(self) -> int:
         """Of the spherical harmonics."""
         return degree_of(self.sh_rest.shape[1])
-
-
-def degree_of(coefficients: int) -> int:
-    """Degree of spherical harmonics with so many coefficients beside the constant one."""
-    return round((coefficients + 1) ** 0.5) - 1
 
 
 def arrays_of(gaussians: Gaussians) -> Arrays:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.splat_files import read_gaussians, splats_of, write_gaussians
+from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
+from gsx.formats.splat_files import read_gaussians, write_gaussians
 
 PROPERTIES = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]

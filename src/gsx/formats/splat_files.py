@@ -7,21 +7,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 
-from gsx.core.data.camera import offsets_from
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import Arrays, arrays_of, degree_of, gaussians_from
-from gsx.core.gaussians.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from gsx.core.gaussians.glb import decode_glb, encode_glb
-from gsx.core.gaussians.ply import HEADER_END, read_ply, write_ply, write_whole
-from gsx.core.gaussians.sh import colours_of, constant_from_colour
+from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.smoothing import smoothed_raw
-from gsx.core.gaussians.sog import decode_sog, encode_sog, sog_is_antialiased
-from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.gaussians.spz import decode_spz, encode_spz, is_antialiased
-from gsx.core.gaussians.suffixes import STANDARD, suffix_of
+from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
+from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
+from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.formats.glb import decode_glb, encode_glb
+from gsx.formats.ply import HEADER_END, read_ply, write_ply, write_whole
+from gsx.formats.sog import decode_sog, encode_sog, sog_is_antialiased
+from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
+from gsx.formats.suffixes import STANDARD, suffix_of
 
 logger = logging.getLogger(__name__)
 
@@ -203,20 +201,3 @@ def compensated(path: Path) -> bool:
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
     told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
     return bool(told) and told[-1]
-
-
-def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
-    """What a viewer of the file draws: all bands active (3D-GS, sh_utils.py)."""
-    degree = degree_of(gaussians.sh_rest.shape[1])
-    return Splats(
-        means=gaussians.means,
-        scales=gaussians.log_scales.exp(),
-        quats=gaussians.quats,
-        log_opacities=logsigmoid(gaussians.opacity_logits),
-        colours=colours_of(
-            gaussians.sh_dc[:, None],
-            gaussians.sh_rest,
-            offsets_from(gaussians.means, camera_centre),
-            degree,
-        ),
-    )

@@ -11,13 +11,8 @@ import zlib
 import numpy as np
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import (
-    Arrays,
-    from_smallest_three,
-    rounded,
-    smallest_three,
-)
 from gsx.core.shapes import Float, UInt8
+from gsx.formats.arrays import Arrays, from_smallest_three, rounded, smallest_three
 
 MAGIC, VERSION = 0x5053474E, 3
 HEADER = struct.Struct("<IIIBBBB")

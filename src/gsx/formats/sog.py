@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import Arrays, from_smallest_three, smallest_three
-from gsx.core.gaussians.clusters import nearest_number, number_book, vector_book
-from gsx.core.gaussians.compressed_ply import morton_order
 from gsx.core.packages import require
 from gsx.core.shapes import Float, Int, UInt8
+from gsx.formats.arrays import Arrays, from_smallest_three, smallest_three
+from gsx.formats.clusters import nearest_number, number_book, vector_book
+from gsx.formats.compressed_ply import morton_order
 
 VERSION = 2
 BOOK = 256

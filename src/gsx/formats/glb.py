@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import Arrays, degree_of
+from gsx.core.gaussians.sh import degree_of
 from gsx.core.shapes import Float
+from gsx.formats.arrays import Arrays
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 EXTENSION = "KHR_gaussian_splatting"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.ply import length_of, read_ply, write_ply
+from gsx.formats.ply import length_of, read_ply, write_ply
 
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\nproperty uchar red\nend_header\n"
 

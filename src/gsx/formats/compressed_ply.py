@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.arrays import Arrays, from_smallest_three, smallest_three
-from gsx.core.gaussians.ply import elements_of, header_of
 from gsx.core.gaussians.sh import BAND_0
 from gsx.core.shapes import Float, Int
+from gsx.formats.arrays import Arrays, from_smallest_three, smallest_three
+from gsx.formats.ply import elements_of, header_of
 
 CHUNK = 256
 """Splats of a chunk."""

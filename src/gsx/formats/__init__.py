@@ -1,0 +1,1 @@
+"""Files of splats and points: what each format holds, read and written."""
