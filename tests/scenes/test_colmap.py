@@ -24,7 +24,8 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.scenes import splits
 from gsx.scenes.colmap import load
-from gsx.scenes.colmap_model import check_binary, count_images
+from gsx.scenes.colmap_model import count_images
+from gsx.scenes.colmap_records import check_binary
 from gsx.scenes.posed import Shot
 from gsx.scenes.undistort import pinhole_of, sample, undistort, undistort_points
 

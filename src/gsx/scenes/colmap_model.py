@@ -1,14 +1,13 @@
 """COLMAP models as plain data: finding, checking and reading `cameras`, `images`, `points3D` (3D-GS).
 
 pycolmap reads every layout (binary and text, 3.x and 4.x with rigs and frames) but does not notice where a binary
-file ends: what lies past the end comes out as noise. The files are therefore walked record by record beforehand.
+file ends: what lies past the end comes out as noise. The files are therefore walked record by record beforehand
+(gsx.scenes.colmap_records).
 """
 
 import copy
 import logging
-import mmap
-import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,17 +19,13 @@ from torch import Tensor
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
+from gsx.scenes.colmap_records import U64, check_binary
 
 logger = logging.getLogger(__name__)
 
 REQUIRED = ("cameras", "images", "points3D")
 OBSERVATIONS_PER_IMAGE = 1000  # read of each image: the reprojection check is a median over all images
 
-U64, ID_MODEL_SIZE = struct.Struct("<Q"), struct.Struct("<iiQQ")
-RIG, SENSOR, FRAME = struct.Struct("<II"), struct.Struct("<iI?"), struct.Struct("<II7dI")
-RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and translation; (type, id, data id)
-IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
-POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
 QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
 
 
@@ -142,22 +137,6 @@ def read_model(folder: Path) -> Model:
     )
 
 
-def check_binary(folder: Path) -> None:
-    """Walk every binary file of a model to its end.
-
-    Raises:
-        InputError: a file ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
-    """
-    walks = {
-        "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig,
-        "frames": _skip_frame,
-    }  # fmt: skip
-    for name, skip in walks.items():
-        file = folder / f"{name}.bin"
-        if file.exists():
-            _walk(file, skip)
-
-
 def _suffix(folder: Path) -> str:
     """`.bin` or `.txt` for a model folder (binary first, as 3D-GS), else an empty string."""
     return next((suffix for suffix in (".bin", ".txt") if (folder / f"cameras{suffix}").is_file()), "")
@@ -174,75 +153,6 @@ def model_files(folder: Path) -> dict[str, Path]:
         if not file.is_file():
             raise InputError(f"The COLMAP model {folder} lacks {file.name}: copy the whole model folder again.")
     return files
-
-
-def _walk(file: Path, skip: Callable[[mmap.mmap, int], int]) -> None:
-    size = file.stat().st_size
-    if size < U64.size:
-        raise _truncated(file, 0, 0)
-    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        (count,) = U64.unpack_from(data, 0)
-        at = U64.size
-        for index in range(count):
-            try:
-                at = skip(data, at)
-            except struct.error:
-                raise _truncated(file, index, count) from None
-            except ValueError as problem:
-                raise InputError(f"{file} is corrupt at record {index}: {problem}; make the model again.") from None
-            if at > size:
-                raise _truncated(file, index, count)
-    if at < size:
-        raise InputError(
-            f"{file} goes on for {size - at} bytes after its {count} records: its count is wrong or its end foreign, "
-            "copy or make the model again."
-        )
-
-
-def _truncated(file: Path, index: int, count: int) -> InputError:
-    size = file.stat().st_size
-    return InputError(
-        f"{file} is truncated: its {size} bytes end within record {index} of {count}; copy or make the model again."
-    )
-
-
-def _skip_camera(data: mmap.mmap, at: int) -> int:
-    import pycolmap
-
-    _, model, width, height = ID_MODEL_SIZE.unpack_from(data, at)
-    known = {int(member): name for name, member in pycolmap.CameraModelId.__members__.items() if int(member) >= 0}
-    if model not in known:
-        raise ValueError(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
-    if not (0 < width < 2**31 and 0 < height < 2**31):
-        raise ValueError(f"a camera of {width}x{height} pixels")
-    parameters = pycolmap.Camera.create_from_model_name(1, known[model], 1.0, 1, 1).params
-    return at + ID_MODEL_SIZE.size + 8 * len(parameters)
-
-
-def _skip_image(data: mmap.mmap, at: int) -> int:
-    end = data.find(b"\0", at + IMAGE_HEAD)
-    if end < 0:
-        raise struct.error
-    (keypoints,) = U64.unpack_from(data, end + 1)
-    return int(end + 1 + U64.size + KEYPOINT * keypoints)
-
-
-def _skip_point(data: mmap.mmap, at: int) -> int:
-    (track,) = U64.unpack_from(data, at + POINT_HEAD)
-    return int(at + POINT_HEAD + U64.size + TRACK_ELEMENT * track)
-
-
-def _skip_rig(data: mmap.mmap, at: int) -> int:
-    _, sensors = RIG.unpack_from(data, at)
-    at += RIG.size + (RIG_REFERENCE if sensors else 0)
-    for _ in range(sensors - 1):
-        *_, posed = SENSOR.unpack_from(data, at)
-        at += SENSOR.size + (POSE if posed else 0)
-    return at
-
-
-def _skip_frame(data: mmap.mmap, at: int) -> int:
-    return int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1])
 
 
 def _reconstruction(folder: Path) -> Any:

@@ -1,0 +1,108 @@
+"""Binary records of COLMAP models: how they lie in a file, and the walk that finds where a file is cut or foreign."""
+
+import mmap
+import struct
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from gsx.core.errors import InputError
+
+U64, ID_MODEL_SIZE = struct.Struct("<Q"), struct.Struct("<iiQQ")
+RIG, SENSOR, FRAME = struct.Struct("<II"), struct.Struct("<iI?"), struct.Struct("<II7dI")
+RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and translation; (type, id, data id)
+IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
+POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
+
+
+def check_binary(folder: Path) -> None:
+    """Walk every binary file of a model to its end.
+
+    Raises:
+        InputError: a file ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
+    """
+    walks = {
+        "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig,
+        "frames": _skip_frame,
+    }  # fmt: skip
+    for name, skip in walks.items():
+        file = folder / f"{name}.bin"
+        if file.exists():
+            _walk(file, skip)
+
+
+def _walk(file: Path, skip: Callable[[mmap.mmap, int], int]) -> None:
+    size = file.stat().st_size
+    if size < U64.size:
+        raise _truncated(file, 0, 0)
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,) = U64.unpack_from(data, 0)
+        at = U64.size
+        for index in range(count):
+            try:
+                at = skip(data, at)
+            except struct.error:
+                raise _truncated(file, index, count) from None
+            except ValueError as problem:
+                raise InputError(f"{file} is corrupt at record {index}: {problem}; make the model again.") from None
+            if at > size:
+                raise _truncated(file, index, count)
+    if at < size:
+        raise InputError(
+            f"{file} goes on for {size - at} bytes after its {count} records: its count is wrong or its end foreign, "
+            "copy or make the model again."
+        )
+
+
+def _truncated(file: Path, index: int, count: int) -> InputError:
+    size = file.stat().st_size
+    return InputError(
+        f"{file} is truncated: its {size} bytes end within record {index} of {count}; copy or make the model again."
+    )
+
+
+def _skip_camera(data: mmap.mmap, at: int) -> int:
+    import pycolmap
+
+    _, model, width, height = ID_MODEL_SIZE.unpack_from(data, at)
+    if model not in camera_models():
+        raise ValueError(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
+    if not (0 < width < 2**31 and 0 < height < 2**31):
+        raise ValueError(f"a camera of {width}x{height} pixels")
+    return at + ID_MODEL_SIZE.size + 8 * camera_models()[model][1]
+
+
+@cache
+def camera_models() -> dict[int, tuple[str, int]]:
+    """Name and number of parameters of each camera model that pycolmap knows, by its number in files."""
+    import pycolmap
+
+    members = {int(member): name for name, member in pycolmap.CameraModelId.__members__.items() if int(member) >= 0}
+    make = pycolmap.Camera.create_from_model_name
+    return {number: (name, len(make(1, name, 1.0, 1, 1).params)) for number, name in members.items()}
+
+
+def _skip_image(data: mmap.mmap, at: int) -> int:
+    end = data.find(b"\0", at + IMAGE_HEAD)
+    if end < 0:
+        raise struct.error
+    (keypoints,) = U64.unpack_from(data, end + 1)
+    return int(end + 1 + U64.size + KEYPOINT * keypoints)
+
+
+def _skip_point(data: mmap.mmap, at: int) -> int:
+    (track,) = U64.unpack_from(data, at + POINT_HEAD)
+    return int(at + POINT_HEAD + U64.size + TRACK_ELEMENT * track)
+
+
+def _skip_rig(data: mmap.mmap, at: int) -> int:
+    _, sensors = RIG.unpack_from(data, at)
+    at += RIG.size + (RIG_REFERENCE if sensors else 0)
+    for _ in range(sensors - 1):
+        *_, posed = SENSOR.unpack_from(data, at)
+        at += SENSOR.size + (POSE if posed else 0)
+    return at
+
+
+def _skip_frame(data: mmap.mmap, at: int) -> int:
+    return int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1])
