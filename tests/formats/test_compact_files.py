@@ -25,7 +25,7 @@ from gsx.formats.compressed_ply import encode_compressed_ply, packed_11_10_11
 from gsx.formats.glb import encode_glb
 from gsx.formats.ply import elements_of
 from gsx.formats.sog import encode_sog, mean_words, quaternion_bytes, signed_log
-from gsx.formats.splat_files import read_gaussians, write_gaussians
+from gsx.formats.splat_files import compensated, read_gaussians, write_gaussians
 from gsx.formats.spz import encode_spz
 
 KINDS = (".compressed.ply", ".spz", ".sog", ".glb")
@@ -269,8 +269,19 @@ def test_spz_of_version_4_is_told_apart(tmp_path: Path) -> None:
 def test_a_compressed_ply_of_no_elements_is_told(tmp_path: Path) -> None:
     head = "ply\nformat binary_little_endian 1.0\nend_header\n"
     (tmp_path / "a.compressed.ply").write_text(head)
-    with pytest.raises(InputError, match="lacks packed splats"):
+    with pytest.raises(InputError, match="no vertices, its elements are: none"):
         read_gaussians(tmp_path / "a.compressed.ply")
+
+
+@pytest.mark.parametrize("kind", [".ply", *KINDS])
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.glb"])
+def test_files_are_read_by_their_first_bytes(tmp_path: Path, kind: str, name: str) -> None:
+    write_gaussians(tmp_path / f"b{kind}", many(5, 1))
+    expected = read_gaussians(tmp_path / f"b{kind}")
+    (tmp_path / name).write_bytes((tmp_path / f"b{kind}").read_bytes())
+    read = read_gaussians(tmp_path / name)
+    assert all(torch.equal(value, vars(expected)[field]) for field, value in vars(read).items())
+    assert compensated(tmp_path / name) is False
 
 
 def test_sog_of_a_splat_by_hand() -> None:

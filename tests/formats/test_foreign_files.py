@@ -46,7 +46,7 @@ def written(
     kinds = [types.get(name, "float") for name in names]
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {one}" for one in comments)]
     head += [f"element vertex {len(rows)}", *(f"property {k} {n}" for k, n in zip(kinds, names, strict=True))]
-    code = "<" + "".join({"float": "f", "uchar": "B", "double": "d"}[kind] for kind in kinds)
+    code = "<" + "".join({"float": "f", "uchar": "B", "ushort": "H", "double": "d"}[kind] for kind in kinds)
     body = [struct.pack(code, *(row.get(name, value_of(name)) for name in names)) for row in rows]
     path.write_bytes("\n".join([*head, "end_header", ""]).encode() + b"".join(body))
     return path
@@ -84,6 +84,62 @@ def test_colours_in_bytes_become_the_constant_band(tmp_path: Path) -> None:
     assert (0.5 + C0 * read.sh_dc[0]).tolist() == pytest.approx([1.0, 0.0, 0.2], abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), tuple("rgb")]
+)
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("uchar", (255, 0, 51)),
+        ("ushort", (65535, 0, 13107)),
+        ("ushort", (255, 0, 51)),
+        ("float", (1.0, 0.0, 0.2)),
+        ("double", (1.0, 0.0, 0.2)),
+        ("float", (255.0, 0.0, 51.0)),
+    ],
+)
+def test_colours_of_any_unit_become_the_constant_band(
+    tmp_path: Path, names: tuple[str, ...], kind: str, values: tuple[float, ...]
+) -> None:
+    properties = [*XYZ, *names, "opacity", *SCALES, *ROTATION]
+    row = dict(zip(names, values, strict=True))
+    read = read_gaussians(written(tmp_path / "a.ply", properties, [row], types=dict.fromkeys(names, kind)))
+    assert (0.5 + C0 * read.sh_dc[0]).tolist() == pytest.approx([1.0, 0.0, 0.2], abs=1e-6)
+
+
+def test_colours_of_no_known_unit_are_refused(tmp_path: Path) -> None:
+    names = [*XYZ, "red", "green", "blue", "opacity", *SCALES, *ROTATION]
+    with pytest.raises(InputError, match=r"from -3 to 9000 are of no known unit: export bytes, or floats in \[0, 1\]"):
+        read_gaussians(written(tmp_path / "a.ply", names, [{"red": -3.0, "green": 9000.0}]))
+
+
+@pytest.mark.parametrize(("kind", "value"), [("uchar", 51), ("float", 0.2), ("double", 0.2), ("ushort", 13107)])
+def test_alpha_stands_in_for_a_missing_opacity(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, value: float
+) -> None:
+    names = [*XYZ, *DC, "alpha", *SCALES, *ROTATION]
+    read = read_gaussians(written(tmp_path / "a.ply", names, [{"alpha": value}], types={"alpha": kind}))
+    assert float(read.opacity_logits.sigmoid()) == pytest.approx(0.2, rel=1e-6)
+    assert "a.ply: property opacity is missing, alpha is taken for it" in caplog.text
+
+
+def test_doubles_are_read_and_those_beyond_floats_are_left_out(tmp_path: Path) -> None:
+    names = ORDERS["INRIA"]
+    rows = [{"x": 1.0}, {"x": 1e300}]
+    read = read_gaussians(written(tmp_path / "a.ply", names, rows, types=dict.fromkeys(names, "double")))
+    assert read.means.tolist() == [[1.0, -2.0, 0.5]]
+
+
+def test_big_endian_files_with_faces_first_are_read(tmp_path: Path) -> None:
+    little = written(tmp_path / "a.ply", ORDERS["gsplat"]).read_bytes()
+    head, _, body = little.partition(b"end_header\n")
+    head = head.replace(b"little", b"big").replace(b"element", b"element face 1\nproperty list uchar int i\nelement", 1)
+    swapped = struct.pack(f">{len(body) // 4}f", *struct.unpack(f"<{len(body) // 4}f", body))
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + struct.pack(">Biii", 3, 0, 0, 0) + swapped)
+    read, expected = read_gaussians(tmp_path / "b.ply"), read_gaussians(tmp_path / "a.ply")
+    assert all(torch.equal(value, vars(expected)[field]) for field, value in vars(read).items())
+
+
 def test_rotations_of_any_length_draw_the_same(tmp_path: Path) -> None:
     """OpenSplat does not normalise them."""
     row = {name: 7 * value_of(name) for name in ROTATION}
@@ -117,6 +173,28 @@ def test_rows_that_are_not_finite_are_left_out_and_told(tmp_path: Path, caplog: 
     [
         ([*XYZ, *DC, "opacity", *SCALES[:2], *ROTATION], "lacks property 'scale_2'.*flat splats"),
         ([*XYZ, "opacity", *SCALES, *ROTATION], "'f_dc_0', or red, green and blue"),
+        ([*XYZ, *NORMALS], "'scale_0' and is a point cloud: give it as scene.points=FILE"),
+        ([*XYZ, "red", "green", "blue", "alpha"], "is a point cloud"),
+        ([*XYZ, *DC], "is no splat file of 3D-GS: export it anew"),
+        (["u", "v"], "lacks property 'x' and is no splat file of 3D-GS, but has u, v"),
+        (
+            [
+                *XYZ,
+                *[f"f_offset_{i}" for i in range(30)],
+                "f_anchor_feat_0",
+                "opacity",
+                "scale_0",
+                "scale_1",
+                "scale_2",
+                "scale_3",
+                *ROTATION,
+            ],
+            "it holds anchors of Scaffold-GS, whose Gaussians a network decodes.*--bake",
+        ),
+        ([*XYZ, "level", "extra_level", "f_anchor_feat_0", *SCALES, *ROTATION], "it holds anchors of Octree-GS"),
+        ([*XYZ, "trbf_center", "motion_0", *SCALES, *ROTATION], "splats that move"),
+        (["packed_position", "packed_rotation", "packed_scale", "packed_color"], "lacks packed splats"),
+        ([*XYZ, *DC[:1], "opacity", *SCALES, *ROTATION], "lacks property 'f_dc_1'"),
         ([*XYZ, *DC, *rest(44), "opacity", *SCALES, *ROTATION], "44 f_rest properties"),
         ([*XYZ, *DC, *rest(8), "f_rest_9", "opacity", *SCALES, *ROTATION], "from 0 to 8"),
     ],
@@ -124,6 +202,14 @@ def test_rows_that_are_not_finite_are_left_out_and_told(tmp_path: Path, caplog: 
 def test_what_is_missing_is_named(tmp_path: Path, names: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         read_gaussians(written(tmp_path / "a.ply", names))
+
+
+def test_a_mesh_is_named(tmp_path: Path) -> None:
+    content = written(tmp_path / "a.ply", [*XYZ, *NORMALS]).read_bytes()
+    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header"
+    (tmp_path / "a.ply").write_bytes(content.replace(b"end_header", faces) + struct.pack("<Biii", 3, 0, 0, 0))
+    with pytest.raises(InputError, match="is a mesh: give splats"):
+        read_gaussians(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(

@@ -64,24 +64,73 @@ def test_no_vertices(tmp_path: Path) -> None:
     assert read_ply(tmp_path / "b.ply")["x"].shape == (0,)
 
 
+FACES = b"property list uchar int vertex_indices\n"
+TRIANGLES = [(0, 1, 0), (1, 0, 1)]
+
+
+def corners(faces: list[tuple[int, ...]], order: str) -> bytes:
+    return b"".join(struct.pack(f"{order}B{len(face)}i", len(face), *face) for face in faces)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("faces", [[], TRIANGLES, [(0, 1), (0, 1, 0, 1, 0), (1,)]], ids=["none", "triangles", "mixed"])
+def test_elements_before_the_vertices_are_skipped(tmp_path: Path, order: str, faces: list[tuple[int, ...]]) -> None:
+    layout = b"binary_little_endian" if order == "<" else b"binary_big_endian"
+    head = b"ply\nformat " + layout + b" 1.0\nelement camera 1\nproperty double fx\nproperty uchar id\n"
+    head += f"element face {len(faces)}\n".encode() + FACES
+    head += b"element vertex 2\nproperty float x\nproperty short level\nelement edge 9\nproperty list int int all\n"
+    body = struct.pack(f"{order}dB", 1e9, 7) + corners(faces, order) + struct.pack(f"{order}fhfh", 1.5, -2, -0.25, 300)
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body)
+    columns = read_ply(tmp_path / "a.ply")
+    assert {name: column.tolist() for name, column in columns.items()} == {"x": [1.5, -0.25], "level": [-2, 300]}
+    assert columns["x"].dtype == np.float32
+    for end in range(len(head + b"end_header\n"), len(head + b"end_header\n" + body)):
+        (tmp_path / "a.ply").write_bytes((head + b"end_header\n" + body)[:end])
+        with pytest.raises(InputError, match=r"it ends (within|after)"):
+            read_ply(tmp_path / "a.ply")
+
+
+def test_text_with_faces_before_the_vertices(tmp_path: Path) -> None:
+    text = "ply\nformat ascii 1.0\nelement face 2\nproperty list uchar int vertex_indices\nelement vertex 2\n"
+    text += "property float x\nend_header\n3 0 1 0\n\n4 0 1 0 1\n0.5\n-7\n"
+    (tmp_path / "a.ply").write_text(text)
+    assert read_ply(tmp_path / "a.ply")["x"].tolist() == [0.5, -7]
+
+
+def test_a_list_longer_than_the_file_is_refused(tmp_path: Path) -> None:
+    head = b"ply\nformat binary_little_endian 1.0\nelement face 1\nproperty list int int all\nelement vertex 0\n"
+    for length in (-1, 2**31 - 1):
+        (tmp_path / "a.ply").write_bytes(head + b"property int x\nend_header\n" + struct.pack("<i", length))
+        with pytest.raises(InputError, match="it ends within its element 'face'"):
+            read_ply(tmp_path / "a.ply")
+
+
+ASCII = HEADER.replace(b"binary_little_endian", b"ascii")
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "no complete PLY header"),
         (b"solid cube\nend_header\n", "no complete PLY header"),
-        (b"ply\nformat ascii 1.0\nelement\nend_header\n", "does not begin with vertices"),
-        (b"ply\nformat ascii 1.0\nelement vertex\nend_header\n", "does not begin with vertices"),
-        (b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n", "does not begin with vertices"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "no vertices, its elements are: none"),
+        (b"ply\nformat ascii 1.0\nelement\nend_header\n", "names no element with its number"),
+        (b"ply\nformat ascii 1.0\nelement vertex\nend_header\n", "names no element with its number"),
+        (b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n", "names no element"),
         (HEADER[:40], "no complete PLY header"),
-        (HEADER + b"\0" * 9, "ends after 1 of 2 vertices"),
-        (HEADER.replace(b"little", b"big"), "binary_big_endian"),
-        (HEADER.replace(b"vertex", b"face"), "does not begin with vertices"),
-        (HEADER.replace(b"property float x", b"property list uchar int x"), "property list uchar int x"),
-        (HEADER.replace(b"property float x\nproperty uchar red\n", b""), "no vertex property or one twice"),
-        (HEADER.replace(b"red", b"x"), "no vertex property or one twice"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1 2\n", "ends after 1 of 2 vertices"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1 2\n3 red\n", "unreadable vertex"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1 2\n3\n", "unreadable vertex"),
+        (HEADER + b"\0" * 9, "ends after 1 of 2 rows of 'vertex'"),
+        (HEADER.replace(b"little", b"middle"), "format binary_middle_endian"),
+        (HEADER.replace(b"vertex", b"face"), "no vertices, its elements are: face"),
+        (HEADER.replace(b"property float x", b"property list uchar int x"), "lists in vertex property 'x'"),
+        (HEADER.replace(b"property float x", b"property list float int x"), "'property list float int x' in element"),
+        (HEADER.replace(b"property float x", b"property half x"), "'property half x' in element 'vertex'"),
+        (HEADER.replace(b"property float x\nproperty uchar red\n", b""), "no property of element 'vertex'"),
+        (HEADER.replace(b"red", b"x"), "no property of element 'vertex', or one twice"),
+        (HEADER.replace(b"end_header", b"element vertex 2\nproperty int y\nend_header"), "two elements 'vertex'"),
+        (ASCII + b"1 2\n", "ends after 1 of 2 rows of 'vertex'"),
+        (ASCII + b"1 2\n3 red\n", "unreadable row of 'vertex'"),
+        (ASCII + b"1 2\n3\n", "unreadable row of 'vertex'"),
+        (ASCII + b"1 2\n# 3 4\n", "unreadable row of 'vertex'"),
     ],
 )
 def test_unusable_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:

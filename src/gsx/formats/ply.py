@@ -1,9 +1,11 @@
-"""PLY files with one table of scalars per vertex: splats and point clouds (3D-GS, save_ply).
+"""PLY files: tables of scalars by element, such as vertices of splats and of point clouds (3D-GS, save_ply).
 
-Reads binary little-endian and ascii, writes binary little-endian. Elements after the vertices are ignored.
+Reads ascii and both binary byte orders, writes binary little-endian. Other elements than the wanted one are skipped,
+also those before it and those with lists, such as faces.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,7 +18,10 @@ TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4"
 TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
 TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
 """numpy's names of PLY's types, under both generations of names; the first name of each is written."""
-
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+"""numpy's mark of the byte order of each kind of body."""
+VERTICES = "vertex"
+"""The element of points and splats."""
 
 HEADER_END = b"\nend_header"
 """Of a PLY, at the beginning of a line."""
@@ -24,23 +29,227 @@ MOST_DIGITS = 15
 """Of a number of vertices: a file with more does not exist."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Element:
+    """One element of a header: its name, its number of rows, and its properties in order."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str, str], ...]
+    """(name, numpy's type of its values, that of a list's length; empty for a scalar)."""
+
+    @property
+    def scalar(self) -> bool:
+        """Return whether no property is a list: all rows are of one size."""
+        return not any(length for _, _, length in self.properties)
+
+    def row(self, order: str, lengths: Sequence[int] = ()) -> np.dtype:
+        """Return the type of one row; `lengths`: of its lists, in order."""
+        rest, fields = iter(lengths), []
+        for number, (name, kind, length) in enumerate(self.properties):
+            if length:
+                fields += [(f"{number} length", order + length), (f"{number} items", order + kind, (next(rest),))]
+            else:
+                fields.append((name, order + kind))
+        return np.dtype(fields)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """The header of a PLY."""
+
+    size: int
+    """Bytes up to the body."""
+    layout: str
+    """A key of ORDERS."""
+    elements: tuple[Element, ...]
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
 def read_ply(path: str | Path) -> dict[str, np.ndarray]:
-    """The vertex properties by name, each an array [vertices] of the type stored.
+    """Return the vertex properties by name, each an array [vertices] of the type stored.
 
     Raises:
-        InputError: the file is missing, is no PLY of the kinds above, or ends early.
+        InputError: the file is missing, is no PLY with vertices of scalars, or ends early.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"Point file '{path}' does not exist, check the path.")
-    data = path.read_bytes()
-    body = header_length(data)
-    if not data.startswith(b"ply") or not body:
-        raise InputError(f"'{path}' has no complete PLY header, export it anew as PLY.")
-    lines = [line.split() for line in data[:body].decode("latin-1").splitlines()]
-    layout, count, table = _layout(lines, path)
-    rows = _ascii(data[body:], count, table, path) if layout == "ascii" else _binary(data, body, count, table, path)
-    return {name: np.ascontiguousarray(rows[name]) for name in table.names or ()}
+    try:
+        return vertices_of(path.read_bytes())
+    except (OSError, InputError) as problem:
+        raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
+
+
+def vertices_of(content: bytes) -> dict[str, np.ndarray]:
+    """Return the vertex properties of a file's content, in native byte order.
+
+    Raises:
+        InputError: as `read_ply`; the file is called "it".
+    """
+    header = header_in(content)
+    position = next((i for i, element in enumerate(header.elements) if element.name == VERTICES), -1)
+    if position < 0:
+        names = ", ".join(element.name for element in header.elements) or "none"
+        raise InputError(f"it has no vertices, its elements are: {names}; save it as a plain point cloud")
+    element = header.elements[position]
+    if not element.scalar:
+        name = next(name for name, _, length in element.properties if length)
+        raise InputError(f"it has lists in vertex property '{name}', only scalar ones can be read: save it without")
+    rows = table_at(content, header, position)
+    return {name: np.ascontiguousarray(rows[name].astype(rows[name].dtype.newbyteorder("=")))
+            for name, _, _ in element.properties}  # fmt: skip
+
+
+def elements_of(content: bytes) -> dict[str, np.ndarray]:
+    """Return all elements of scalars by name, as structured arrays.
+
+    Raises:
+        InputError: it is no PLY, or ends early.
+    """
+    header = header_in(content)
+    elements = enumerate(header.elements)
+    return {element.name: table_at(content, header, i) for i, element in elements if element.scalar}
+
+
+def table_at(content: bytes, header: Header, position: int) -> np.ndarray:
+    """Return the rows of the element at a position, which has no lists.
+
+    Raises:
+        InputError: the file ends before them, or a row cannot be read.
+    """
+    element = header.elements[position]
+    if header.layout == "ascii":
+        return _ascii(content[header.size :], header.elements[:position], element)
+    start, order = header.size, ORDERS[header.layout]
+    for other in header.elements[:position]:
+        start += _size(content, start, other, order)
+    table = element.row(order)
+    if len(content) - start < element.count * table.itemsize:
+        present = max(0, len(content) - start) // table.itemsize
+        raise InputError(f"it ends after {present} of {element.count} rows of '{element.name}': copy or export it anew")
+    return np.frombuffer(content, table, element.count, start)
+
+
+def header_in(content: bytes) -> Header:
+    """Return the header of a file, which may have lost its body.
+
+    Raises:
+        InputError: it has none, or one that contradicts itself.
+    """
+    size = header_length(content)
+    if not content.startswith(b"ply") or not size:
+        raise InputError("it has no complete PLY header: export it anew as PLY")
+    lines = [line.split() for line in content[:size].decode("latin-1").splitlines()]
+    layout = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "missing")
+    if layout not in ORDERS:
+        raise InputError(f"it has format {layout}: save it as binary_little_endian")
+    return Header(size=size, layout=layout, elements=tuple(_elements(lines)))
+
+
+def header_length(content: bytes) -> int:
+    """Return the bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
+    end = content.find(HEADER_END)
+    return content.find(b"\n", end + 1) + 1 if end >= 0 else 0
+
+
+def length_of(head: bytes) -> int:
+    """Return the bytes of the binary file that begins so, by its header.
+
+    Raises:
+        InputError: it has no complete header of a binary PLY of scalar properties.
+    """
+    header = header_in(head)
+    if header.layout == "ascii" or not all(element.scalar for element in header.elements):
+        raise InputError("it has no header of a binary PLY of scalars: export it anew")
+    return header.size + sum(element.count * element.row("<").itemsize for element in header.elements)
+
+
+def _elements(lines: list[list[str]]) -> Iterable[Element]:
+    """Yield the elements of a header."""
+    starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
+    names = set()
+    for start, stop in pairwise([*starts, len(lines)]):
+        words = lines[start]
+        if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MOST_DIGITS:
+            raise InputError(f"it has '{' '.join(words)[:80]}', which names no element with its number: export it anew")
+        if words[1] in names:
+            raise InputError(f"it has two elements '{words[1]}': export it anew")
+        names.add(words[1])
+        rows = [line for line in lines[start:stop] if line[:1] == ["property"]]
+        properties = tuple(_property(line, words[1]) for line in rows)
+        if len({name for name, _, _ in properties}) < len(properties) or not properties:
+            raise InputError(f"it names no property of element '{words[1]}', or one twice: export it anew")
+        yield Element(name=words[1], count=int(words[2]), properties=properties)
+
+
+def _property(words: list[str], element: str) -> tuple[str, str, str]:
+    """Return (name, type, type of a list's length) of a line of a header."""
+    if len(words) == 3 and words[1] in TYPES:
+        return words[2], TYPES[words[1]], ""
+    if len(words) == 5 and words[1] == "list" and {words[2], words[3]} <= TYPES.keys() and TYPES[words[2]][0] != "f":
+        return words[4], TYPES[words[3]], TYPES[words[2]]
+    raise InputError(f"it has '{' '.join(words)[:80]}' in element '{element}', which is no property: export it anew")
+
+
+def _size(content: bytes, start: int, element: Element, order: str) -> int:
+    """Return the bytes of an element of a binary file.
+
+    Raises:
+        InputError: the file ends within it.
+    """
+    if element.scalar:
+        return element.count * element.row(order).itemsize
+    if not element.count:
+        return 0
+    equal = element.row(order, _row_end(content, start, element, order)[1])
+    size = element.count * equal.itemsize
+    if len(content) - start >= size:  # faces often have one number of corners
+        rows = np.frombuffer(content, equal, element.count, start)
+        lengths = [rows[name] for name in equal.names or () if name.endswith(" length")]
+        if all((values == values[0]).all() for values in lengths):
+            return size
+    end = start
+    for _ in range(element.count):
+        end, _ = _row_end(content, end, element, order)
+    return end - start
+
+
+def _row_end(content: bytes, start: int, element: Element, order: str) -> tuple[int, list[int]]:
+    """Return the end of the row with lists that begins at a byte, and how long its lists are.
+
+    Raises:
+        InputError: the file ends within it.
+    """
+    lengths: list[int] = []
+    for _, kind, length in element.properties:
+        if length and start + np.dtype(length).itemsize <= len(content):
+            lengths.append(int(np.frombuffer(content, order + length, 1, start)[0]))
+        start += np.dtype(kind).itemsize * (lengths[-1] if length and lengths else 1)
+        start += np.dtype(length).itemsize if length else 0
+        if start > len(content) or min(lengths, default=0) < 0:
+            raise InputError(f"it ends within its element '{element.name}': copy or export it anew")
+    return start, lengths
+
+
+def _ascii(body: bytes, before: Sequence[Element], element: Element) -> np.ndarray:
+    """Return the rows of an element of a text file, one line each, after those of the elements before it."""
+    first = sum(other.count for other in before)
+    lines = [line for line in body.decode("latin-1").splitlines() if line.strip()][first : first + element.count]
+    table = element.row("<")
+    if len(lines) < element.count:
+        raise InputError(
+            f"it ends after {len(lines)} of {element.count} rows of '{element.name}': copy or export it anew"
+        )
+    try:
+        return np.loadtxt(lines, table, ndmin=1, comments=None) if lines else np.empty(0, table)
+    except (ValueError, OverflowError) as problem:
+        raise InputError(f"it has an unreadable row of '{element.name}' ({problem}): export it anew") from None
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
 
 
 def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = ()) -> None:
@@ -61,7 +270,7 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     rows = np.empty(next(iter(counts)), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
     for name, column in columns.items():
         rows[name] = column
-    header = header_of({"vertex": (len(rows), {name: names[code] for name, code in codes.items()})}, comments)
+    header = header_of({VERTICES: (len(rows), {name: names[code] for name, code in codes.items()})}, comments)
     write_whole(path, header + rows.tobytes())
 
 
@@ -78,109 +287,13 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: Iterable[str] = ()) -> bytes:
-    """The header of a binary file; elements: how many there are of each name, and their properties with PLY's types."""
+    """Return the header of a binary file; elements: rows of each, and its properties with PLY's types."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
     for name, (count, properties) in elements.items():
         lines += [f"element {name} {count}", *(f"property {kind} {inner}" for inner, kind in properties.items())]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def elements_of(content: bytes) -> dict[str, np.ndarray]:
-    """All elements of a binary file by name, as structured arrays.
-
-    Raises:
-        InputError: it is no binary PLY of scalar properties, or ends early.
-    """
-    body, lines = _binary_header(content)
-    found: dict[str, np.ndarray] = {}
-    for name, count, kinds in _elements(lines):
-        if len(content) - body < count * kinds.itemsize:
-            raise InputError(f"it ends within its element '{name}': copy or export it anew")
-        found[name] = np.frombuffer(content, kinds, count, body)
-        body += count * kinds.itemsize
-    return found
-
-
-def length_of(head: bytes) -> int:
-    """Bytes of the binary file that begins so, by its header.
-
-    Raises:
-        InputError: it has no complete header of a binary PLY of scalar properties.
-    """
-    body, lines = _binary_header(head)
-    return body + sum(count * kinds.itemsize for _, count, kinds in _elements(lines))
-
-
-def header_length(content: bytes) -> int:
-    """Bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
-    end = content.find(HEADER_END)
-    return content.find(b"\n", end + 1) + 1 if end >= 0 else 0
-
-
-def _binary_header(content: bytes) -> tuple[int, list[list[str]]]:
-    """Length of the header, and the words of its lines."""
-    body = header_length(content)
-    lines = [line.split() for line in content[:body].decode("latin-1").splitlines()]
-    whole = content.startswith(b"ply") and ["end_header"] in lines
-    if not whole or ["format", "binary_little_endian", "1.0"] not in lines:
-        raise InputError("it has no complete header of a binary PLY: export it anew")
-    return body, lines
-
-
-def _elements(lines: list[list[str]]) -> list[tuple[str, int, np.dtype]]:
-    """Name, number and type of the elements that a header tells."""
-    starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
-    found = []
-    for start, stop in pairwise([*starts, len(lines)]):
-        words = lines[start]
-        properties = [line for line in lines[start:stop] if line[:1] == ["property"]]
-        if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MOST_DIGITS:
-            raise InputError(f"'{' '.join(words)}' names no element with its number: export it anew")
-        if not properties or any(len(one) != 3 or one[1] not in TYPES for one in properties):
-            raise InputError(f"its element '{words[1]}' has not only scalar properties: export it anew")
-        if len({name for _, _, name in properties}) < len(properties):
-            raise InputError(f"its element '{words[1]}' names a property twice: export it anew")
-        kinds = np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
-        found.append((words[1], int(words[2]), kinds))
-    return found
-
-
 def plain(comment: str) -> str:
-    """In one line of ASCII, all that headers may hold; other characters become escapes."""
+    """Return a comment in one line of ASCII, all that headers may hold; other characters become escapes."""
     return " ".join(comment.split()).encode("ascii", "backslashreplace").decode()
-
-
-def _layout(lines: list[list[str]], path: Path) -> tuple[str, int, np.dtype]:
-    """Kind of body, number of vertices and the type of one of them."""
-    layout = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "missing")
-    if layout not in ("ascii", "binary_little_endian"):
-        raise InputError(f"'{path}' has format {layout}, save it as binary_little_endian.")
-    elements = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
-    first = lines[elements[0]] if elements else []
-    if first[1:2] != ["vertex"] or len(first) != 3 or not first[2].isdecimal() or len(first[2]) > MOST_DIGITS:
-        raise InputError(f"'{path}' does not begin with vertices, save it as a plain point cloud.")
-    stop = elements[1] if len(elements) > 1 else len(lines)
-    properties = [words for words in lines[elements[0] : stop] if words[:1] == ["property"]]
-    unknown = next((words for words in properties if len(words) != 3 or words[1] not in TYPES), None)
-    if unknown is not None:
-        raise InputError(f"'{path}' has '{' '.join(unknown)}', only scalar vertex properties can be read.")
-    if not properties or len({name for _, _, name in properties}) < len(properties):
-        raise InputError(f"'{path}' names no vertex property or one twice, export it anew.")
-    return layout, int(first[2]), np.dtype([(name, f"<{TYPES[kind]}") for _, kind, name in properties])
-
-
-def _binary(data: bytes, body: int, count: int, table: np.dtype, path: Path) -> np.ndarray:
-    if len(data) - body < count * table.itemsize:
-        present = (len(data) - body) // table.itemsize
-        raise InputError(f"'{path}' ends after {present} of {count} vertices, copy or export it anew.")
-    return np.frombuffer(data, table, count, body)
-
-
-def _ascii(body: bytes, count: int, table: np.dtype, path: Path) -> np.ndarray:
-    lines = [line for line in body.decode("latin-1").splitlines() if line.strip()][:count]
-    if len(lines) < count:
-        raise InputError(f"'{path}' ends after {len(lines)} of {count} vertices, copy or export it anew.")
-    try:
-        return np.loadtxt(lines, table, ndmin=1) if lines else np.empty(0, table)
-    except ValueError as problem:
-        raise InputError(f"'{path}' has an unreadable vertex ({problem}), export it anew.") from None

@@ -9,24 +9,20 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.sh import constant_from_colour
-from gsx.core.gaussians.smoothing import smoothed_raw
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.formats.detect import MOST_HEADER, format_of
 from gsx.formats.glb import decode_glb, encode_glb
-from gsx.formats.ply import HEADER_END, read_ply, write_ply, write_whole
+from gsx.formats.ply import HEADER_END, write_ply, write_whole
 from gsx.formats.sog import decode_sog, encode_sog, sog_is_antialiased
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
+from gsx.formats.standard_ply import decode_standard_ply
 from gsx.formats.suffixes import STANDARD, suffix_of
 
 logger = logging.getLogger(__name__)
 
-MOST_LOGIT = 30.0
-"""What infinite logits, of opacities 0 and 1, are read as."""
-MOST_COEFFICIENTS = 15
-"""Beside the constant one, of degree 3."""
 MODE_WORDS = ("splatrendermode:", "antialiased")
 """First words of the comments that say how a file is to be drawn."""
 
@@ -85,96 +81,34 @@ def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: S
 
 
 def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
-    """Read a splat file of any SH degree, of the kind that its suffix says. axes: of SPZ, which does not tell.
+    """Read a splat file of any SH degree, of the format that its first bytes show. axes: of SPZ, which does not tell.
 
     Raises:
         InputError: it is damaged, or lacks a property.
     """
-    suffix = suffix_of(path)
-    return read_standard(path) if suffix in (STANDARD, "") else gaussians_from(read_compact(path, suffix, axes))
-
-
-def read_compact(path: Path, suffix: str, axes: str) -> Arrays:
-    """Read a splat file that is no standard PLY; errors as `read_gaussians`."""
     try:
         content = path.read_bytes()
-        if suffix == ".spz":
-            return decode_spz(content, axes)
-        return {".sog": decode_sog, ".glb": decode_glb, ".compressed.ply": decode_compressed_ply}[suffix](content)
+        kind = format_of(content[:MOST_HEADER], path)
+        if kind != suffix_of(path):
+            logger.info("%s is read as %s, which its first bytes show", path, kind)
+        return decode(content, kind, axes, str(path))
     except (OSError, InputError) as problem:
         raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
 
 
-def read_standard(path: Path) -> Gaussians:
-    """Read a standard PLY, with what programs are known to write otherwise; errors as `read_gaussians`.
-
-    Properties are found by name. Colours may be bytes (nerfstudio) and bands beyond degree 3 are left out; a 3D filter
-    beside the scales is fused (Mip-Splatting, training); rows that are not finite go, as viewers have it.
-    """
-    columns = {name: torch.from_numpy(value.astype(np.float32)) for name, value in read_ply(path).items()}
-
-    def column(name: str) -> Tensor:
-        if name not in columns:
-            flat = ", it holds flat splats (2DGS)" if name == "scale_2" and "scale_1" in columns else ""
-            raise InputError(f"{path} lacks property '{name}': it is no splat file of 3D-GS{flat}")
-        return columns[name]
-
-    def stack(*names: str) -> Tensor:
-        return torch.stack([column(name) for name in names], 1)
-
-    raw = {
-        "means": stack(*"xyz"),
-        "log_scales": stack(*(f"scale_{i}" for i in range(3))),
-        "quats": stack(*(f"rot_{i}" for i in range(4))),
-        "opacity_logits": column("opacity").nan_to_num(torch.nan, MOST_LOGIT, -MOST_LOGIT),
-        "sh_dc": constant_colours(columns, path)
-        if "f_dc_0" not in columns
-        else stack(*(f"f_dc_{i}" for i in range(3))),
-        "sh_rest": higher_bands(columns, path),
-    }
-    if "filter_3D" in columns:
-        drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], columns["filter_3D"])
-        raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
-    return Gaussians(**finite_rows(raw, path))
-
-
-def constant_colours(columns: dict[str, Float[Tensor, "N"]], path: Path) -> Float[Tensor, "N 3"]:
-    """Coefficients of the constant band from colours in bytes.
+def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
+    """Return the splats of a file's content. kind: one of SUFFIXES; name: of the file, for the log.
 
     Raises:
-        InputError: there are none.
+        InputError: it is damaged, or lacks a property.
     """
-    names = ("red", "green", "blue")
-    if not set(names) <= columns.keys():
-        raise InputError(f"{path} lacks property 'f_dc_0', or red, green and blue: it is no splat file of 3D-GS")
-    return constant_from_colour(torch.stack([columns[name] for name in names], 1) / 255)
-
-
-def higher_bands(columns: dict[str, Float[Tensor, "N"]], path: Path) -> Float[Tensor, "N B 3"]:
-    """Coefficients beside the constant one, up to degree 3; f_rest is channel-major.
-
-    Raises:
-        InputError: there are not as many as any degree has.
-    """
-    count = sum(name.startswith("f_rest_") for name in columns)
-    if count not in (3 * ((degree + 1) ** 2 - 1) for degree in range(5)):
-        raise InputError(f"{path} has {count} f_rest properties: degrees 0 to 4 have 0, 9, 24, 45 or 72")
-    rows, names = len(columns["x"]), [f"f_rest_{i}" for i in range(count)]
-    if not set(names) <= columns.keys():
-        raise InputError(f"{path} does not number its f_rest properties from 0 to {count - 1}: export it anew")
-    values = torch.stack([columns[name] for name in names], 1) if names else torch.zeros(rows, 0)
-    return values.view(rows, 3, count // 3).transpose(1, 2)[:, :MOST_COEFFICIENTS]
-
-
-def finite_rows(raw: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """The rows that are finite in everything; how many others there were goes to the log."""
-    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) if value.ndim > 1 else torch.isfinite(value)
-                          for value in raw.values()]).all(0)  # fmt: skip
-    if bool(finite.all()):
-        return raw
-    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", path,
-                   int((~finite).sum()), len(finite))  # fmt: skip
-    return {name: value[finite] for name, value in raw.items()}
+    if kind == STANDARD:
+        return decode_standard_ply(content, name)
+    if kind == ".spz":
+        return gaussians_from(decode_spz(content, axes))
+    return gaussians_from(
+        {".sog": decode_sog, ".glb": decode_glb, ".compressed.ply": decode_compressed_ply}[kind](content)
+    )
 
 
 def compensated(path: Path) -> bool:
@@ -188,14 +122,15 @@ def compensated(path: Path) -> bool:
     """
     try:
         with path.open("rb") as file:
-            head = file.read(1 << 16)
+            head = file.read(MOST_HEADER)
     except OSError as problem:
         raise InputError(f"'{path}' cannot be read: {problem.strerror}") from None
-    if suffix_of(path) == ".spz":
+    kind = format_of(head, path)
+    if kind == ".spz":
         return is_antialiased(head)
-    if suffix_of(path) == ".sog":
+    if kind == ".sog":
         return sog_is_antialiased(path)
-    if suffix_of(path) == ".glb":
+    if kind == ".glb":
         return b"SplatRenderMode: mip" in head  # a comment of ours
     lines = head.partition(HEADER_END)[0].decode("latin-1").lower().splitlines()
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]

@@ -1,5 +1,6 @@
 """Initial points of scenes that no reconstruction comes with: from a PLY file, or random (3D-GS)."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +11,10 @@ from torch import Tensor
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
+from gsx.formats.colours import colours_among, full_scale_of
 from gsx.formats.ply import read_ply
+
+logger = logging.getLogger(__name__)
 
 GREY = 127  # colour of points without one: the published random clouds store this byte
 
@@ -37,8 +41,8 @@ def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Points of a PLY file: x, y, z and, where present, red, green, blue, of 8 or 16 bits or in [0, 1]; those that are
-    not finite are left out.
+    """Return the points of a PLY file: x, y, z and, where present, colours of 8 or 16 bits, or floats in [0, 1] or
+    [0, 255]. Points that are not finite are left out.
 
     Raises:
         InputError: the file cannot be read, has no coordinates, or holds no finite point.
@@ -46,7 +50,8 @@ def read_points(path: Path) -> PointCloud:
     columns = read_ply(path)
     if not {"x", "y", "z"} <= set(columns):
         raise InputError(f"'{path}' has no x, y, z but {', '.join(columns)}, give a point cloud.")
-    positions = torch.from_numpy(np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1))
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, which is left out
+        positions = torch.from_numpy(np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1))
     finite = positions.isfinite().all(dim=1)
     if not finite.any():
         raise InputError(f"'{path}' holds no point with finite coordinates, give another or scene.points=random.")
@@ -55,16 +60,17 @@ def read_points(path: Path) -> PointCloud:
 
 
 def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None:
-    """Display RGB of points by the columns of their file; None: they have none, or of a kind that nobody writes."""
-    if not {"red", "green", "blue"} <= set(columns):
+    """Return the display RGB of points by the columns of their file; None: they have none that can be read.
+
+    Points whose colour is not finite are grey.
+    """
+    values = colours_among(columns)
+    full = None if values is None else full_scale_of(values)
+    if values is None or full is None:
+        if values is not None:
+            logger.warning("colours from %g to %g are of no known unit: points are grey", values.min(), values.max())
         return None
-    values = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)
     if values.dtype == np.uint8:
         return torch.from_numpy(values)
-    if values.dtype == np.uint16:
-        most = 65535 if values.max() > 255 else 255  # some write 8 bits so
-    elif values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all():
-        most = 1
-    else:
-        return None
-    return torch.from_numpy((values.astype(np.float64) * (255 / most) + 0.5).astype(np.uint8))
+    scaled = values.astype(np.float64) * (255 / full) + 0.5
+    return torch.from_numpy(np.nan_to_num(scaled, nan=GREY, posinf=255, neginf=0).clip(0, 255).astype(np.uint8))

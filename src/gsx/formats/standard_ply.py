@@ -1,0 +1,175 @@
+"""The standard PLY of 3D-GS, with what programs are known to write otherwise; properties are found by name.
+
+Colours may be display RGB (nerfstudio), an opacity may be an alpha channel, bands beyond degree 3 are left out. A 3D
+filter next to the scales is fused (Mip-Splatting, training). Rows that are not finite are left out, as by viewers.
+"""
+
+import logging
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsx.core.errors import InputError
+from gsx.core.gaussians.sh import constant_from_colour
+from gsx.core.gaussians.smoothing import smoothed_raw
+from gsx.core.gaussians.splats import Gaussians
+from gsx.core.shapes import Float
+from gsx.formats.arrays import SMALLEST_OPACITY
+from gsx.formats.colours import COLOUR_NAMES, colours_among, full_scale_of
+from gsx.formats.ply import header_in, vertices_of
+
+logger = logging.getLogger(__name__)
+
+MOST_LOGIT = 30.0
+"""What infinite logits, of opacities 0 and 1, are read as."""
+MOST_COEFFICIENTS = 15
+"""Beside the constant one, of degree 3."""
+Columns = Mapping[str, np.ndarray]
+
+BAKED = "whose Gaussians a network decodes for each camera: export Gaussians (gsx export RUN FILE --bake ZOOM does)"
+FORMS = {
+    ("level", "f_anchor_feat_0"): f"holds anchors of Octree-GS, {BAKED}",
+    ("f_anchor_feat_0",): f"holds anchors of Scaffold-GS, {BAKED}",
+    ("f_offset_0",): f"holds anchors of Scaffold-GS, {BAKED}",
+    ("trbf_center",): "holds splats that move (SpacetimeGaussians): export one moment of them",
+    ("motion_0",): "holds splats that move: export one moment of them",
+    ("packed_position",): "holds packed splats without their chunks: export it anew as compressed PLY",
+}
+"""Forms of files that lack a property of splats, by properties that only they have."""
+ANCHORS = ("f_anchor_feat_0", "f_offset_0")
+"""Files with one of these are no splats, whatever else they have."""
+
+
+def decode_standard_ply(content: bytes, name: str) -> Gaussians:
+    """Return the splats of a file's content. name: of the file, for the log.
+
+    Raises:
+        InputError: it is damaged, or holds no splats of 3D-GS.
+    """
+    columns = vertices_of(content)
+    if problem := problem_of(columns, content):
+        raise InputError(problem)
+    raw = {
+        "means": stacked(columns, "x", "y", "z"),
+        "log_scales": stacked(columns, *(f"scale_{i}" for i in range(3))),
+        "quats": stacked(columns, *(f"rot_{i}" for i in range(4))),
+        "opacity_logits": opacity_logits(columns, name),
+        "sh_dc": constant_band(columns),
+        "sh_rest": higher_bands(columns),
+    }
+    if "filter_3D" in columns:
+        drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], float_column(columns, "filter_3D"))
+        raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
+    return Gaussians(**finite_rows(raw, name))
+
+
+def problem_of(columns: Columns, content: bytes) -> str:
+    """Return why vertices are no splats of 3D-GS, in words; empty: they are."""
+    needed = ["x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    missing = [f"'{name}'" for name in needed if name not in columns]
+    if not {"opacity", "alpha"} & columns.keys():
+        missing.append("'opacity'")
+    if "f_dc_0" not in columns and colours_among(columns) is None:
+        missing.append("'f_dc_0', or red, green and blue,")
+    if any(name in columns for name in ANCHORS):
+        return f"it {form_of(columns, content)}"
+    return f"it lacks property {missing[0]} and {form_of(columns, content)}" if missing else ""
+
+
+def form_of(columns: Columns, content: bytes) -> str:
+    """Return what vertices that are no splats probably are, and a remedy."""
+    for names, form in FORMS.items():
+        if set(names) <= columns.keys():
+            return form
+    if "scale_1" in columns and "scale_2" not in columns:
+        return "holds flat splats (2DGS), which are not drawn: train 3D-GS, or export with a third scale"
+    if any(name.startswith(("scale_", "rot_", "f_dc_", "f_rest_")) for name in columns):
+        return "is no splat file of 3D-GS: export it anew as PLY"
+    if any(element.name in ("face", "tristrips") and element.count for element in header_in(content).elements):
+        return "is a mesh: give splats, or sample its points for scene.points"
+    if {"x", "y", "z"} <= columns.keys():
+        return "is a point cloud: give it as scene.points=FILE (transforms, blender), or give splats"
+    return f"is no splat file of 3D-GS, but has {', '.join(list(columns)[:8])}: export it anew as PLY"
+
+
+def float_column(columns: Columns, name: str) -> Float[Tensor, "N"]:
+    """Return a property as float32; doubles beyond it become infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return torch.from_numpy(columns[name].astype(np.float32))
+
+
+def stacked(columns: Columns, *names: str) -> Float[Tensor, "N k"]:
+    """Return properties side by side."""
+    return torch.stack([float_column(columns, name) for name in names], 1)
+
+
+def opacity_logits(columns: Columns, file: str) -> Float[Tensor, "N"]:
+    """Return logits of opacities: as stored, or of an alpha channel of any unit.
+
+    Raises:
+        InputError: alpha is of no known unit.
+    """
+    if "opacity" in columns:
+        return float_column(columns, "opacity").nan_to_num(torch.nan, MOST_LOGIT, -MOST_LOGIT)
+    alpha = scaled_by(columns["alpha"], "alpha").clamp(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
+    logger.warning("%s: property opacity is missing, alpha is taken for it", file)
+    return alpha.logit()
+
+
+def constant_band(columns: Columns) -> Float[Tensor, "N 3"]:
+    """Return coefficients of the constant band: as stored, or of display RGB.
+
+    Raises:
+        InputError: RGB is of no known unit.
+    """
+    if "f_dc_0" in columns:
+        missing = [name for name in ("f_dc_1", "f_dc_2") if name not in columns]
+        if missing:
+            raise InputError(f"it lacks property '{missing[0]}': export it anew as PLY")
+        return stacked(columns, "f_dc_0", "f_dc_1", "f_dc_2")
+    colours = colours_among(columns)
+    assert colours is not None  # problem_of has looked
+    return constant_from_colour(scaled_by(colours, "/".join(COLOUR_NAMES[0])))
+
+
+def scaled_by(values: np.ndarray, name: str) -> Float[Tensor, "..."]:
+    """Return intensities as shares of full intensity.
+
+    Raises:
+        InputError: their unit cannot be known.
+    """
+    full = full_scale_of(values)
+    if full is None:
+        ends = f"{np.nanmin(values):g} to {np.nanmax(values):g}"
+        raise InputError(f"its {name} from {ends} are of no known unit: export bytes, or floats in [0, 1]")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return torch.from_numpy(values.astype(np.float32)) / full
+
+
+def higher_bands(columns: Columns) -> Float[Tensor, "N B 3"]:
+    """Return coefficients next to the constant one, up to degree 3; f_rest is channel-major.
+
+    Raises:
+        InputError: there are not as many as any degree has.
+    """
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count not in (3 * ((degree + 1) ** 2 - 1) for degree in range(5)):
+        raise InputError(f"it has {count} f_rest properties, degrees 0 to 4 have 0, 9, 24, 45 or 72: export it anew")
+    rows, names = len(columns["x"]), [f"f_rest_{i}" for i in range(count)]
+    if not set(names) <= columns.keys():
+        raise InputError(f"it does not number its f_rest properties from 0 to {count - 1}: export it anew")
+    values = stacked(columns, *names) if names else torch.zeros(rows, 0)
+    return values.view(rows, 3, count // 3).transpose(1, 2)[:, :MOST_COEFFICIENTS]
+
+
+def finite_rows(raw: dict[str, Tensor], file: str) -> dict[str, Tensor]:
+    """Return the rows that are finite in everything; log how many others there were."""
+    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) if value.ndim > 1 else torch.isfinite(value)
+                          for value in raw.values()]).all(0)  # fmt: skip
+    if bool(finite.all()):
+        return raw
+    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", file,
+                   int((~finite).sum()), len(finite))  # fmt: skip
+    return {name: value[finite] for name, value in raw.items()}
