@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from gsx.core.errors import InputError
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -150,6 +152,21 @@ def finite(content: Any) -> Any:
     if isinstance(content, list | tuple):
         return [finite(value) for value in content]
     return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+LFS_POINTER = b"version https://git-lfs"
+"""First bytes of the small text that stands in for a file until Git LFS downloads it."""
+
+
+def refuse_lfs_pointer(path: Path) -> None:
+    """Raise InputError for a file that Git LFS has not downloaded yet."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(len(LFS_POINTER))
+    except OSError:
+        return
+    if head == LFS_POINTER:
+        raise InputError(f"'{path}' is a Git LFS pointer, not the file itself: run 'git lfs pull' in its repository.")
 
 
 def is_file(path: Path) -> bool:

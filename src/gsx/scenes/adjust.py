@@ -23,7 +23,7 @@ from torch import Tensor
 from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
-from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model
+from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model, reconstruction_of
 from gsx.scenes.kept_models import kept_model
 from gsx.scenes.sfm import quiet
 from gsx.scenes.undistort import pinhole_of, undistort_points
@@ -154,9 +154,9 @@ def bundle_adjusted(folder: Path) -> Any:
     Raises:
         InputError: nothing could be solved.
     """
-    import pycolmap
-
-    found = pycolmap.Reconstruction(folder)
+    found, _ = reconstruction_of(folder)
+    if not found.num_points3D():
+        raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
     logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
     adjust(found, folder)
     straight = [number for number, camera in found.cameras.items() if camera.model_name in BENT]

@@ -28,7 +28,7 @@ from gsx.core.files import at_home
 from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
-from gsx.scenes.colmap_model import model_folders
+from gsx.scenes.colmap_folders import model_folders
 from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.points import grey_points, read_points

@@ -1,8 +1,10 @@
 """Scenes from a COLMAP model and its photos (3D-GS, dataset_readers.py and getNerfppNorm and camera_utils.py)."""
 
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,17 +12,28 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.images import checked_size
 from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
+from gsx.core.options import without_effect
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.adjust import WHEN, adjusted, fit_line
-from gsx.scenes.colmap_model import Model, ModelImage, find_model, model_folders, read_model
+from gsx.scenes.colmap_folders import (
+    AUTO,
+    find_model,
+    model_folders,
+    other_model_folders,
+    photo_folders,
+    photo_folders_above,
+)
+from gsx.scenes.colmap_model import Model, ModelImage, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.options import SceneOptions, refuse_other
+from gsx.scenes.photo_names import similar_photo
 from gsx.scenes.posed import (
     MIN_IMAGES,
     Shot,
@@ -45,6 +58,8 @@ class ColmapOptions(SceneOptions):
 
     images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
+    model: str = without_effect(default=AUTO)
+    """Folder of the model, relative to `path`; auto: the one with the most images (gsx.scenes.colmap_folders)."""
     adjust: str = "never"
     """never | auto | always: whether poses and intrinsics are found anew from the model's observations
     (gsx.scenes.adjust)."""
@@ -61,9 +76,10 @@ def load(options: ColmapOptions) -> Scene:
     """
     refuse_other("adjust", options.adjust, WHEN)
     path = at_home(options.path)
-    folder, notes = find_model(path)
+    folder, notes = find_model(path, options.model)
     model, adjustment = adjusted(read_model(folder), options.adjust)
-    return build(model, path / options.images, options, [*notes, *adjustment])
+    images = options.images if folder in model_folders(path) else images_elsewhere(path, model, options.images)
+    return build(model, path / images, replace(options, images=images), [*notes, *adjustment])
 
 
 def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str]) -> Scene:
@@ -109,19 +125,19 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     """
     present = [image for image in model.images if is_file(photos / image.name)]
     if not present and model.images:
-        remedy = "set scene.images to the folder that holds them"
-        if (model.folder / "images.txt").is_file() and not (model.folder / "images.bin").is_file():
-            remedy += "; of a model as text pycolmap reads names as far as their first space: write it as .bin"
+        names = [image.name for image in model.images]
         raise InputError(
-            f"None of the {len(model.images)} images of {model.folder} is in {photos} (looked for "
-            f"{named([image.name for image in model.images])}): {remedy}."
+            f"None of the {len(names)} images of {model.folder} is in {photos} (looked for {named(names)}): "
+            f"{similar_photo(photos, names) or 'set scene.images to the folder that holds them'}."
         )
     if len(present) < MIN_IMAGES:
         raise InputError(
             f"{model.folder} has {len(model.images)} registered images, {len(present)} of them in {photos}, but "
             f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
         )
-    refuse_partial(_missing(model, present), len(model.images), model.folder, missing)
+    absent = _missing(model, present)
+    hint = similar_photo(photos, absent) if len(absent) > missing * len(model.images) else ""
+    refuse_partial(absent, len(model.images), model.folder, missing, remedy=hint or "complete them")
     refuse_file_twice([image.name for image in present], [photos / image.name for image in present], model.folder)
     return present
 
@@ -230,17 +246,47 @@ def overrides(path: Path) -> dict[str, str]:
 
 
 def image_folder(path: Path, model: Model) -> str:
-    """The folder below `path` with most of the model's images; `images` unless another has more."""
-    others = sorted(folder.name for folder in path.iterdir() if folder.is_dir() and folder.name != IMAGES)
-    return max(
-        (IMAGES, *others, "."), key=lambda folder: sum(is_file(path / folder / image.name) for image in model.images)
-    )
+    """Return the folder with most of the model's images, relative to `path`; `images` where no folder has any.
+
+    Of several with as many it is the first whose photos have the size of their camera, or a uniform reduction of it.
+    """
+    for folders in (photo_folders(path, model.folder), photo_folders_above(path, model.folder)):
+        counts = {folder: sum(is_file(folder / image.name) for image in model.images) for folder in folders}
+        most = max(counts.values(), default=0)
+        likely = [folder for folder, count in counts.items() if count == most > 0]
+        if likely:
+            best = next((folder for folder in likely if _fits(folder, model)), likely[0])
+            return Path(os.path.relpath(best, path)).as_posix()
+    return IMAGES
+
+
+def _fits(folder: Path, model: Model) -> bool:
+    """Compare the size of the first photo with its camera's."""
+    image = next(image for image in model.images if is_file(folder / image.name))
+    camera = model.cameras[image.camera_id]
+    with suppress(InputError):
+        checked_size(folder / image.name, (camera.width, camera.height))
+        return True
+    return False
+
+
+def images_elsewhere(path: Path, model: Model, images: str) -> str:
+    """Return the folder of the images of a model in an unusual place, where `images` is not set otherwise."""
+    return image_folder(path, model) if images == IMAGES else images
+
+
+def recognise(path: Path) -> bool:
+    """Recognise a model in any of its places; a transforms.json is preferred to a model that it was made from."""
+    if not path.is_dir():
+        return False
+    transforms = any((path / name).is_file() for name in ("transforms.json", "transforms_train.json"))
+    return bool(model_folders(path)) or (not transforms and bool(other_model_folders(path)))
 
 
 FORMAT = SceneFormat(
     meaning="COLMAP model with photos",
     sign="COLMAP model (sparse/)",
-    recognise=lambda path: path.is_dir() and bool(model_folders(path)),
+    recognise=recognise,
     facts=facts,
     overrides=overrides,
 )

@@ -1,4 +1,4 @@
-"""COLMAP models as plain data: finding, checking and reading `cameras`, `images`, `points3D` (3D-GS).
+"""COLMAP models as plain data: checking and reading `cameras`, `images`, `points3D` (3D-GS).
 
 pycolmap reads every layout (binary and text, 3.x and 4.x with rigs and frames) but does not notice where a binary
 file ends: what lies past the end comes out as noise. The files are therefore walked record by record beforehand
@@ -6,10 +6,13 @@ file ends: what lies past the end comes out as noise. The files are therefore wa
 """
 
 import copy
-import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import copyfile
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,14 +21,14 @@ from torch import Tensor
 
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
+from gsx.core.files import refuse_lfs_pointer
 from gsx.core.shapes import Bool, Float
-from gsx.scenes.colmap_records import U64, check_binary
+from gsx.scenes.colmap_folders import model_files
+from gsx.scenes.colmap_records import U64, check_binary, contradiction
+from gsx.scenes.colmap_text import write_as_binary
+from gsx.scenes.points import read_points
 
-logger = logging.getLogger(__name__)
-
-REQUIRED = ("cameras", "images", "points3D")
 OBSERVATIONS_PER_IMAGE = 1000  # read of each image: the reprojection check is a median over all images
-
 QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
 
 
@@ -59,119 +62,110 @@ class Model:
     notes: list[str]
 
 
-def find_model(path: Path) -> tuple[Path, list[str]]:
-    """The model folder below `path` with the most images, and a note where there was a choice.
-
-    Raises:
-        InputError: no model in `path`/sparse/*, `path`/sparse or `path`, or a file of it is missing.
-    """
-    folders = model_folders(path)
-    if not folders:
-        raise InputError(
-            f"No COLMAP model (cameras.bin or cameras.txt) in {path / 'sparse' / '0'}, {path / 'sparse'} or {path}: "
-            "scene.path must be the folder that holds sparse/ and images/ (photos only: use scene=photos)."
-        )
-    counts = {folder: count_images(folder) for folder in folders}
-    best = max(folders, key=lambda folder: counts[folder])  # max keeps the first of equals
-    if len(folders) == 1:
-        return best, []
-    others = ", ".join(f"{folder.name} ({counts[folder]})" for folder in folders if folder != best)
-    return best, [f"Took sub-model {best.name} with {counts[best]} images; not used, with images: {others}."]
-
-
-def model_folders(path: Path) -> list[Path]:
-    """Folders that hold a model: `sparse/*` in order of name, `sparse`, `path` itself."""
-    sparse = path / "sparse"
-    inner = sorted(folder for folder in sparse.iterdir() if folder.is_dir()) if sparse.is_dir() else []
-    return [folder for folder in (*inner, sparse, path) if _suffix(folder)]
-
-
-def count_images(folder: Path) -> int:
-    """The number of images of a model, from the head of images.bin or the lines of images.txt."""
-    file = model_files(folder)["images"]
-    if file.suffix == ".txt":
-        return _count_text(file)
-    with file.open("rb") as stream:
-        head = stream.read(U64.size)
-    return int(U64.unpack(head)[0]) if len(head) == U64.size else 0
-
-
-def _count_text(file: Path) -> int:
-    count = 0
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if line.strip() and not line.startswith("#"):
-                count += 1
-                next(lines, None)  # the line of keypoints, which may be empty
-    return count
-
-
 def read_model(folder: Path) -> Model:
     """Read a model.
 
     Raises:
         InputError: a file is missing, truncated or corrupt, a camera model is unknown, or there are no points.
     """
-    files = model_files(folder)
-    if _suffix(folder) == ".bin":
-        check_binary(folder)
-    reconstruction = _reconstruction(folder)
+    file = model_files(folder)["points3D"]
+    reconstruction, notes = reconstruction_of(folder)
+    read = _points_of_ply if file.suffix.lower() == ".ply" else _points
+    points, positions, point_notes = read(reconstruction, file)
+    return Model(
+        folder=folder,
+        cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
+        images=_images(reconstruction, positions, file),
+        points=points,
+        mean_error=reconstruction.compute_mean_reprojection_error(),
+        notes=[*notes, *point_notes],
+    )
+
+
+Positions = Mapping[int, Float[Tensor, "3"]]
+"""World points by their id, float64."""
+
+
+def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, list[str]]:
+    """Points of a model, all positions by id, and a note on those that are dropped."""
     numbers = sorted(reconstruction.points3D)
     points = [reconstruction.point3D(number) for number in numbers]
     positions = _stack([point.xyz for point in points], 3)
     usable = _usable(positions)
     if not usable.any():
         raise InputError(
-            f"{files['points3D']} holds no points with finite coordinates, but training starts from points: "
+            f"{file} holds no points with finite coordinates, but training starts from points: "
             "triangulate the model (colmap point_triangulator) or reconstruct the photos with scene=photos."
         )
     dropped = int((~usable).sum())
     colours = torch.from_numpy(np.array([point.color for point in points]))
-    return Model(
-        folder=folder,
-        cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
-        images=_images(reconstruction, dict(zip(numbers, positions, strict=True)), files["points3D"]),
-        points=PointCloud(positions[usable].float(), colours[usable]),
-        mean_error=reconstruction.compute_mean_reprojection_error(),
-        notes=[f"Dropped {dropped} points with coordinates that are not finite."] if dropped else [],
-    )
+    notes = [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
+    cloud = PointCloud(positions[usable].float(), colours[usable])
+    return cloud, dict(zip(numbers, positions, strict=True)), notes
 
 
-def _suffix(folder: Path) -> str:
-    """`.bin` or `.txt` for a model folder (binary first, as 3D-GS), else an empty string."""
-    return next((suffix for suffix in (".bin", ".txt") if (folder / f"cameras{suffix}").is_file()), "")
+def _points_of_ply(reconstruction: Any, file: Path) -> tuple[PointCloud, None, list[str]]:
+    """Points of a PLY, which does not say which images observe them."""
+    cloud = read_points(file)
+    note = f"Points are those of {file.name}, as there is no points3D.bin: cameras cannot be checked by observations."
+    return cloud, None, [note]
 
 
-def model_files(folder: Path) -> dict[str, Path]:
-    """Files that every model has, by what they hold.
+@contextmanager
+def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
+    """Yield a folder with the binary files of a model under COLMAP's names, and notes on what its text states.
 
     Raises:
-        InputError: one is missing.
+        InputError: a file is no text or binary file of a model, or damaged.
     """
-    files = {name: folder / f"{name}{_suffix(folder)}" for name in REQUIRED}
-    for file in files.values():
-        if not file.is_file():
-            raise InputError(f"The COLMAP model {folder} lacks {file.name}: copy the whole model folder again.")
-    return files
+    folders = {file.parent for file in files.values()}
+    if all(file.name == f"{name}.bin" for name, file in files.items()) and len(folders) == 1:
+        yield folders.pop(), []
+        return
+    with TemporaryDirectory(prefix="gsx-colmap-") as made:
+        folder = Path(made)
+        texts = {name: file for name, file in files.items() if file.suffix.lower() == ".txt"}
+        notes = write_as_binary(texts, folder)
+        for name, file in files.items():
+            if file.suffix.lower() == ".bin":
+                copyfile(file, folder / f"{name}.bin")
+        if files["points3D"].suffix.lower() == ".ply":
+            (folder / "points3D.bin").write_bytes(U64.pack(0))
+        yield folder, notes
 
 
-def _reconstruction(folder: Path) -> Any:
+def reconstruction_of(folder: Path) -> tuple[Any, list[str]]:
+    """Return the pycolmap.Reconstruction of a model folder, and notes on what its text states.
+
+    Raises:
+        InputError: a file is missing, truncated or corrupt, or files contradict each other.
+    """
     import pycolmap
 
-    try:
-        return pycolmap.Reconstruction(folder)
-    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
-        raise InputError(
-            f"pycolmap cannot read the COLMAP model {folder} "
-            f"({', '.join(file.name for file in present_files(folder))}): "
-            f"{str(problem).strip()}; copy or make the model again."
-        ) from None
+    files = model_files(folder)
+    for name, file in files.items():
+        refuse_lfs_pointer(file)
+        if file.suffix.lower() == ".bin":
+            check_binary(name, file)
+    with binary_model(files) as (binary, notes):
+        try:
+            return pycolmap.Reconstruction(binary), notes
+        except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
+            raise InputError(
+                f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in files.values())}): "
+                f"{contradiction(binary) or plain(problem)}; copy or make the model again."
+            ) from None
+
+
+def plain(problem: Exception) -> str:
+    """Return pycolmap's words for a failed check without its place in COLMAP's source."""
+    words = re.sub(r"^\[[\w.]+:\d+\]\s*(Check failed: )?", "", str(problem).strip("'\" \n"))
+    return "its files contradict each other" if words.startswith(("unordered_map", "vector::")) else words
 
 
 def present_files(folder: Path) -> Iterator[Path]:
-    """Files of a model that are there; by COLMAP 4 its poses are in `frames` and `rigs`."""
-    names = (*REQUIRED, "rigs", "frames")
-    return (file for name in names if (file := folder / f"{name}{_suffix(folder)}").is_file())
+    """Yield the files of a model that are there; by COLMAP 4 its poses are in `frames` and `rigs`."""
+    yield from model_files(folder).values()
 
 
 def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
@@ -179,16 +173,17 @@ def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
     return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
 
 
-def _images(reconstruction: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> list[ModelImage]:
+def _images(reconstruction: Any, positions: Positions | None, file: Path) -> list[ModelImage]:
     images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
     return [_image(image, positions, file) for image in sorted(images, key=lambda image: _name(image, file))]
 
 
-def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) -> ModelImage:
-    """An image with its observations; `file` is named if it lacks one of the points in `positions`."""
-    indices = image.get_observation_point2D_idxs()
+def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
+    """An image with its observations, None: without; `file` is named if it lacks one of the points in `positions`."""
+    indices = [] if positions is None else image.get_observation_point2D_idxs()
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
     seen = [image.point2D(index) for index in indices[::step]]
+    positions = positions or {}
     lost = next((point.point3D_id for point in seen if point.point3D_id not in positions), None)
     name = _name(image, file)
     if lost is not None:
@@ -212,13 +207,13 @@ def _image(image: Any, positions: Mapping[int, Float[Tensor, "3"]], file: Path) 
 
 
 def _name(image: Any, file: Path) -> str:
-    """Of the photo of an image.
+    """Return the name of an image's photo, with `/` for the backslashes of Windows.
 
     Raises:
         InputError: it is no text.
     """
     try:
-        return str(image.name)
+        return str(image.name).replace("\\", "/")
     except UnicodeDecodeError as error:
         raise InputError(
             f"The model {file.parent} names an image by bytes that are no UTF-8 ({error.object!r}): rename the photo, "

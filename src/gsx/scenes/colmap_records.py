@@ -2,6 +2,7 @@
 
 import mmap
 import struct
+from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,24 +15,19 @@ RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and
 IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
 POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
 
+Bytes = bytes | mmap.mmap
 
-def check_binary(folder: Path) -> None:
-    """Walk every binary file of a model to its end.
+
+def check_binary(name: str, file: Path) -> None:
+    """Walk a binary file to its end; name: of what it holds, such as `cameras`.
 
     Raises:
-        InputError: a file ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
+        InputError: it ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
     """
-    walks = {
-        "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig,
-        "frames": _skip_frame,
-    }  # fmt: skip
-    for name, skip in walks.items():
-        file = folder / f"{name}.bin"
-        if file.exists():
-            _walk(file, skip)
+    _walk(file, SKIPS[name])
 
 
-def _walk(file: Path, skip: Callable[[mmap.mmap, int], int]) -> None:
+def _walk(file: Path, skip: Callable[[Bytes, int], int]) -> None:
     size = file.stat().st_size
     if size < U64.size:
         raise _truncated(file, 0, 0)
@@ -61,7 +57,7 @@ def _truncated(file: Path, index: int, count: int) -> InputError:
     )
 
 
-def _skip_camera(data: mmap.mmap, at: int) -> int:
+def _skip_camera(data: Bytes, at: int) -> int:
     import pycolmap
 
     _, model, width, height = ID_MODEL_SIZE.unpack_from(data, at)
@@ -82,7 +78,7 @@ def camera_models() -> dict[int, tuple[str, int]]:
     return {number: (name, len(make(1, name, 1.0, 1, 1).params)) for number, name in members.items()}
 
 
-def _skip_image(data: mmap.mmap, at: int) -> int:
+def _skip_image(data: Bytes, at: int) -> int:
     end = data.find(b"\0", at + IMAGE_HEAD)
     if end < 0:
         raise struct.error
@@ -90,12 +86,12 @@ def _skip_image(data: mmap.mmap, at: int) -> int:
     return int(end + 1 + U64.size + KEYPOINT * keypoints)
 
 
-def _skip_point(data: mmap.mmap, at: int) -> int:
+def _skip_point(data: Bytes, at: int) -> int:
     (track,) = U64.unpack_from(data, at + POINT_HEAD)
     return int(at + POINT_HEAD + U64.size + TRACK_ELEMENT * track)
 
 
-def _skip_rig(data: mmap.mmap, at: int) -> int:
+def _skip_rig(data: Bytes, at: int) -> int:
     _, sensors = RIG.unpack_from(data, at)
     at += RIG.size + (RIG_REFERENCE if sensors else 0)
     for _ in range(sensors - 1):
@@ -104,5 +100,46 @@ def _skip_rig(data: mmap.mmap, at: int) -> int:
     return at
 
 
-def _skip_frame(data: mmap.mmap, at: int) -> int:
+def _skip_frame(data: Bytes, at: int) -> int:
     return int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1])
+
+
+SKIPS: dict[str, Callable[[Bytes, int], int]] = {
+    "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig, "frames": _skip_frame,
+}  # fmt: skip
+"""What returns the end of the record that begins at a place."""
+
+
+# -- ids ---------------------------------------------------------------------------------------------------------------
+
+
+HEADS = {
+    "cameras": struct.Struct("<I"), "images": struct.Struct("<I56xI"), "rigs": struct.Struct("<I"),
+    "frames": struct.Struct("<II"),
+}  # fmt: skip
+"""The id at the beginning of a record and, if any, the id of the record in another file that it refers to."""
+REFERENCES = {"images": "cameras", "frames": "rigs"}
+
+
+def contradiction(folder: Path) -> str:
+    """Return what is wrong with the ids in the binary files of a model, in words; empty: nothing that is known."""
+    heads = {name: _heads(name, folder / f"{name}.bin") for name in HEADS if (folder / f"{name}.bin").is_file()}
+    for name, rows in heads.items():
+        ids = Counter(row[0] for row in rows)
+        if twice := [number for number, count in ids.items() if count > 1]:
+            return f"the id {twice[0]} stands twice in {name}"
+    for name, other in REFERENCES.items():
+        known = {row[0] for row in heads.get(other, [])}
+        if lacking := [row for row in heads.get(name, []) if row[1] not in known]:
+            number, reference = lacking[0]
+            return f"entry {number} of {name} refers to {reference} of {other}, which is not there"
+    return ""
+
+
+def _heads(name: str, file: Path) -> list[tuple[int, ...]]:
+    """Ids at the beginning of each record of a file that `check_binary` accepts."""
+    data, at, rows = file.read_bytes(), U64.size, list[tuple[int, ...]]()
+    for _ in range(U64.unpack_from(data, 0)[0]):
+        rows.append(HEADS[name].unpack_from(data, at))
+        at = SKIPS[name](data, at)
+    return rows

@@ -1,0 +1,300 @@
+"""COLMAP models as text, turned into the binary files that pycolmap reads.
+
+pycolmap's own reader of text ends the name of an image at its first space, and knows no byte order mark. Here names go
+to the end of the line, as COLMAP writes them, and an error names its line.
+"""
+
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+
+from gsx.core.errors import InputError, nearest
+from gsx.scenes.colmap_records import FRAME, ID_MODEL_SIZE, U64, camera_models
+
+KEYPOINTS = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
+NO_POINT = 2**64 - 1
+"""Point id of a keypoint that observes no point; -1 in text."""
+NAME_AT = 9
+"""Numbers before the name of an image."""
+BLANKS = " \t\r\n"
+"""Around words. Other characters that Python strips may be part of a name."""
+STATED = re.compile(r"#\s*Number of \w+:\s*(\d+)")
+"""The comment in which COLMAP states how many records a file has."""
+
+
+def write_as_binary(files: Mapping[str, Path], folder: Path) -> list[str]:
+    """Write the binary files of a text model to `folder`; files: by what they hold (`cameras`, `images`, ...).
+
+    Returns:
+        A note for each file that holds another number of records than its comments state.
+
+    Raises:
+        InputError: a file is no text, or a line is wrong.
+    """
+    notes = []
+    for name, file in files.items():
+        records = list(records_of(file, READERS[name]))
+        (folder / f"{name}.bin").write_bytes(U64.pack(len(records)) + b"".join(records))
+        stated = stated_count(file)
+        if stated is not None and stated != len(records):
+            notes.append(f"{file.name} states {stated} {name} and holds {len(records)}.")
+    return notes
+
+
+class Lines:
+    """Lines of a text file without comments and blanks at their ends; with or without a byte order mark."""
+
+    def __init__(self, file: Path, errors: str = "strict") -> None:
+        self.file, self.errors = file, errors
+        self.number = 0
+        """Of the latest line, from 1."""
+
+    def __iter__(self) -> Iterator[str]:
+        with self.file.open(encoding="utf-8-sig", errors=self.errors) as stream:
+            for self.number, line in enumerate(stream, 1):
+                text = line.strip(BLANKS)
+                if not text.startswith("#"):
+                    yield text
+
+
+Reader = Callable[[Lines], Iterator[bytes]]
+"""Yields a binary record for each record in text; raises ValueError for a line that is none."""
+
+
+def records_of(file: Path, read: Reader) -> Iterator[bytes]:
+    """The binary records of a text file.
+
+    Raises:
+        InputError: it is no text, or a line is wrong.
+    """
+    lines = Lines(file)
+    try:
+        yield from read(lines)
+    except UnicodeDecodeError as problem:
+        odd = problem.object[problem.start : problem.start + 8]
+        raise InputError(
+            f"{file} holds bytes that are no UTF-8 ({odd!r}, after line {lines.number}): save it as UTF-8, or rename "
+            "the photos and reconstruct again."
+        ) from None
+    except (ValueError, OverflowError, struct.error) as problem:
+        raise InputError(
+            f"{file} cannot be read at line {lines.number}: {problem}; correct it, or make the model again."
+        ) from None
+
+
+def stated_count(file: Path) -> int | None:
+    """The number of records that the comments at the top of a file state; None: they state none."""
+    with file.open(encoding="utf-8-sig", errors="replace") as stream:
+        top = takewhile(lambda line: line.startswith("#"), stream)
+        return next((int(found[1]) for line in top if (found := STATED.match(line))), None)
+
+
+def count_text_images(file: Path) -> int:
+    """The number of images in an images.txt, which may be damaged."""
+    return sum(1 for _ in _image_lines(Lines(file, errors="replace")))
+
+
+# -- records -----------------------------------------------------------------------------------------------------------
+
+
+def _cameras(lines: Lines) -> Iterator[bytes]:
+    numbers = {name: (number, count) for number, (name, count) in camera_models().items()}
+    for words in _rows(lines, 4, "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"):
+        identity, model, width, height, *params = words
+        if model not in numbers:
+            raise ValueError(f"camera model '{model}' is unknown to pycolmap.{nearest(model.upper(), numbers)}")
+        number, count = numbers[model]
+        if len(params) != count:
+            raise ValueError(f"camera model {model} has {count} parameters, and {len(params)} are there")
+        yield ID_MODEL_SIZE.pack(_whole(identity), number, *_size(width, height)) + _floats(params).tobytes()
+
+
+def _size(width: str, height: str) -> tuple[int, int]:
+    size = _whole(width), _whole(height)
+    if not all(0 < side < 2**31 for side in size):
+        raise ValueError(f"a camera of {width}x{height} pixels")
+    return size
+
+
+def _images(lines: Lines) -> Iterator[bytes]:
+    for header, keypoints in _image_lines(lines):
+        *numbers, name = _header_words(header)
+        if len(numbers) < NAME_AT:
+            raise ValueError("it is no IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME")
+        pose = _floats(numbers[1:8]).tobytes()
+        head = struct.pack("<I", _whole(numbers[0])) + pose + struct.pack("<I", _whole(numbers[8]))
+        yield head + _name(name) + _keypoints(keypoints)
+
+
+def _image_lines(lines: Lines) -> Iterator[tuple[str, str]]:
+    """The two lines of each image. The second may be empty; some programs leave empty ones out."""
+    header = ""
+    for line in lines:
+        if not header:
+            header = line
+        elif _is_header(line):
+            yield header, ""
+            header = line
+        else:
+            yield header, line
+            header = ""
+    if header:
+        yield header, ""
+
+
+def _is_header(line: str) -> bool:
+    """Recognise the first line of an image where keypoints are due: it has whole numbers for ids, and then a name."""
+    words = _header_words(line)
+    whole = len(words) > NAME_AT and words[0].isdecimal() and words[NAME_AT - 1].isdecimal()
+    return whole and not _are_keypoints(line)
+
+
+def _are_keypoints(line: str) -> bool:
+    try:
+        return bool(_keypoints(line))
+    except ValueError:
+        return False
+
+
+def _header_words(line: str) -> list[str]:
+    """Nine numbers and the name, which goes to the end of the line and may hold blanks."""
+    return re.split(r"[ \t]+", line, maxsplit=NAME_AT)
+
+
+def _name(name: str) -> bytes:
+    if "\0" in name:
+        raise ValueError("the name holds a NUL character")
+    return name.encode() + b"\0"
+
+
+def _keypoints(line: str) -> bytes:
+    values = _floats(line.split())
+    if len(values) % 3:
+        raise ValueError(f"{len(values)} numbers are no keypoints, which have three (X, Y, POINT3D_ID) each")
+    rows = values.reshape(-1, 3)
+    return U64.pack(len(rows)) + _keypoint_rows(rows).tobytes()
+
+
+def _keypoint_rows(rows: np.ndarray) -> np.ndarray:
+    """Keypoints [K, 3] as COLMAP stores them."""
+    ids, stored = rows[:, 2], np.empty(len(rows), KEYPOINTS)
+    if not (ids == np.floor(ids)).all():
+        raise ValueError("a POINT3D_ID is no whole number")
+    seen = (ids >= 0) & (ids < 2.0**63)
+    stored["x"], stored["y"] = rows[:, 0], rows[:, 1]
+    stored["point"] = np.where(seen, np.where(seen, ids, 0).astype(np.uint64), np.uint64(NO_POINT))
+    return stored
+
+
+def _points(lines: Lines) -> Iterator[bytes]:
+    for words in _rows(lines, 8, "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"):
+        position, error = _floats(words[1:4]).tobytes(), _floats(words[7:8]).tobytes()
+        yield U64.pack(_whole(words[0])) + position + _colour(words[4:7]) + error + _track(words[8:])
+
+
+def _colour(words: Sequence[str]) -> bytes:
+    values = [_whole(word) for word in words]
+    if max(values) > 255:
+        raise ValueError(f"'{' '.join(words)}' is no colour, whose values go from 0 to 255")
+    return bytes(values)
+
+
+def _track(words: Sequence[str]) -> bytes:
+    if len(words) % 2:
+        raise ValueError(f"{len(words)} numbers are no track, which has two (IMAGE_ID, POINT2D_IDX) for each image")
+    return U64.pack(len(words) // 2) + np.array([_whole(word) for word in words], dtype="<u4").tobytes()
+
+
+def _rigs(lines: Lines) -> Iterator[bytes]:
+    for identity, count, *words in _rows(lines, 2, "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]"):
+        record = struct.pack("<II", _whole(identity), _whole(count))
+        if _whole(count):
+            record += _sensor(words)
+            words = words[2:]
+        for _ in range(_whole(count) - 1):
+            sensor, words = _posed_sensor(words)
+            record += sensor
+        _refuse_rest(words)
+        yield record
+
+
+def _posed_sensor(words: list[str]) -> tuple[bytes, list[str]]:
+    """A sensor with its pose, if it has one, and the words after it."""
+    posed = words[2:3] == ["1"]
+    end = 10 if posed else 3
+    if len(words) < end:
+        raise ValueError("it ends within a sensor")
+    return _sensor(words) + struct.pack("<?", posed) + _floats(words[3:end]).tobytes(), words[end:]
+
+
+def _sensor(words: Sequence[str]) -> bytes:
+    """Type and id of a sensor."""
+    import pycolmap
+
+    kinds = pycolmap.SensorType.__members__
+    if len(words) < 2 or words[0] not in kinds:
+        raise ValueError(f"'{' '.join(words[:2])}' is no sensor, which is one of {', '.join(kinds)} and a number")
+    return struct.pack("<iI", int(kinds[words[0]]), _whole(words[1]))
+
+
+def _frames(lines: Lines) -> Iterator[bytes]:
+    for words in _rows(lines, 10, "FRAME_ID, RIG_ID, RIG_FROM_WORLD[], NUM_DATA_IDS, DATA_IDS[]"):
+        count, data = _whole(words[9]), words[10:]
+        _refuse_rest(data[3 * count :])
+        record = FRAME.pack(_whole(words[0]), _whole(words[1]), *_floats(words[2:9]), count)
+        for first in range(0, 3 * count, 3):
+            if len(data) < first + 3:
+                raise ValueError(f"it lists {len(data) // 3} of {count} images")
+            record += _sensor(data[first:]) + U64.pack(_whole(data[first + 2]))
+        yield record
+
+
+READERS: dict[str, Reader] = {
+    "cameras": _cameras, "images": _images, "points3D": _points, "rigs": _rigs, "frames": _frames,
+}  # fmt: skip
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+
+
+def _rows(lines: Lines, least: int, columns: str) -> Iterator[list[str]]:
+    """Words of the lines that are not empty, at least so many."""
+    for line in lines:
+        words = line.split()
+        if 0 < len(words) < least:
+            raise ValueError(f"{len(words)} words are less than {columns}")
+        if words:
+            yield words
+
+
+def _whole(word: str) -> int:
+    """A whole number, also one that is written `12.0`.
+
+    Raises:
+        ValueError: it is none, or negative.
+    """
+    number = int(word) if word.isdecimal() else _float(word)
+    if not (0 <= number < 2.0**63 and number == int(number)):
+        raise ValueError(f"'{word}' is no whole number of 0 or more")
+    return int(number)
+
+
+def _floats(words: Sequence[str]) -> np.ndarray:
+    """Numbers, float64."""
+    return np.array([_float(word) for word in words], dtype="<f8")
+
+
+def _float(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"'{word}' is no number") from None
+
+
+def _refuse_rest(words: Sequence[str]) -> None:
+    if words:
+        raise ValueError(f"{len(words)} words are left over at its end")
