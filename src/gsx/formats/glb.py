@@ -1,13 +1,17 @@
-"""GLB with KHR_gaussian_splatting: glTF's binary container, float attributes (KhronosGroup/glTF at 77b44be7, of
-2026-07-17, where the extension is a release candidate: scales and opacities are linear).
+"""GLB with KHR_gaussian_splatting: scales and opacities are linear, colours are harmonics of sRGB or linear light.
 
-The splats lie as training has them (x right, y down, z front) below a node that turns them by 180 degrees about z, into
-glTF's world (y up): a viewer that heeds the node turns their spherical harmonics with them.
+Follows the ratified extension, in the text of KhronosGroup/glTF 63770cc (2026-04-15).
+
+Splats are written as training has them (x right, y down, z front) below a node that turns them by 180 degrees about z,
+into glTF's world (y up): a viewer that heeds the node turns their spherical harmonics with them.
 """
 
 import json
+import logging
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,14 +20,52 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import degree_of
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays
+from gsx.formats.gltf_asset import (
+    BINARY_CHUNK,
+    FLOAT,
+    JSON_CHUNK,
+    KINDS,
+    MAGIC,
+    Asset,
+    Entry,
+    asset_of,
+    entry_at,
+    list_in,
+    part_of,
+    values_of,
+    view_of,
+)
+from gsx.formats.gltf_nodes import moved, placed_meshes
+from gsx.formats.linear_colours import srgb_of_linear
+from gsx.formats.spz import decode_spz
 
-MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+logger = logging.getLogger(__name__)
+
 EXTENSION = "KHR_gaussian_splatting"
-REVISION = "KHR_gaussian_splatting release candidate, KhronosGroup/glTF 77b44be7 (2026-07-17)"
+REVISION = "KHR_gaussian_splatting, ratified; text of KhronosGroup/glTF 63770cc (2026-04-15)"
 TURN = [0.0, 0.0, 1.0, 0.0]
 """Quaternion (x, y, z, w) of the node."""
-FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0
-KINDS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+TRAINING_FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""180 degrees about z: y up becomes y down."""
+ARRAY_BUFFER, POINTS = 34962, 0
+
+POSITION = "POSITION"
+ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
+CONSTANT = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
+REQUIRED = (POSITION, ROTATION, SCALE, OPACITY, CONSTANT)
+SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
+RULES = {"kernel": "ellipse", "projection": "perspective"}
+"""How splats are drawn. The order of blending is gsx's own: by depth, not by distance."""
+SPZ_EXTENSIONS = (
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+)
+"""Proposals, not ratified, that keep splats as SPZ in a buffer view (Cesium)."""
+SMALLEST_SCALE = 1e-10
+"""Scales of 0, which have no logarithm, are read as this."""
+OVERSHOOT = 1e-3
+"""Opacities this far beyond [0, 1] are rounding."""
 
 
 def encode_glb(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
@@ -67,11 +109,11 @@ def encode_glb(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
 def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:
     """Attributes by name, in the units of the extension."""
     found = {
-        "POSITION": arrays.means,
-        f"{EXTENSION}:ROTATION": arrays.quats[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.exp(arrays.log_scales.clip(-60, 60)),
-        f"{EXTENSION}:OPACITY": arrays.opacities,
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": arrays.sh_dc,
+        POSITION: arrays.means,
+        ROTATION: arrays.quats[:, [1, 2, 3, 0]],
+        SCALE: np.exp(arrays.log_scales.clip(-60, 60)),
+        OPACITY: arrays.opacities,
+        CONSTANT: arrays.sh_dc,
     }
     return found | {name: arrays.sh_rest[:, i] for i, name in enumerate(higher_bands(arrays.degree))}
 
@@ -87,84 +129,154 @@ def chunk(kind: int, content: bytes, padding: bytes) -> bytes:
     return struct.pack("<II", len(content), kind) + content
 
 
-def decode_glb(content: bytes) -> Arrays:
-    """The splats of a file that holds one primitive of them, in floats, below a node as `encode_glb` writes it.
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Arrays:
+    """Return the splats of a GLB or glTF of any program, in the axes of training worlds.
+
+    All splats of its scene are put together, each where its node is. Other primitives are left out, as are rows that
+    are not finite. name: of the file, for the log; folder: of its buffers.
 
     Raises:
-        InputError: it is damaged, or other than that.
+        InputError: it is damaged, holds no splats, or some that are drawn otherwise than by this extension.
     """
-    document, body = container(content)
-    try:
-        (mesh,) = document["meshes"]
-        (primitive,) = mesh["primitives"]
-        (node,) = document["nodes"]
-        turned = {key: node[key] for key in ("rotation", "translation", "scale", "matrix") if key in node}
-        if EXTENSION not in primitive["extensions"] or turned != {"rotation": TURN}:
-            raise InputError(
-                "its splats lie otherwise than gsx writes them: convert it to PLY by the program it is from"
-            )
-        found = {name: accessed(document, body, index) for name, index in primitive["attributes"].items()}
-        return arrays_of_attributes(found)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise InputError(f"it is no GLB of splats as gsx reads them ({type(error).__name__}: {error})") from None
+    asset = asset_of(content, folder)
+    parts, others = [], 0
+    for mesh, world in placed_meshes(asset.document):
+        for primitive in list_in(entry_at(asset.document, "meshes", mesh), "primitives"):
+            if not holds_splats(primitive):
+                others += 1
+                continue
+            parts.append(moved(splats_of_primitive(asset, primitive, name), TRAINING_FROM_GLTF @ world))
+    if not parts:
+        raise InputError(f"its scene holds no splats ({EXTENSION}), but {others} other primitives: choose another file")
+    if others:
+        logger.info("%s: %d primitives of its scene are no splats, and are left out", name, others)
+    arrays = together(parts)
+    refuse_far(arrays)
+    return arrays
 
 
-def container(content: bytes) -> tuple[Any, bytes]:
-    """Document and binary chunk.
+def holds_splats(primitive: Any) -> bool:
+    """Return whether a primitive is of splats."""
+    if not isinstance(primitive, dict):
+        raise InputError("one of its primitives is no object: export it anew")
+    return EXTENSION in part_of(primitive, "extensions") or bool(compression_of(primitive))
+
+
+def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
+    """Return the splats of a primitive in its own axes, their colours in sRGB.
 
     Raises:
-        InputError: it is no GLB, or ends early.
+        InputError: they are damaged, or drawn otherwise than by this extension.
     """
-    if len(content) < 20 or struct.unpack_from("<II", content) != (MAGIC, 2):
-        raise InputError("it is no GLB of version 2: export it anew")
-    size, kind = struct.unpack_from("<II", content, 12)
-    binary = 20 + size + 8
-    if kind != JSON_CHUNK or binary > len(content):
-        raise InputError("it is no whole GLB: copy or export it anew")
-    length, second = struct.unpack_from("<II", content, binary - 8)
-    if second != BINARY_CHUNK or binary + length > len(content):
-        raise InputError("it is no whole GLB: copy or export it anew")
-    try:
-        return json.loads(content[20 : 20 + size].decode()), content[binary : binary + length]
-    except (ValueError, RecursionError):
-        raise InputError("its document is no JSON: export it anew") from None
+    options = part_of(part_of(primitive, "extensions"), EXTENSION)
+    refuse_other_rules(options)
+    compressed = compression_of(primitive)
+    if compressed:
+        content, _ = view_of(asset, compressed.get("bufferView"))
+        arrays = decode_spz(content, axes="rdf")  # a node turns them, not their format
+    else:
+        attributes = part_of(primitive, "attributes")
+        found = {key: values_of(asset, attributes[key]) for key in wanted(attributes)}
+        arrays = arrays_of_attributes(finite_rows(found, name))
+    space = options.get("colorSpace", SRGB)
+    if space not in (SRGB, LINEAR):
+        raise InputError(f"its colours are of '{str(space)[:40]}', gsx reads {SRGB} and {LINEAR}: export one of them")
+    return srgb_of_linear(arrays, name) if space == LINEAR else arrays
 
 
-def accessed(document: Any, body: bytes, index: int) -> Float[np.ndarray, "N k"]:
-    """Values of an accessor, which has to be of floats that lie side by side."""
-    accessor = document["accessors"][index]
-    view, width = document["bufferViews"][accessor["bufferView"]], KINDS[accessor["type"]]
-    count, start = accessor["count"], view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    if accessor["componentType"] != FLOAT or "sparse" in accessor or view.get("byteStride", 4 * width) != 4 * width:
-        raise ValueError("its attributes are no floats side by side")
-    if not (isinstance(count, int) and count >= 1 and isinstance(start, int) and start >= 0):
-        raise ValueError("an accessor is of nothing")
-    with np.errstate(invalid="ignore"):  # nan of any kind, refused later
-        return np.frombuffer(body, "<f4", count * width, start).reshape(count, width).astype(float)
+def compression_of(primitive: Entry) -> Entry:
+    """Return the extension that keeps a primitive's splats as SPZ; empty: there is none."""
+    extensions = part_of(primitive, "extensions")
+    inner = part_of(part_of(extensions, EXTENSION), "extensions")
+    names = [key for key in extensions | inner if key in SPZ_EXTENSIONS]
+    return part_of(extensions | inner, names[0]) if names else {}
+
+
+def refuse_other_rules(options: Entry) -> None:
+    """Raise InputError if splats are drawn otherwise than as ellipses in perspective."""
+    for key, known in RULES.items():
+        value = options.get(key, known)
+        if value != known:
+            raise InputError(f"its {key} is '{str(value)[:40]}', gsx draws '{known}' alone: export it with that")
+    others = [key for key in part_of(options, "extensions") if key not in SPZ_EXTENSIONS]
+    if others:
+        raise InputError(f"its splats need '{others[0][:60]}', which is not read: export them without")
+
+
+def wanted(attributes: Entry) -> list[str]:
+    """Return the attributes that splats are read from; others, such as COLOR_0, repeat them.
+
+    Raises:
+        InputError: one is missing, or bands are not whole.
+    """
+    missing = [name for name in REQUIRED if name not in attributes]
+    if missing:
+        draft = ", as drafts of the extension did" if "_ROTATION" in attributes or "_SCALE" in attributes else ""
+        raise InputError(f"its splats lack attribute {missing[0]}{draft}: export them anew")
+    bands = [name for name in higher_bands(3) if name in attributes]
+    degree = degree_of(len(bands))
+    if bands != higher_bands(degree):
+        raise InputError(f"its harmonics lack coefficients, it has {len(bands)} but not 0, 3, 8 or 15: export it anew")
+    return [*REQUIRED, *bands]
+
+
+def finite_rows(found: dict[str, Float[np.ndarray, "N k"]], name: str) -> dict[str, Float[np.ndarray, "M k"]]:
+    """Return attributes of the splats that are finite in all; log how many others there were.
+
+    Raises:
+        InputError: attributes have a form that those of splats do not have.
+    """
+    for key, values in found.items():
+        width = {ROTATION: 4, OPACITY: 1}.get(key, 3)
+        if values.shape != (len(found[POSITION]), width):
+            raise InputError(f"its attribute {key} has {values.shape[0]:,} x {values.shape[1]} values, "
+                             f"not {len(found[POSITION]):,} x {width}: export it anew")  # fmt: skip
+    finite = np.isfinite(np.concatenate(list(found.values()), 1)).all(1)
+    if finite.all():
+        return found
+    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),
+                   len(finite))  # fmt: skip
+    return {key: values[finite] for key, values in found.items()}
 
 
 def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
-    """Splats of attributes by name.
+    """Return splats of finite attributes by name.
 
     Raises:
-        KeyError, ValueError: one is missing, or of another form.
+        InputError: a scale or an opacity is none.
     """
-    bands = [name for name in higher_bands(3) if name in found]
-    degree = degree_of(len(bands))
-    if bands != higher_bands(degree) or len({len(values) for values in found.values()}) != 1:
-        raise ValueError("its bands are not whole, or not those of all splats")
-    scales, quats = found[f"{EXTENSION}:SCALE"], found[f"{EXTENSION}:ROTATION"]
-    if not all(np.isfinite(values).all() for values in found.values()) or (scales <= 0).any():
-        raise ValueError("a value is not finite, or a scale not above 0")
+    scales, opacities, quats = found[SCALE], found[OPACITY][:, 0], found[ROTATION]
+    if (scales < 0).any():
+        raise InputError("a scale is below 0, but scales are no logarithms in glTF: export it anew")
+    if (opacities < -OVERSHOOT).any() or (opacities > 1 + OVERSHOOT).any():
+        raise InputError("an opacity is beyond [0, 1], but opacities are no logits in glTF: export it anew")
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    if not (norms > 0).all():
-        raise ValueError("a rotation is none")
-    rest = np.stack([found[name] for name in bands], 1) if bands else np.empty((len(scales), 0, 3))
+    quats = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [0.0, 0.0, 0.0, 1.0])
+    rest = [found[name] for name in found if name not in REQUIRED]
     return Arrays(
-        means=found["POSITION"],
-        log_scales=np.log(scales),
-        quats=(quats / norms)[:, [3, 0, 1, 2]],
-        opacities=found[f"{EXTENSION}:OPACITY"][:, 0],
-        sh_dc=found[f"{EXTENSION}:SH_DEGREE_0_COEF_0"],
-        sh_rest=rest,
+        means=found[POSITION],
+        log_scales=np.log(np.maximum(scales, SMALLEST_SCALE)),
+        quats=quats[:, [3, 0, 1, 2]],
+        opacities=opacities.clip(0, 1),
+        sh_dc=found[CONSTANT],
+        sh_rest=np.stack(rest, 1) if rest else np.empty((len(scales), 0, 3)),
     )
+
+
+def together(parts: Sequence[Arrays]) -> Arrays:
+    """Return the splats of several primitives, with harmonics of the highest degree among them."""
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh_rest.shape[1] for part in parts)
+    padded = [replace(part, sh_rest=np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))))
+              for part in parts]  # fmt: skip
+    return Arrays(**{key: np.concatenate([vars(part)[key] for part in padded]) for key in vars(parts[0])})
+
+
+def refuse_far(arrays: Arrays) -> None:
+    """Raise InputError if a node moved splats beyond what 32 bits hold."""
+    if len(arrays.means) and not np.abs(arrays.means).max() <= np.finfo(np.float32).max:
+        raise InputError("its splats lie beyond what 32 bits hold: export them with their transform applied")

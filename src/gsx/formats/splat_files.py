@@ -106,9 +106,9 @@ def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
         return decode_standard_ply(content, name)
     if kind == ".spz":
         return gaussians_from(decode_spz(content, axes))
-    return gaussians_from(
-        {".sog": decode_sog, ".glb": decode_glb, ".compressed.ply": decode_compressed_ply}[kind](content)
-    )
+    if kind == ".glb":
+        return gaussians_from(decode_glb(content, name, Path(name).parent))
+    return gaussians_from({".sog": decode_sog, ".compressed.ply": decode_compressed_ply}[kind](content))
 
 
 def compensated(path: Path) -> bool:

@@ -1,0 +1,288 @@
+"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with its buffers (glTF specification, 3.6 and 4)."""
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from gsx.core.errors import InputError
+from gsx.core.shapes import Float
+
+MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+KINDS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+"""Values of each type of accessor that splats have."""
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+FLOAT = 5126
+LARGEST = 1e30
+"""Numbers of a document are smaller."""
+DATA_URI = "data:"
+COMPRESSED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+"""Extensions of buffer views whose bytes are no values."""
+Entry = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Asset:
+    """A document with the bytes that it refers to."""
+
+    document: Entry
+    binary: bytes
+    """The binary chunk of a GLB; empty where it has none."""
+    folder: Path | None
+    """Of the buffers in files of their own; None: these are not read."""
+    buffers: dict[int, bytes] = field(default_factory=dict)
+    """Those read so far, by index."""
+
+
+# -- the document ------------------------------------------------------------------------------------------------------
+
+
+def asset_of(content: bytes, folder: Path | None = None) -> Asset:
+    """Return the asset of a GLB, or of a glTF as text.
+
+    Raises:
+        InputError: it is neither, ends early, or is of another version.
+    """
+    if content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        return Asset(document=document_of(content), binary=b"", folder=folder)
+    text, binary = chunks_of(content)
+    return Asset(document=document_of(text), binary=binary, folder=folder)
+
+
+def chunks_of(content: bytes) -> tuple[bytes, bytes]:
+    """Return the text and the binary chunk of a GLB; chunks of other kinds are skipped.
+
+    Raises:
+        InputError: it is no GLB of version 2, or ends early.
+    """
+    if len(content) < 12 or struct.unpack_from("<I", content)[0] != MAGIC:
+        raise InputError("it is no GLB: export it anew")
+    _, version, length = struct.unpack_from("<III", content)
+    if version != 2:
+        raise InputError(f"it is GLB of version {version}: export it anew as version 2")
+    if length > len(content):
+        raise InputError(f"it ends after {len(content):,} of {length:,} bytes: copy or export it anew")
+    chunks: dict[int, bytes] = {}
+    start = 12
+    while start + 8 <= length:
+        size, kind = struct.unpack_from("<II", content, start)
+        if start + 8 + size > length:
+            raise InputError("it ends within a chunk: copy or export it anew")
+        chunks.setdefault(kind, content[start + 8 : start + 8 + size])
+        start += 8 + size
+    if JSON_CHUNK not in chunks:
+        raise InputError("it is no GLB with a document: export it anew")
+    return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK, b"")
+
+
+def document_of(text: bytes) -> Entry:
+    """Return the document of a text.
+
+    Raises:
+        InputError: it is no JSON, or of another version.
+    """
+    try:
+        document = json.loads(text.decode("utf-8-sig"))
+    except (ValueError, RecursionError):
+        raise InputError("its document is no JSON: export it anew") from None
+    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
+        raise InputError("its document is no glTF: export it anew")
+    version = document["asset"].get("version")
+    if not str(version).startswith("2."):
+        raise InputError(f"it is glTF of version {str(version)[:20]}: export it anew as version 2.0")
+    return document
+
+
+def entry_at(document: Entry, collection: str, index: Any) -> Entry:
+    """Return an entry of a collection of the document, such as a node.
+
+    Raises:
+        InputError: there is none.
+    """
+    entries = list_in(document, collection)
+    if type(index) is int and 0 <= index < len(entries) and isinstance(entries[index], dict):
+        return dict(entries[index])
+    raise InputError(f"its {collection}[{str(index)[:20]}] is missing: export it anew")
+
+
+def part_of(entry: Entry, key: str) -> Entry:
+    """Return an object within an entry; empty: it has none.
+
+    Raises:
+        InputError: it is something else.
+    """
+    part = entry.get(key, {})
+    if not isinstance(part, dict):
+        raise InputError(f"its '{key}' is no object: export it anew")
+    return part
+
+
+def list_in(entry: Entry, key: str) -> list[Any]:
+    """Return a list within an entry; empty: it has none.
+
+    Raises:
+        InputError: it is something else.
+    """
+    values = entry.get(key, [])
+    if not isinstance(values, list):
+        raise InputError(f"its '{key}' is no list: export it anew")
+    return values
+
+
+def whole_in(entry: Entry, key: str, default: int | None = None) -> int:
+    """Return a whole number >= 0 of an entry.
+
+    Raises:
+        InputError: it has none.
+    """
+    value = entry.get(key, default)
+    if type(value) is not int or not 0 <= value < 2**53:
+        raise InputError(f"its '{key}' is {str(value)[:20]}, no whole number: export it anew")
+    return value
+
+
+def numbers_in(entry: Entry, key: str, default: Sequence[float]) -> Float[np.ndarray, "k"]:
+    """Return as many numbers of an entry as the default has.
+
+    Raises:
+        InputError: it has others, or one that is not finite.
+    """
+    values = entry.get(key, default)
+    counted = isinstance(values, Sequence) and len(values) == len(default)
+    if counted and all(type(value) in (int, float) and abs(value) < LARGEST for value in values):
+        return np.array(values, dtype=float)
+    raise InputError(f"its '{key}' is {str(values)[:40]}, no {len(default)} finite numbers: export it anew")
+
+
+# -- buffers and accessors ---------------------------------------------------------------------------------------------
+
+
+def buffer_of(asset: Asset, index: int) -> bytes:
+    """Return the bytes of a buffer: of the binary chunk, of the document, or of a file next to it.
+
+    Raises:
+        InputError: they are missing, or too few.
+    """
+    if index not in asset.buffers:
+        entry = entry_at(asset.document, "buffers", index)
+        content = asset.binary if "uri" not in entry else linked(asset, entry["uri"])
+        size = whole_in(entry, "byteLength")
+        if len(content) < size:
+            raise InputError(f"its buffer {index} has {len(content):,} of {size:,} bytes: copy or export it anew")
+        asset.buffers[index] = content
+    return asset.buffers[index]
+
+
+def linked(asset: Asset, uri: Any) -> bytes:
+    """Return the bytes that a buffer's URI stands for.
+
+    Raises:
+        InputError: it is damaged, leads out of the folder, or cannot be read.
+    """
+    if isinstance(uri, str) and uri.startswith(DATA_URI):
+        head, _, data = uri.partition(",")
+        try:
+            return (
+                base64.b64decode(data, validate=True) if head.endswith(";base64") else unquote(data).encode("latin-1")
+            )
+        except (binascii.Error, ValueError):
+            raise InputError("a buffer's data URI is damaged: export it anew") from None
+    name = unquote(uri) if isinstance(uri, str) else ""
+    inside = (
+        name
+        and "\0" not in name
+        and "://" not in name
+        and not Path(name).is_absolute()
+        and ".." not in Path(name).parts
+    )
+    if asset.folder is None or not inside:
+        raise InputError(f"its buffer '{str(uri)[:60]}' is no file next to it: export it as GLB")
+    try:
+        return (asset.folder / name).read_bytes()
+    except OSError as problem:
+        raise InputError(f"its buffer '{name}' cannot be read ({problem.strerror}): copy it next to the file") from None
+
+
+def view_of(asset: Asset, index: Any) -> tuple[bytes, Entry]:
+    """Return the bytes of a buffer view, and its entry.
+
+    Raises:
+        InputError: it lies beyond its buffer, or is compressed.
+    """
+    entry = entry_at(asset.document, "bufferViews", index)
+    compressed = [name for name in COMPRESSED_VIEWS if name in part_of(entry, "extensions")]
+    if compressed:
+        raise InputError(f"its values are compressed ({compressed[0]}), which is not read: export it uncompressed")
+    content = buffer_of(asset, whole_in(entry, "buffer"))
+    start, size = whole_in(entry, "byteOffset", 0), whole_in(entry, "byteLength")
+    if start + size > len(content):
+        raise InputError(f"its bufferViews[{index}] ends beyond its buffer: copy or export it anew")
+    return content[start : start + size], entry
+
+
+def values_of(asset: Asset, index: Any) -> Float[np.ndarray, "N k"]:
+    """Return the values of an accessor: of any type, normalised where it says so, sparse ones filled in.
+
+    Raises:
+        InputError: it is damaged, or of a type that splats do not have.
+    """
+    accessor = entry_at(asset.document, "accessors", index)
+    width, count = KINDS.get(str(accessor.get("type")), 0), whole_in(accessor, "count")
+    if not width or whole_in(accessor, "componentType") not in COMPONENTS or not count:
+        raise InputError(f"its accessors[{index}] is of no type that splats have: export it anew")
+    values = stored(asset, accessor, count, width)
+    if "sparse" in accessor:
+        fill_sparse(asset, accessor, values)
+    return normalised(values, accessor)
+
+
+def stored(asset: Asset, accessor: Entry, count: int, width: int) -> np.ndarray:
+    """Return the stored values of an accessor without its sparse ones; zeros where it has no buffer view.
+
+    Raises:
+        InputError: they lie beyond their buffer view.
+    """
+    kind = np.dtype(COMPONENTS[accessor["componentType"]])
+    if "bufferView" not in accessor:
+        if count > sum(whole_in(entry, "byteLength") for entry in list_in(asset.document, "buffers")):
+            raise InputError(f"an accessor has {count:,} values, more than the file has bytes: export it anew")
+        return np.zeros((count, width), kind)
+    content, view = view_of(asset, accessor["bufferView"])
+    stride = whole_in(view, "byteStride", kind.itemsize * width)
+    start = whole_in(accessor, "byteOffset", 0)
+    if stride < 1 or start + stride * (count - 1) + kind.itemsize * width > len(content):
+        raise InputError(f"an accessor has {count:,} values, its buffer view fewer: copy or export it anew")
+    return np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
+
+
+def fill_sparse(asset: Asset, accessor: Entry, values: np.ndarray) -> None:
+    """Put the sparse values of an accessor in their places.
+
+    Raises:
+        InputError: they are damaged.
+    """
+    sparse = part_of(accessor, "sparse")
+    count, indices = whole_in(sparse, "count"), part_of(sparse, "indices")
+    if whole_in(indices, "componentType") not in (5121, 5123, 5125) or not count:
+        raise InputError("a sparse accessor has no indices: export it anew")
+    rows = stored(asset, indices, count, 1)[:, 0]
+    if (rows >= len(values)).any():
+        raise InputError("a sparse accessor has an index beyond its values: export it anew")
+    replacing = part_of(sparse, "values") | {"componentType": accessor["componentType"]}
+    values[rows] = stored(asset, replacing, count, values.shape[1])
+
+
+def normalised(values: np.ndarray, accessor: Entry) -> Float[np.ndarray, "N k"]:
+    """Return values as floats: whole numbers as shares of their largest where the accessor is normalised."""
+    with np.errstate(invalid="ignore"):  # nan of any kind
+        floats = values.astype(float)
+    if values.dtype.kind == "f" or accessor.get("normalized") is not True:
+        return floats
+    return np.maximum(floats / np.iinfo(values.dtype).max, -1)

@@ -1,0 +1,138 @@
+"""Nodes of glTF: where each mesh of a scene lies, and splats moved there."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from gsx.core.errors import InputError
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
+from gsx.core.gaussians.turned import product, turned_harmonics
+from gsx.core.shapes import Float
+from gsx.formats.arrays import Arrays
+from gsx.formats.gltf_asset import LARGEST, Entry, entry_at, list_in, numbers_in
+
+SHEAR = 1e-3
+"""Cosine between a node's axes up to which they count as orthogonal."""
+EQUAL = 1e-6
+"""Relative difference of scales that counts as none."""
+ROUNDING = 1e-12
+"""Difference from a whole number that is rounding alone."""
+IDENTITY = np.eye(4)
+
+
+def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
+    """Yield the index of each mesh of the scene and the matrix to the world, once for each node that has it.
+
+    A document without nodes has its meshes in the world.
+
+    Raises:
+        InputError: nodes are no trees, or one is damaged.
+    """
+    if not list_in(document, "nodes"):
+        yield from ((mesh, IDENTITY) for mesh in range(len(list_in(document, "meshes"))))
+    pending = [(index, IDENTITY) for index in reversed(roots(document))]
+    visited: set[int] = set()
+    while pending:
+        index, world_from_parent = pending.pop()
+        node = entry_at(document, "nodes", index)
+        if index in visited:
+            raise InputError(f"its node {index} has two parents: export it anew")
+        visited.add(index)
+        with np.errstate(over="ignore", invalid="ignore"):  # refused where splats are moved by it
+            matrix = world_from_parent @ node_matrix(node)
+        if "mesh" in node:
+            yield node["mesh"], matrix
+        pending += [(child, matrix) for child in reversed(list_in(node, "children"))]
+
+
+def roots(document: Entry) -> list[int]:
+    """Return the root nodes of the scene that is displayed; without scenes, nodes that are no children."""
+    if list_in(document, "scenes"):
+        return list_in(entry_at(document, "scenes", document.get("scene", 0)), "nodes")
+    nodes = range(len(list_in(document, "nodes")))
+    children = [child for index in nodes for child in list_in(entry_at(document, "nodes", index), "children")]
+    below = {child for child in children if type(child) is int}
+    return [index for index in nodes if index not in below]
+
+
+def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix from a node to its parent: as stored, column by column, or translation, rotation, scale."""
+    if "matrix" in node:
+        return numbers_in(node, "matrix", IDENTITY.flatten().tolist()).reshape(4, 4).T
+    x, y, z, w = numbers_in(node, "rotation", (0.0, 0.0, 0.0, 1.0))
+    matrix = np.eye(4)
+    turn = rotation_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+    matrix[:3, :3] = turn * numbers_in(node, "scale", (1.0, 1.0, 1.0))
+    matrix[:3, 3] = numbers_in(node, "translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
+    """Return splats where every point p is `matrix` (p, 1): a rotation after positive scales, and a translation.
+
+    Colours turn with the rotation (KHR_gaussian_splatting, "Splat Lighting").
+
+    Raises:
+        InputError: the matrix mirrors, shears or flattens.
+    """
+    if not np.abs(matrix).max() < LARGEST:
+        raise InputError("a node lies beyond all numbers: export it with its transform applied")
+    if np.abs(matrix - IDENTITY).max() < ROUNDING:
+        return arrays
+    linear, scale = matrix[:3, :3], np.linalg.norm(matrix[:3, :3], axis=0)
+    rotation = unscaled(linear, scale)
+    turn = torch.from_numpy(rotation)
+    uniform = float(scale.max() - scale.min()) <= EQUAL * float(scale.max())
+    if uniform:
+        log_scales = arrays.log_scales + np.log(scale.mean())
+        quats = product(quaternions_of(turn[None])[0], torch.from_numpy(arrays.quats)).numpy()
+    else:
+        log_scales, quats = stretched(arrays, linear)
+    rest = arrays.sh_rest
+    if arrays.degree:
+        rest = sharpened(turned_harmonics(turn, arrays.degree).numpy()) @ rest
+    return Arrays(
+        means=arrays.means @ linear.T + matrix[:3, 3],
+        log_scales=log_scales,
+        quats=quats,
+        opacities=arrays.opacities,
+        sh_dc=arrays.sh_dc,
+        sh_rest=rest,
+    )
+
+
+def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of a node, whose columns are as long as `scale`.
+
+    Raises:
+        InputError: it is none.
+    """
+    if scale.min() < 1 / LARGEST:
+        raise InputError("a node has a scale of 0: export it with its transform applied")
+    axes = linear / scale
+    if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
+        raise InputError("a node shears its splats, which is not read: export it with its transform applied")
+    if np.linalg.det(axes) < 0:
+        raise InputError("a node mirrors its splats, which is not read: export it with its transform applied")
+    left, _, right = np.linalg.svd(axes)
+    return sharpened(left @ right)
+
+
+def sharpened(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return a matrix without rounding: whole numbers where it is that close to them."""
+    return np.where(np.abs(matrix - matrix.round()) < ROUNDING, matrix.round(), matrix)
+
+
+def stretched(
+    arrays: Arrays, linear: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 4"]]:
+    """Return logarithms of scales, and quaternions, of splats after a map that is no similarity.
+
+    The covariance becomes M C C^T M^T, whose principal axes are the left singular vectors of M C.
+    """
+    own = rotation_matrices(torch.from_numpy(arrays.quats)).numpy() * np.exp(arrays.log_scales)[:, None]
+    left, scales, _ = np.linalg.svd(linear @ own)
+    left[:, :, 2] *= np.sign(np.linalg.det(left))[:, None]
+    quats = quaternions_of(torch.from_numpy(left)).numpy()
+    return np.log(np.maximum(scales, np.finfo(float).tiny)), quats
