@@ -646,3 +646,30 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(tmp_path: Path) -> Non
     assert found
     assert found.group(2) == str(tmp_path / "run")
     assert list((tmp_path / "run" / "checkpoints").glob(f"step_{int(found.group(1)):07d}.safetensors"))
+
+
+@pytest.mark.parametrize("words", [["-m", "seed=0,1"], ["+experiment=table_real_world", "dataset=demo"]])
+def test_slurm_is_refused_where_there_is_none(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main([*words, "hydra/launcher=slurm", f"output={tmp_path / 'out'}"]) == 2
+    assert "hydra/launcher=slurm: this machine has no Slurm, no srun is on the PATH" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_launcher_that_fails_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failing(self: object, job_overrides: object, initial_job_idx: int) -> None:
+        raise RuntimeError("no such partition\nand more")
+
+    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+    monkeypatch.setattr(BasicLauncher, "launch", failing)
+    assert main(["-m", "seed=0,1", "iterations=1", f"output={tmp_path}"]) == 2
+    assert capsys.readouterr().err == (
+        "gsx: the launcher failed (RuntimeError: no such partition): mend its settings, or choose "
+        "hydra/launcher=basic: one run after the other, here\n"
+    )
+    assert os.environ.get("HYDRA_FULL_ERROR") != "1"  # what other errors of this process print stays as it was

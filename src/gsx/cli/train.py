@@ -77,7 +77,7 @@ def fill_table(arguments: list[str]) -> int:
 def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     with loading():
-        from gsx.experiments.runs.compose import check_overrides, hydra_main, quoted
+        from gsx.experiments.runs.compose import check_overrides, hydra_main, launch, quoted
         from gsx.experiments.runs.launched import waiting_for_all
         from gsx.experiments.tables.sweep import is_table
 
@@ -97,7 +97,7 @@ def hand_to_hydra(arguments: list[str]) -> int:
     sweep, code = new_sweep(output), 0
     try:
         with waiting_for_all(sweep):
-            hydra_main(["-m", *given, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+            launch(["-m", *given, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     except KeyboardInterrupt:
         say("\ngsx: interrupted; runs that were begun say above how to go on\n", as_error=True)
         code = INTERRUPTED

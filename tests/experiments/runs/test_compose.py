@@ -1,5 +1,6 @@
 """Composition: every file composes, typed options, nearest matches."""
 
+import re
 from dataclasses import asdict, replace
 from functools import cache
 from itertools import zip_longest
@@ -49,6 +50,15 @@ def test_every_file_composes_and_fits_its_schema(group: str) -> None:
             settings = compositions.settings([*NEEDS.get((group, option.split("_")[0]), ()), f"{group}={option}"])
             if group in ("scene", "backbone"):
                 assert getattr(settings, group).component.name == option
+
+
+def test_groups_that_name_others_have_a_choice() -> None:
+    """Hydra 1.4 refuses to interpolate the choice of a group that has none."""
+    defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults, resolve=False)
+    choices = {key: value for entry in defaults if isinstance(entry, dict) for key, value in entry.items()}
+    named = {name for value in choices.values() for name in re.findall(r"\$\{(\w+)\}", str(value))}
+    assert named == {"backbone", "dataset"}
+    assert all(choices[name] for name in named)
 
 
 def test_every_file_of_what_is_chosen_apart_composes_and_fits_its_schema() -> None:

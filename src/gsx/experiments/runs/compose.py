@@ -1,27 +1,32 @@
 """From overrides to a composition: the only module that speaks to Hydra, but for the files that Hydra reads."""
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
+from inspect import signature
 from itertools import islice
 from pathlib import Path
+from shutil import which
 from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.errors import ConfigError, GsxError, first_line, nearest
 from gsx.core.files import at_home
 from gsx.core.plugins import Plugins
 from gsx.experiments.runs.launched import waiting_for_all
 from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
-OmegaConf.register_new_resolver("either", lambda first, second: first or second, replace=True)
-OmegaConf.register_new_resolver("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
+NEWER = "replace" in signature(OmegaConf.register_resolver).parameters  # OmegaConf 2.4: an older function of this name
+register = OmegaConf.register_resolver if NEWER else OmegaConf.register_new_resolver
+register("either", lambda first, second: first or second, replace=True)
+register("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
 MODULE = "gsx.conf"
 LAUNCHERS = {
@@ -32,6 +37,9 @@ LAUNCHERS = {
     "submitit_local": ("hydra-submitit-launcher", "slurm"),
 }
 """Package and extra of each launcher beside Hydra's own."""
+FULL_ERROR = "HYDRA_FULL_ERROR"
+SLURM = ("slurm", "submitit_slurm")
+"""Launchers that submit jobs by Slurm's own programs."""
 MOST_KEPT = 16
 """Compositions of a session, a MB each, that are there when they are asked for again."""
 
@@ -42,12 +50,19 @@ def hydra_session(plugins: Plugins) -> Iterator[None]:
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
 
-    from gsx.experiments.runs.config_files import register
+    from gsx.experiments.runs import config_files
 
-    register(plugins.config_paths)
+    config_files.register(plugins.config_paths)
     GlobalHydra.instance().clear()
-    with initialize_config_module(MODULE, version_base="1.3"):
+    with initialize_config_module(MODULE, **version_base()):
         yield
+
+
+def version_base() -> dict[str, str]:
+    """Return the argument that keeps Hydra 1.3 to its own rules: newer ones warn of it, and have no other."""
+    import hydra
+
+    return {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
 
 
 @dataclass(frozen=True)
@@ -272,6 +287,16 @@ def refuse_absent_launcher(name: str) -> None:
         raise ConfigError(f"hydra/launcher={name} needs the package {package}: pip install 'gsx[{extra}]'") from error
 
 
+def refuse_absent_slurm(overrides: Sequence[str]) -> None:
+    """Raise ConfigError if jobs go to Slurm and this machine has no program of it."""
+    chosen = [str(one.value()) for one in parse_overrides(overrides) if one.key_or_group == "hydra/launcher"]
+    if chosen and chosen[-1] in SLURM and which("srun") is None:
+        raise ConfigError(
+            f"hydra/launcher={chosen[-1]}: this machine has no Slurm, no srun is on the PATH. Submit from a machine of "
+            "the cluster, or run here with hydra/launcher=processes"
+        )
+
+
 def known_groups() -> list[str]:
     """Configuration groups, nested ones included: `regenerator/upscale`."""
     outer = [group for group in listed("", groups=True) if not group.startswith("hydra")]
@@ -314,6 +339,7 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, l
 
     Returns (the folder that its runs go to, overrides of its launcher for as many runs).
     """
+    refuse_absent_slurm(overrides)
     with hydra_session(plugins):
         groups, given = known_groups(), [one for one in parse_overrides(overrides) if one.input_line]
         refuse_one_folder(given)
@@ -382,11 +408,31 @@ def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictCo
 
     import hydra
 
-    from gsx.experiments.runs.config_files import register
+    from gsx.experiments.runs import config_files
 
-    register(plugins.config_paths)
+    config_files.register(plugins.config_paths)
     sys.argv = ["gsx", *arguments]
-    hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="config")(job)()
+    hydra.main(**version_base(), config_path=f"pkg://{MODULE}", config_name="config")(job)()
+
+
+def launch(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
+    """Run the jobs of a multirun by Hydra's launcher.
+
+    Raises:
+        ConfigError: the launcher failed. Errors of gsx and of the file system stay as they are.
+    """
+    before = os.environ.get(FULL_ERROR)
+    os.environ[FULL_ERROR] = "1"  # or Hydra prints a traceback and ends the program
+    try:
+        hydra_main(arguments, plugins, job)
+    except (GsxError, OSError):
+        raise
+    except Exception as error:
+        remedy = "mend its settings, or choose hydra/launcher=basic: one run after the other, here"
+        raise ConfigError(f"the launcher failed ({type(error).__name__}: {first_line(error)}): {remedy}") from error
+    finally:
+        os.environ.pop(FULL_ERROR)
+        os.environ |= {} if before is None else {FULL_ERROR: before}
 
 
 def job_place() -> tuple[Path, int] | None:

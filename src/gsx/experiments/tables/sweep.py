@@ -14,7 +14,7 @@ from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed_name, left_behind
 from gsx.experiments.run_folder.files import reported
 from gsx.experiments.run_folder.run_key import sorted_items
-from gsx.experiments.runs.compose import Compositions, key_of, parse_overrides
+from gsx.experiments.runs.compose import Compositions, key_of, parse_overrides, refuse_absent_slurm
 from gsx.experiments.runs.job import tidied
 from gsx.experiments.runs.settings import typed
 from gsx.experiments.tables.datasets import missing
@@ -81,6 +81,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         tell(plan, lacking)
         if experiment.dry:
             return "".join(f"{command(*job)}\n" for phase in plan.phases for job in phase), 0
+        refuse_absent_slurm(launching)
         tidy(folder, due)
         for number, phase in enumerate(plan.phases):
             launched(compositions, launching, folder / "launched" / str(number), phase, job)
