@@ -3,6 +3,7 @@
 import gc
 import os
 from collections import Counter
+from collections.abc import Iterator
 from getpass import getuser
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +11,7 @@ from tempfile import gettempdir
 
 import pytest
 from hypothesis import settings
+from processes import Begin, default_signals, killed_at_the_end
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "0")
 for switch, value in {"TORCHINDUCTOR_VEC_ISA_OK": "1", "TORCH_FAKE_TENSOR_DISPATCH_CACHE": "0"}.items():
@@ -44,10 +46,15 @@ COMPILED = {
 
 
 def checked_modules() -> list[str]:
-    """Every module of the core and the backbones but the compiled ones; the hook takes a package with all below it."""
+    """Every module of core, formats and backbones but the compiled ones; the hook takes a package with all below it."""
     spec = find_spec("gsx")
     root = Path(next(iter(spec.submodule_search_locations)))
-    files = [file for part in ("core", "backbones") for file in (root / part).rglob("*.py") if file.stem != "__init__"]
+    files = [
+        file
+        for part in ("core", "formats", "backbones")
+        for file in (root / part).rglob("*.py")
+        if file.stem != "__init__"
+    ]
     names = {".".join(file.relative_to(root.parent).with_suffix("").parts) for file in files}
     return sorted(names - COMPILED)
 
@@ -69,6 +76,20 @@ settings.load_profile("repeatable")  # the same cases on every run
 def pytest_collection_finish():
     """What is imported by now stays: to look through it for garbage took a twentieth of the time."""
     gc.freeze()
+
+
+@pytest.fixture(scope="module")
+def signals() -> Iterator[None]:
+    """Signals end processes as they do in a terminal, also under `nohup` and in the background."""
+    with default_signals():
+        yield
+
+
+@pytest.fixture
+def begin(signals: None) -> Iterator[Begin]:
+    """`subprocess.Popen` for processes that are killed after the test, however it ends."""
+    with killed_at_the_end() as begin:
+        yield begin
 
 
 @pytest.fixture(autouse=True)

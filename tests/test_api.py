@@ -195,3 +195,20 @@ def test_the_page_does_what_it_says(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["four_times.png", "model.ply", "photograph.png"]
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"{run.folder} 3 {run.folder / 'report.html'}"
+
+
+def test_zlib_is_loaded_before_the_copy_in_the_wheel_of_pycolmap() -> None:
+    """In this order both compress; harmless input."""
+    program = (
+        "import gsx, sys; assert 'zlib' in sys.modules and 'pycolmap' not in sys.modules; import pycolmap, zlib; "
+        "print(zlib.decompress(zlib.compress(bytes(1000))) == bytes(1000))"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "True\n"
+    )
+
+
+def test_pycolmap_before_zlib_is_warned_of() -> None:
+    program = "import sys; sys.modules.pop('zlib', None); sys.modules['pycolmap'] = sys; import gsx"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stderr
+    assert "pycolmap was imported before zlib, which can end Python: import gsx first" in found

@@ -3,8 +3,16 @@
 Importing this module does not import torch; the first use of `gsx.train` or `gsx.load` does.
 """
 
+import sys
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# The wheel of pycolmap holds a zlib of its own. Whoever loads the system's first decides which functions that one
+# calls, and mixed they end the process. Loaded by Python's own module, each keeps to itself.
+if "pycolmap" in sys.modules and "zlib" not in sys.modules:
+    warnings.warn("pycolmap was imported before zlib, which can end Python: import gsx first", stacklevel=2)
+import zlib  # noqa: F401
 
 if TYPE_CHECKING:
     from gsx.api import SplatFile as SplatFile

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import Begin
 from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
@@ -629,18 +630,15 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_partial_file(
     assert not list(tmp_path.rglob("*partial*"))
 
 
-def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(tmp_path: Path) -> None:
+def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(begin: Begin, tmp_path: Path) -> None:
     command = [*GSX, *words(tmp_path / "run", *FEW, "iterations=100000", "rasterizer=eager", "training.log_every=1")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 120
-        while not (metrics.exists() and metrics.read_text().count("\n") >= 2):
-            assert time.monotonic() < deadline, "training did not begin"
-            time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=120)
-    finally:
-        process.kill()
+    process = begin(command, stderr=subprocess.PIPE, text=True)
+    metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 120
+    while not (metrics.exists() and metrics.read_text().count("\n") >= 2):
+        assert time.monotonic() < deadline, "training did not begin"
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == 130
     found = re.search(r"stopped at step (\d+); go on with: gsx resume (\S+)", err)
     assert found

@@ -13,7 +13,7 @@ from faults.children import command, in_child, preload, run_in_child
 from faults.record import record, some
 from faults.verbs import VERBS, model_by_name, orphans
 
-pytestmark = pytest.mark.faults
+pytestmark = [pytest.mark.faults, pytest.mark.usefixtures("signals")]
 
 RUN = VERBS["reuse"].words
 PARTS, RUNS = 15, 20

@@ -83,7 +83,7 @@ def as_rank(rank: int, words: Sequence[str], port: int, folder: Path, failing: d
 
 
 @pytest.fixture(scope="module")
-def forking() -> Any:
+def forking(signals: None) -> Any:
     """Starts processes that have gsx and all it needs imported."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
@@ -103,6 +103,8 @@ def both(context: Any, folder: Path, *words: str, **failing: str) -> subprocess.
         rank.start()
     for rank in ranks:
         rank.join(300)
+        rank.kill()
+        rank.join()
     said = ["".join((folder / f"{name}{rank}").read_text() for rank in (0, 1)) for name in ("out", "err")]
     return subprocess.CompletedProcess(words, max(abs(rank.exitcode or 0) for rank in ranks), *said)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+from processes import Begin
 from tiny import tiny_settings, words
 
 from gsx.builtin import plugins
@@ -47,15 +48,14 @@ def test_the_second_is_told_who_is_first_and_nothing_stays_behind(tmp_path: Path
             pass
 
 
-def test_the_claim_of_a_killed_process_is_void(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+def test_the_claim_of_a_killed_process_is_void(begin: Begin, tmp_path: Path) -> None:
+    process = begin([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     with pytest.raises(InputError, match=f"process {process.pid} "), claimed(tmp_path):
         pytest.fail("two had it")
     process.send_signal(signal.SIGKILL)
     process.wait()
-    process.stdout.close()
     assert (tmp_path / LOCK).is_file()
     with claimed(tmp_path):
         pass

@@ -208,7 +208,7 @@ class Sending:
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR2"])
-def test_signals_of_a_jobs_end_keep_its_last_step(tmp_path: Path, name: str) -> None:
+def test_signals_of_a_jobs_end_keep_its_last_step(signals: None, tmp_path: Path, name: str) -> None:
     number, received = getattr(signal, name), []
     before = signal.signal(number, lambda *_: received.append(name))
     loaded = plugins()

@@ -8,11 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
-from subprocess import PIPE, Popen
+from subprocess import PIPE
 
 import pytest
+from processes import Begin
 
 from gsx.experiments.runs.launched import STOPPED, ended_from_without, waiting_for_all
+
+pytestmark = pytest.mark.usefixtures("signals")
 
 
 def work(folder: Path, name: str) -> None:
@@ -58,8 +61,12 @@ def test_all_jobs_come_to_an_end_before_a_signal_counts(
             one.join(20)
         assert (tmp_path / STOPPED).exists()
 
-    with pytest.raises(raised), waiting_for_all(tmp_path):
-        launched()
+    try:
+        with pytest.raises(raised), waiting_for_all(tmp_path):
+            launched()
+    finally:
+        for one in both:
+            one.kill()
     assert [one.exitcode for one in both] == [0, 0]
     assert files(tmp_path, "ended") == ["first_0_ended", "second_0_ended"]
     assert files(tmp_path, "begun") == ["first_0_begun", "second_0_begun"]
@@ -94,7 +101,9 @@ def test_what_a_launcher_raises_is_told(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals to processes are of Unix")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_leaves_a_checkpoint_of_every_run_of_a_multirun(number: signal.Signals, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_checkpoint_of_every_run_of_a_multirun(
+    number: signal.Signals, begin: Begin, tmp_path: Path
+) -> None:
     """Three runs in two processes: two have begun."""
     from tiny import LIGHT, OVERRIDES  # the processes of the first test would import it
 
@@ -111,7 +120,7 @@ def test_ctrl_c_leaves_a_checkpoint_of_every_run_of_a_multirun(number: signal.Si
         f"output={tmp_path}",
         "seed=0,1,2",
     ]
-    sweep = Popen([sys.executable, "-m", "gsx", *words], start_new_session=True, stderr=PIPE, text=True)
+    sweep = begin([sys.executable, "-m", "gsx", *words], stderr=PIPE, text=True)
     while len(list(tmp_path.glob("demo/*/*/metrics.jsonl"))) < 2 and sweep.poll() is None:
         time.sleep(0.2)
     (os.killpg if number == signal.SIGINT else os.kill)(sweep.pid, number)

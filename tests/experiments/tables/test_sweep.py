@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import Begin
 from tiny import final_tensors
 
 from gsx.cli.dispatch import main
@@ -90,11 +91,11 @@ def test_a_table_shares_beginnings_survives_a_failure_and_redoes_nothing(
 
 
 def test_killed_and_started_again_a_table_goes_on_where_it_was(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    begin: Begin, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [*TABLE, "experiment.only=[3D-GS,3D-GS-UP]", "training.checkpoint_every=3", "iterations=40"]
     command = [sys.executable, "-m", "gsx", *words]
-    begun = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    begun = begin(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     second = "outputs/demo/gs3d/*/branch.json"  # of the run that branched: the first one is finished
     until = time.monotonic() + 120
     while not list(tmp_path.glob(second)) and begun.poll() is None and time.monotonic() < until:
@@ -203,9 +204,9 @@ def test_a_table_shows_the_scene_that_is_there_and_names_results_of_another_sour
     assert shown("b")[1] is False
 
 
-def test_sigterm_leaves_a_checkpoint_and_its_own_exit_code(tmp_path: Path) -> None:
+def test_sigterm_leaves_a_checkpoint_and_its_own_exit_code(begin: Begin, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "gsx", *SMALL, "iterations=5000", "folder=run", "training.log_every=1"]
-    begun = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    begun = begin(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 60
     while not (tmp_path / "run" / "metrics.jsonl").exists() and time.monotonic() < until:
         time.sleep(0.05)
