@@ -25,8 +25,9 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model, reconstruction_of
 from gsx.scenes.kept_models import kept_model
+from gsx.scenes.observations import known, straight_keypoints, unmeasured
 from gsx.scenes.sfm import quiet
-from gsx.scenes.undistort import pinhole_of, undistort_points
+from gsx.scenes.undistort import pinhole_of
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +38,8 @@ LEAST = 32
 """Observations of an image that tell its movement."""
 SHIFT = 0.25
 """Px of the model's cameras, root of the mean square, from which on movements of whole pictures are wrong cameras."""
+FLAT = 1e3
+"""A point farther to the side than so many times its depth lies in the plane of the camera's centre."""
 BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}
 """Cameras with distortion, by the same ones without."""
 
@@ -51,13 +54,13 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
         return model, []
     before = shift_of(model)
     if when == "auto" and not (before is not None and before > SHIFT):
-        return model, [f"Nothing is adjusted: {fit_told(before)} (scene.adjust=auto)."]
+        return model, [f"Nothing is adjusted: {fit_told(before)}{unmeasured(model)} (scene.adjust=auto)."]
     stamps = [file_stamp(file) for file in present_files(model.folder)]
     key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
     after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [
         f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_told(before)}, then "
-        f"{fit_told(shift_of(after))}{lenses_told(model, after)}."
+        f"{fit_told(shift_of(after))}{unmeasured(after)}{lenses_told(model, after)}."
     ]
 
 
@@ -69,11 +72,11 @@ def fit_told(shift: float | None) -> str:
 def fit_line(model: Model) -> str:
     """The same of a model, with what to do about it."""
     try:
-        shift = shift_of(model)
+        shift, rest = shift_of(model), unmeasured(model)
     except InputError as problem:  # of a lens
         return str(problem)
     wrong = shift is not None and shift > SHIFT
-    return fit_told(shift) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
+    return fit_told(shift) + str(rest) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
 
 
 def installed() -> str:
@@ -101,23 +104,23 @@ def lenses_told(before: Model, after: Model) -> str:
 def shift_of(model: Model) -> float | None:
     """Px of the model's cameras by which movements of whole pictures put points beside where they were observed: root
     of the mean square over images; None where none tells."""
-    told = [found for image in model.images if (found := explained(image, model.cameras[image.camera_id])) is not None]
-    return math.sqrt(max(0.0, sum(told) / len(told))) if told else None
+    squares = [explained(image, model.cameras[image.camera_id]) for image in model.images]
+    finite = [square for square in squares if square is not None and math.isfinite(square)]
+    return math.sqrt(max(0.0, sum(finite) / len(finite))) if finite else None
 
 
 def explained(image: ModelImage, intrinsics: Any) -> float | None:
     """Mean square of the movement that half the keypoints of an image tell of the other half, px; may be negative where
     they contradict each other. None: too few."""
-    pinhole = pinhole_of(intrinsics)
+    pinhole, observed = pinhole_of(intrinsics), straight_keypoints(image, intrinsics)
     points = image.observed @ image.rotation.T + image.translation
-    seen = points[:, 2] > 0
-    x, y, z = points[seen].T
+    usable = (points[:, 2] > 0) & (points[:, :2].abs() <= FLAT * points[:, 2:]).all(1) & known(observed)
+    x, y, z = points[usable].T
     if len(z) < LEAST:
         return None
-    observed = undistort_points(intrinsics, pinhole, image.keypoints)[seen]
     focal = observed.new_tensor([pinhole.focal_length_x, pinhole.focal_length_y])
     centre = observed.new_tensor([pinhole.principal_point_x, pinhole.principal_point_y])
-    off = (observed - centre) / focal - torch.stack([x / z, y / z], 1)
+    off = (observed[usable] - centre) / focal - torch.stack([x / z, y / z], 1)
     columns = movements(x / z, y / z, z)
     told = [told_of(columns, off, slice(start, None, 2), slice(1 - start, None, 2)) for start in range(2)]
     return float(focal.square().mean()) * sum(told) / len(told)
@@ -217,4 +220,5 @@ def bend_of(reconstruction: Any, cameras: Sequence[int]) -> float:
         straight = camera.cam_from_img(seen) * focal + [camera.principal_point_x, camera.principal_point_y]
         squares.append(np.square(straight - seen).sum(1))
     moved = np.concatenate(squares)
+    moved = moved[np.isfinite(moved)]  # a lens may have no ray for a keypoint
     return float(np.sqrt(moved.mean())) if len(moved) else 0.0

@@ -1,5 +1,6 @@
 """Scenes from a COLMAP model and its photos (3D-GS, dataset_readers.py and getNerfppNorm and camera_utils.py)."""
 
+import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -29,9 +30,10 @@ from gsx.scenes.colmap_folders import (
     photo_folders,
     photo_folders_above,
 )
-from gsx.scenes.colmap_model import Model, ModelImage, read_model
+from gsx.scenes.colmap_model import Model, ModelImage, error_told, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
+from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.photo_names import similar_photo
 from gsx.scenes.posed import (
@@ -47,7 +49,7 @@ from gsx.scenes.posed import (
     views_of,
 )
 from gsx.scenes.splits import split_names
-from gsx.scenes.undistort import METHOD, pinhole_of, undistort_points
+from gsx.scenes.undistort import METHOD, pinhole_of
 
 MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observations that could be compared instead
 
@@ -163,33 +165,49 @@ def check_cameras(
     # views without their centring, if any: that is an approximation asked for, not a mistake to be found
     cameras = [shot.whole.resize(*view.camera.size) for shot, view in zip(shots, views, strict=True)]
     lenses = [model.cameras[image.camera_id] for image in images]
-    errors = torch.cat([reprojection_errors(*fit) for fit in zip(images, lenses, cameras, strict=True)])
-    if not len(errors):
-        return _check_visible(model, cameras)
-    median = float(errors.median())
+    errors = [reprojection_errors(*fit) for fit in zip(images, lenses, cameras, strict=True)]
+    rest = counted([image.name for image in images], [~one.isnan() for one in errors], [one.isinf() for one in errors])
+    measured = torch.cat([one[~one.isnan()] for one in errors])
+    if not len(measured):
+        return _check_visible(model, cameras, rest)
+    median = float(measured.median())
     if not median <= limit:
-        raise InputError(
-            f"The cameras of {model.folder} miss the observed keypoints by {median:.3g} px (median; the limit is "
-            f"scene.max_reprojection_px={limit:g}): poses, intrinsics or files of different reconstructions are mixed. "
-            "Where they are only inexact, scene.adjust=auto finds them anew from these observations."
-        )
-    return f"Reprojection error {median:.2f} px (median of {len(errors)} observations, at the model's resolution)."
+        raise InputError(_misses(model, median, limit, rest))
+    return (
+        f"Reprojection error {median:.2f} px (median of {len(measured)} observations, at the model's resolution){rest}."
+    )
+
+
+def _misses(model: Model, median: float, limit: float, rest: Unmeasured) -> str:
+    """Return the message for cameras whose median reprojection error exceeds the limit."""
+    missed = (
+        "have most of the points that they observe behind them"
+        if math.isinf(median)
+        else f"miss the observed keypoints by {median:.3g} px"
+    )
+    return (
+        f"The cameras of {model.folder} {missed} (median; the limit is scene.max_reprojection_px={limit:g}{rest}): "
+        "poses, intrinsics or files of different reconstructions are mixed. Where they are only inexact, "
+        "scene.adjust=auto finds them anew from these observations."
+    )
 
 
 def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> Float[Tensor, "K"]:
-    """Distance of projected points from their keypoints in pixels of the model; infinite behind the camera.
+    """Return distances of projected points from their keypoints in pixels of the model.
 
-    `camera` is the image's pinhole camera on any raster, `intrinsics` the model's pycolmap camera.
+    They are infinite for points behind the camera, and NaN for keypoints for which the lens has no ray. `camera` is
+    the image's pinhole camera on any raster, `intrinsics` the model's pycolmap camera.
     """
     pinhole = pinhole_of(intrinsics)
-    observed = undistort_points(intrinsics, pinhole, image.keypoints)
+    observed = straight_keypoints(image, intrinsics)
     projected, depth = camera.project(image.observed)
     to_model = projected.new_tensor([pinhole.width / camera.width, pinhole.height / camera.height])
     errors = (projected * to_model - observed).norm(dim=1)
-    return torch.where(depth > 0, errors, torch.inf)
+    ahead = (depth > 0) & errors.isfinite()  # a point in the plane of the camera's centre projects to infinity
+    return torch.where(known(observed), torch.where(ahead, errors, torch.inf), torch.nan)
 
 
-def _check_visible(model: Model, cameras: Sequence[Camera]) -> str:
+def _check_visible(model: Model, cameras: Sequence[Camera], rest: Unmeasured) -> str:
     visible = torch.stack([camera.sees(model.points.positions) for camera in cameras]).any(dim=0)
     fraction = float(visible.double().mean())
     if fraction < MIN_VISIBLE_FRACTION:
@@ -197,7 +215,12 @@ def _check_visible(model: Model, cameras: Sequence[Camera]) -> str:
             f"Only {fraction:.0%} of the points of {model.folder} are in view of any camera (at least "
             f"{MIN_VISIBLE_FRACTION:.0%} should be): points and poses belong to different reconstructions."
         )
-    return f"The model keeps no observations to check the cameras by; {fraction:.0%} of its points are in view."
+    why = (
+        "No keypoint can check the cameras"
+        if rest.no_ray
+        else "The model keeps no observations to check the cameras by"
+    )
+    return f"{why}; {fraction:.0%} of its points are in view{rest}."
 
 
 def _missing(model: Model, present: Sequence[ModelImage]) -> list[str]:
@@ -226,7 +249,7 @@ def facts(path: Path) -> Iterator[str]:
     """The model, its cameras, and the images that are there."""
     folder = find_model(path)[0]
     model = read_model(folder)
-    yield f"model     {folder}: {len(model.images)} images, mean reprojection error {model.mean_error:.2f} px"
+    yield f"model     {folder}: {len(model.images)} images, {error_told(model.mean_error)}"
     yield f"fit       {fit_line(model)}"
     cameras = [model.cameras[image.camera_id] for image in model.images]
     kinds = Counter((camera.model_name, camera.width, camera.height) for camera in cameras)

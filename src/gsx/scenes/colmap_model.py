@@ -6,6 +6,7 @@ file ends: what lies past the end comes out as noise. The files are therefore wa
 """
 
 import copy
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -58,7 +59,7 @@ class Model:
     images: list[ModelImage]
     points: PointCloud
     mean_error: float
-    """Mean reprojection error that COLMAP states, in pixels."""
+    """Mean reprojection error of the points that state a finite one, in pixels; NaN: none does."""
     notes: list[str]
 
 
@@ -72,13 +73,14 @@ def read_model(folder: Path) -> Model:
     reconstruction, notes = reconstruction_of(folder)
     read = _points_of_ply if file.suffix.lower() == ".ply" else _points
     points, positions, point_notes = read(reconstruction, file)
+    mean_error, error_notes = stated_error(reconstruction)
     return Model(
         folder=folder,
         cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
         images=_images(reconstruction, positions, file),
         points=points,
-        mean_error=reconstruction.compute_mean_reprojection_error(),
-        notes=[*notes, *point_notes],
+        mean_error=mean_error,
+        notes=[*notes, *point_notes, *error_notes],
     )
 
 
@@ -109,6 +111,19 @@ def _points_of_ply(reconstruction: Any, file: Path) -> tuple[PointCloud, None, l
     cloud = read_points(file)
     note = f"Points are those of {file.name}, as there is no points3D.bin: cameras cannot be checked by observations."
     return cloud, None, [note]
+
+
+def stated_error(reconstruction: Any) -> tuple[float, list[str]]:
+    """Return the mean reprojection error that points state, px, and a note on those that state no number."""
+    errors = np.array([point.error for point in reconstruction.points3D.values() if point.has_error()])
+    finite = errors[np.isfinite(errors)]
+    left = f"The mean reprojection error leaves out {len(errors) - len(finite)} points whose own is not finite."
+    return float(finite.mean()) if len(finite) else math.nan, [left] if len(finite) < len(errors) else []
+
+
+def error_told(mean_error: float) -> str:
+    """Return the mean reprojection error of a model in words; NaN: it states none."""
+    return "no reprojection error stated" if math.isnan(mean_error) else f"mean reprojection error {mean_error:.2f} px"
 
 
 @contextmanager

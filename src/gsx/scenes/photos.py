@@ -18,7 +18,7 @@ from gsx.core.files import at_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.scenes import colmap, sfm
-from gsx.scenes.colmap_model import Model, read_model
+from gsx.scenes.colmap_model import Model, error_told, read_model
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
@@ -194,8 +194,8 @@ def report(model: Model, photos: Sequence[str]) -> list[str]:
     """What became of the photos, in sentences."""
     lost = sorted(set(photos) - {image.name for image in model.images})
     placed = (
-        f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, mean reprojection "
-        f"error {model.mean_error:.2f} px."
+        f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, "
+        f"{error_told(model.mean_error)}."
     )
     return (
         [placed, f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."]

@@ -23,7 +23,7 @@ from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions, refuse_unknown
-from gsx.scenes.undistort import StoredUndistortion, camera_of, pinhole_of, undistorted_size
+from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined
 NAMED_AT_MOST = 5  # file names spelt out in a note
@@ -88,12 +88,28 @@ def shot_through(
 
 
 def lens_notes(shots: Sequence[Shot]) -> list[str]:
-    """One note for each kind of camera that is undistorted."""
-    kinds = {(shot.remap.intrinsics.model_name, shot.expected_size, shot.whole.size) for shot in shots if shot.remap}
+    """Return one note for each kind of camera that is undistorted."""
+    kinds = {
+        (remap.intrinsics.model_name, shot.expected_size, shot.whole.size, cut_note(remap.intrinsics))
+        for shot in shots
+        if (remap := shot.remap)
+    }
     return [
-        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}."
-        for name, (width, height), (new_width, new_height) in sorted(kinds)
+        f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}{cut}."
+        for name, (width, height), (new_width, new_height), cut in sorted(kinds)
     ]
+
+
+def cut_note(intrinsics: Any) -> str:
+    """Return what is cut off the photos of a pycolmap camera whose lens folds, as the end of a sentence."""
+    cut = cut_of(intrinsics)
+    if cut is None:
+        return ""
+    ends = f", {cut.radius:.0f} px from the principal point" if math.isfinite(cut.radius) else ""
+    return (
+        f", cut to where the lens does not fold: it ends within the photo{ends}, and of its "
+        f"{intrinsics.width * intrinsics.height} px {cut.pixels} are used"
+    )
 
 
 def read_json(path: Path) -> dict[str, Any]:

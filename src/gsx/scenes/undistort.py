@@ -1,17 +1,19 @@
 """Lens distortion out of the photos: the pinhole camera that sees (almost) the same, and the resampling to it.
 
-The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, so borders are trimmed). Pixel centres
-are at +0.5 on both rasters. Sampling is cubic where COLMAP's own undistorter is bilinear: it keeps more detail.
+The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, so borders are trimmed), cut where the
+lens folds (gsx.scenes.lens_folds). Pixel centres are at +0.5 on both rasters. Sampling is cubic where COLMAP's own
+undistorter is bilinear: it keeps more detail.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.core.data.camera import Camera
@@ -19,11 +21,14 @@ from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
+from gsx.scenes.lens_folds import Cut, cut_where_folded, shows_truly
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
 OUTSIDE = 1.0
 """An undistorted picture that would show what lies farther outside its photo, in sides of it, comes of no real lens."""
 STEPS = 9  # along each side of the picture, at which that is looked at
+SAME_PIXEL = 0.1
+"""Px by which a keypoint may differ from the projection of its ray; more, and the ray is another pixel's."""
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
 
 
@@ -33,23 +38,62 @@ def is_pinhole(camera: Any) -> bool:
 
 
 def pinhole_of(camera: Any) -> Any:
-    """The pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
+    """Return the pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
 
     Raises:
-        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, or has a senseless distortion.
+        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, has a senseless distortion, or
+            has rays for too little of its photo.
     """
-    import pycolmap
-
     if is_pinhole(camera) and np.isfinite(camera.params).all():  # to pycolmap distortion by no number is none
         return camera
+    return undistorted(camera).pinhole
+
+
+def cut_of(camera: Any) -> Cut | None:
+    """Return what is cut off the photos of a pycolmap camera because its lens folds; None: nothing.
+
+    Raises:
+        InputError: as `pinhole_of`.
+    """
+    return None if is_pinhole(camera) else undistorted(camera).cut
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """What a distorted camera is undistorted to."""
+
+    pinhole: Any
+    """A pycolmap PINHOLE camera."""
+    cut: Cut | None
+    """What is cut off its photos; None: nothing but the borders that COLMAP trims."""
+
+
+def undistorted(camera: Any) -> Undistorted:
+    """Return what a distorted pycolmap camera is undistorted to.
+
+    Raises:
+        InputError: as `pinhole_of`.
+    """
+    return _undistorted(camera.model_name, camera.width, camera.height, tuple(camera.params.tolist()))
+
+
+@lru_cache(maxsize=1024)  # a lens is needed for each of its photos
+def _undistorted(model: str, width: int, height: int, params: tuple[float, ...]) -> Undistorted:
+    import pycolmap
+
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     if not camera.is_perspective():
         raise InputError(
             f"Camera model {camera.model_name} of a {camera.width}x{camera.height} photo has no pinhole equivalent: "
             "cut the photos into perspective views and reconstruct those."
         )
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    refuse_nonsense(camera, pinhole)
-    return pinhole
+    found = Undistorted(pinhole, None)
+    sensible = np.isfinite(params).all() and min(camera.focal_length_x, camera.focal_length_y) > 0
+    if sensible and not shows_truly(camera, pinhole):
+        found = Undistorted(*cut_where_folded(camera, pinhole))
+    refuse_nonsense(camera, found.pinhole)
+    return found
 
 
 def refuse_nonsense(camera: Any, pinhole: Any) -> None:
@@ -84,13 +128,27 @@ def undistorted_size(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> tu
 
 
 def undistort_points(intrinsics: Any, pinhole: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
-    """Where pixels of `intrinsics` lie in `pinhole`; both pycolmap cameras, positions in pixels, float64."""
+    """Return where pixels of `intrinsics` lie in `pinhole`; NaN where the lens has no ray for a pixel.
+
+    Both are pycolmap cameras, positions are in pixels, float64.
+    """
     if intrinsics is pinhole or not len(positions):
         return positions
-    rays = torch.from_numpy(intrinsics.cam_from_img(positions.numpy()))
+    rays = rays_of(intrinsics, positions)
     focal = torch.tensor([pinhole.focal_length_x, pinhole.focal_length_y], dtype=torch.float64)
     centre = torch.tensor([pinhole.principal_point_x, pinhole.principal_point_y], dtype=torch.float64)
     return rays * focal + centre
+
+
+def rays_of(intrinsics: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
+    """Return rays (x/z, y/z) of pixels of a pycolmap camera; NaN where no ray before the camera has that pixel.
+
+    A ray counts if it projects to its pixel again: fisheye models mirror what lies behind the camera to the front.
+    """
+    rays = torch.from_numpy(intrinsics.cam_from_img(positions.numpy()))
+    again = torch.from_numpy(intrinsics.img_from_cam(nn.functional.pad(rays, (0, 1), value=1.0).numpy()))
+    same = (again - positions).abs().amax(1, keepdim=True) <= SAME_PIXEL
+    return torch.where(same, rays, torch.nan)
 
 
 def undistort(

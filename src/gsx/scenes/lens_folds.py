@@ -1,0 +1,247 @@
+"""Lenses that fold: where the polynomial of a lens stops growing, pixels show mirrored what others show already.
+
+`r (1 + k r^2)` with k < 0 grows as far as r = 1 / sqrt(-3 k). Farther rays come back towards the middle, and pixels
+beyond the turning point have no ray at all. A picture that reaches past it is mirrored there. What can be trained on
+is the part around the principal axis in which the lens keeps the orientation of the picture: the Jacobian determinant
+of its map from rays to pixels is positive. This holds for every lens model, so none needs a formula of its own.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from gsx.core.errors import InputError
+from gsx.core.shapes import Bool, Float, Int
+
+STEPS = 129
+"""Places along each side of an undistorted picture at which its orientation is checked."""
+FINE_STEPS = 257
+"""The same where a part has to be cut out: the cut is exact to so many parts of the side."""
+RAY_STEPS = 257  # along each side of a photo, at which it is checked whether pixels have rays
+DIFFERENCE = 1e-6  # of a ray's slope, by which derivatives are taken
+LARGEST_SCALE = 2.0
+"""An undistorted side is at most so many times the photo's, as COLMAP's are (UndistortCameraOptions.max_scale)."""
+LEAST_AREA = 0.01
+"""Px of the photo, for one in its middle, that a pixel of a cut picture shows at least: at the fold it is none."""
+REACH = 2.0  # px of the photo, along each axis, from which a pixel is interpolated
+LEAST_SHARE = 0.2
+"""Share of a photo that its cut picture shows at least; of less, the lens is wrong."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """The part of a photo that an undistorted picture shows where its lens folds."""
+
+    pixels: int
+    """Of the photo, which the picture shows."""
+    radius: float
+    """Px from the principal point to the nearest pixel without a ray; infinite: the lens has a ray for each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Rays on a rectangular grid and where a lens puts them."""
+
+    x: Float[Tensor, "X"]
+    """Slopes x/z, increasing."""
+    y: Float[Tensor, "Y"]
+    pixels: Float[Tensor, "Y X 2"]
+    """Where the lens sees them, px; NaN where it does not."""
+    areas: Float[Tensor, "Y X"]
+    """Jacobian determinant, px^2 per unit of slopes; negative where the picture is mirrored, along one axis or both."""
+
+
+def lattice_of(camera: Any, x: Float[Tensor, "X"], y: Float[Tensor, "Y"]) -> Lattice:
+    """Return the lattice of the rays with these slopes through a pycolmap camera."""
+    pixels = project(camera, x, y)
+    across = (project(camera, x + DIFFERENCE, y) - pixels) / DIFFERENCE
+    down = (project(camera, x, y + DIFFERENCE) - pixels) / DIFFERENCE
+    areas = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+    return Lattice(x, y, pixels, torch.where(across[..., 0] > 0, areas, -areas.abs()))  # mirrored twice is turned over
+
+
+def project(camera: Any, x: Float[Tensor, "X"], y: Float[Tensor, "Y"]) -> Float[Tensor, "Y X 2"]:
+    """Return pixels of the rays of a grid of slopes; not finite where a lens has none."""
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
+    return torch.from_numpy(camera.img_from_cam(rays.numpy())).reshape(len(y), len(x), 2)
+
+
+def shows_truly(camera: Any, pinhole: Any) -> bool:
+    """Return whether no pixel of `pinhole` is mirrored, nor one that lies beyond a border of pixels without rays.
+
+    Both are pycolmap cameras.
+    """
+    x = slopes(0.5, pinhole.width - 0.5, pinhole.principal_point_x, pinhole.focal_length_x, STEPS)
+    y = slopes(0.5, pinhole.height - 0.5, pinhole.principal_point_y, pinhole.focal_length_y, STEPS)
+    lattice = lattice_of(camera, x, y)
+    if not bool((lattice.areas > 0).all()):
+        return False
+    # COLMAP finds its picture from rays of the photo's border: where some are missing, it may reach past the photo
+    return bool(border_rays(camera).isfinite().all()) or bool(inside(camera, lattice.pixels, 1.0).all())
+
+
+def slopes(first: float, last: float, principal: float, focal: float, count: int) -> Float[Tensor, "N"]:
+    """Return slopes of `count` pixel positions from `first` to `last`, float64."""
+    return (torch.linspace(first, last, count, dtype=torch.float64) - principal) / focal
+
+
+def inside(camera: Any, pixels: Float[Tensor, "*N 2"], margin: float = 0.0) -> Bool[Tensor, "*N"]:
+    """Return which pixel positions lie on the photo of a camera, or within a margin around it, px."""
+    size = pixels.new_tensor([camera.width, camera.height])
+    return ((pixels >= -margin) & (pixels <= size + margin)).all(-1)
+
+
+def border_rays(camera: Any) -> Float[Tensor, "K 2"]:
+    """Return rays of pixel centres along the photo's border; NaN where there is none."""
+    x = torch.linspace(0.5, camera.width - 0.5, STEPS, dtype=torch.float64)
+    y = torch.linspace(0.5, camera.height - 0.5, STEPS, dtype=torch.float64)
+    sides = [torch.stack([x, torch.full_like(x, row)], 1) for row in (y[0], y[-1])]
+    sides += [torch.stack([torch.full_like(y, column), y], 1) for column in (x[0], x[-1])]
+    return torch.from_numpy(camera.cam_from_img(torch.cat(sides).numpy()))
+
+
+def cut_where_folded(camera: Any, pinhole: Any) -> tuple[Any, Cut]:
+    """Return the largest pinhole camera that shows nothing mirrored and nothing twice, and what it shows of the photo.
+
+    It has the focal lengths of `pinhole`, what COLMAP would undistort to; all are pycolmap cameras.
+
+    Raises:
+        InputError: it would show less than `LEAST_SHARE` of the photo.
+    """
+    lattice = photo_lattice(camera)
+    usable = usable_rays(camera, lattice)
+    place = nearest_to_axis(camera, lattice, usable)
+    if place is None:
+        raise refusal(camera, 0)
+    top, bottom, left, right = largest_rectangle(usable, *place)
+    part = lattice.areas[top : bottom + 1, left : right + 1]
+    window = (float(values) for values in (lattice.x[left], lattice.x[right], lattice.y[top], lattice.y[bottom]))
+    cut = with_window(pinhole, *window)
+    pixels = 0 if cut is None else round(float(part.mean()) * covered(lattice, top, bottom, left, right))
+    if cut is None or pixels < LEAST_SHARE * camera.width * camera.height:
+        raise refusal(camera, pixels)
+    return cut, Cut(min(pixels, camera.width * camera.height), radius_without_rays(camera))
+
+
+def usable_rays(camera: Any, lattice: Lattice) -> Bool[Tensor, "Y X"]:
+    """Return which rays of a lattice the photo shows, unmirrored and not too small; false for NaN."""
+    middle = lattice.areas[lattice.y.abs().argmin(), lattice.x.abs().argmin()]
+    shown = inside(camera, lattice.pixels) & (lattice.areas > 0) & (lattice.areas > LEAST_AREA * middle)
+    return shown & surrounded(camera, lattice.pixels.nan_to_num())
+
+
+def surrounded(camera: Any, pixels: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:
+    """Return which positions on a photo are interpolated from pixels for which there is a ray."""
+    x, y, lost = pixels_without_rays(camera)
+    reach = [math.ceil(REACH / spacing(places)) for places in (y, x)]
+    near = max_pool2d(lost.float()[None], [2 * n + 1 for n in reach], 1, reach)[0] > 0
+    column, row = (nearest_place(pixels[..., axis], places) for axis, places in enumerate((x, y)))
+    return ~near[row, column]
+
+
+def pixels_without_rays(camera: Any) -> tuple[Float[Tensor, "X"], Float[Tensor, "Y"], Bool[Tensor, "Y X"]]:
+    """Return columns and rows of pixels spread over the photo of a camera, and which of these have no ray."""
+    sides = camera.width, camera.height
+    x, y = (torch.linspace(0.5, side - 0.5, min(side, RAY_STEPS), dtype=torch.float64) for side in sides)
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+    rays = torch.from_numpy(camera.cam_from_img(pixels.numpy()))
+    return x, y, ~rays.isfinite().all(1).reshape(len(y), len(x))
+
+
+def spacing(places: Float[Tensor, "N"]) -> float:
+    """Return the distance between neighbours in equal steps; 1 for a single place."""
+    return float(places[1] - places[0]) if len(places) > 1 else 1.0
+
+
+def nearest_place(values: Float[Tensor, "*N"], places: Float[Tensor, "P"]) -> Int[Tensor, "*N"]:
+    """Return the index of the place nearest to each value, for places in equal steps."""
+    return ((values - places[0]) / spacing(places)).round().long().clamp(0, len(places) - 1)
+
+
+def nearest_to_axis(camera: Any, lattice: Lattice, usable: Bool[Tensor, "Y X"]) -> tuple[int, int] | None:
+    """Return (row, column) of the usable ray nearest to the principal axis; None where a fold lies in between."""
+    distances = torch.where(usable, lattice.x.square() + lattice.y.square()[:, None], torch.inf)
+    row, column = divmod(int(distances.argmin()), len(lattice.x))
+    if not usable[row, column]:
+        return None
+    way = torch.linspace(0, 1, STEPS, dtype=torch.float64)[:, None] * torch.stack([lattice.x[column], lattice.y[row]])
+    unfolded = all(bool((lattice_of(camera, x[None], y[None]).areas > 0).all()) for x, y in way)
+    return (row, column) if unfolded else None
+
+
+def covered(lattice: Lattice, top: int, bottom: int, left: int, right: int) -> float:
+    """Return the area of a rectangle of the lattice, in slopes."""
+    return float((lattice.x[right] - lattice.x[left]) * (lattice.y[bottom] - lattice.y[top]))
+
+
+def photo_lattice(camera: Any) -> Lattice:
+    """Return the lattice of the rays that a photo of a pycolmap camera may show, its principal axis among them."""
+    x = around_axis(camera.width, camera.principal_point_x, camera.focal_length_x)
+    y = around_axis(camera.height, camera.principal_point_y, camera.focal_length_y)
+    return lattice_of(camera, x, y)
+
+
+def around_axis(side: int, principal: float, focal: float) -> Float[Tensor, "N"]:
+    """Return slopes across `LARGEST_SCALE` times a side, from the principal axis outwards in equal steps, with 0."""
+    before, after = (min(max(reach, 0.0), LARGEST_SCALE * side) for reach in (principal, side - principal))
+    step = LARGEST_SCALE * side / (FINE_STEPS - 1) / focal
+    first, last = (round(LARGEST_SCALE * reach / focal / step) for reach in (before, after))
+    return torch.arange(-first, last + 1, dtype=torch.float64) * step
+
+
+def largest_rectangle(usable: Bool[Tensor, "Y X"], row: int, column: int) -> tuple[int, int, int, int]:
+    """Return (top, bottom, left, right), inclusive, of the usable rectangle of the largest area around one place."""
+    up, down = reaches(usable, row)  # of each column, how many places are usable without a gap
+    left_up, right_up = (outward(up, column, side) for side in (-1, 1))
+    left_down, right_down = (outward(down, column, side) for side in (-1, 1))
+    heights = torch.minimum(left_up[:, None], right_up) + torch.minimum(left_down[:, None], right_down) - 2
+    widths = torch.arange(len(left_up))[:, None] + torch.arange(len(right_up))
+    areas = torch.where(torch.minimum(left_up[:, None], right_up) > 0, heights * widths, -1)
+    before, after = divmod(int(areas.argmax()), areas.shape[1])
+    above, below = min(left_up[before], right_up[after]), min(left_down[before], right_down[after])
+    return row - max(int(above) - 1, 0), row + max(int(below) - 1, 0), column - before, column + after
+
+
+def reaches(usable: Bool[Tensor, "Y X"], row: int) -> tuple[Tensor, Tensor]:
+    """Return how many places of each column are usable from a row upwards, and downwards, with itself."""
+    up, down = usable[: row + 1].flip(0), usable[row:]
+    return up.long().cumprod(0).sum(0), down.long().cumprod(0).sum(0)
+
+
+def outward(reach: Tensor, column: int, side: int) -> Tensor:
+    """Return the least reach of all columns from one outwards, to the left (-1) or to the right (1)."""
+    from_column = reach[: column + 1].flip(0) if side < 0 else reach[column:]
+    return from_column.cummin(0).values
+
+
+def with_window(pinhole: Any, left: float, right: float, top: float, bottom: float) -> Any | None:
+    """Return a pycolmap PINHOLE camera of the focal lengths of `pinhole` that sees these slopes; None: no pixel."""
+    import pycolmap
+
+    fx, fy = pinhole.focal_length_x, pinhole.focal_length_y
+    width, height = int((right - left) * fx), int((bottom - top) * fy)
+    if min(width, height) < 1:
+        return None
+    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, -left * fx, -top * fy])
+
+
+def radius_without_rays(camera: Any) -> float:
+    """Return px from the principal point of a camera to the nearest pixel of its photo for which there is no ray."""
+    x, y, lost = pixels_without_rays(camera)
+    distances = torch.hypot(x - camera.principal_point_x, (y - camera.principal_point_y)[:, None])
+    return float(distances[lost].min()) if bool(lost.any()) else math.inf
+
+
+def refusal(camera: Any, pixels: int) -> InputError:
+    """Return the error for a lens that folds so early that too little of its photo is left."""
+    whole = camera.width * camera.height
+    return InputError(
+        f"The {camera.model_name} camera of a {camera.width}x{camera.height} photo ({camera.params_to_string()}) "
+        f"folds: a picture without mirrored parts would show {pixels} of its {whole} px (at least {LEAST_SHARE:.0%} "
+        "are needed): correct its intrinsics, or reconstruct the photos with a lens model that fits."
+    )

@@ -1,0 +1,70 @@
+"""Observations of a COLMAP model that no error can be measured by: keypoints without a ray, points behind a camera."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from gsx.core.shapes import Bool, Float
+from gsx.scenes.colmap_model import Model, ModelImage
+from gsx.scenes.posed import named
+from gsx.scenes.undistort import pinhole_of, undistort_points
+
+
+@dataclass(frozen=True)
+class Unmeasured:
+    """How many observations are left out, or infinitely wrong."""
+
+    no_ray: int = 0
+    """Keypoints for which the lens has no ray, or that are not finite."""
+    behind: int = 0
+    """Observed points behind their camera."""
+    blind: tuple[str, ...] = ()
+    """Images of which no keypoint has a ray."""
+
+    def __str__(self) -> str:
+        """Return clauses to append to a sentence; an empty string if all observations are measured."""
+        return "".join(f"; {clause}" for clause in self.clauses())
+
+    def clauses(self) -> Iterator[str]:
+        """Yield one clause for each kind."""
+        if self.no_ray:
+            yield f"keypoints for which the lens has no ray, left out: {self.no_ray}"
+        if self.blind:
+            yield f"no keypoint is left of {named(self.blind)}"
+        if self.behind:
+            yield f"observed points that lie behind their camera: {self.behind}"
+
+
+def straight_keypoints(image: ModelImage, intrinsics: Any) -> Float[Tensor, "K 2"]:
+    """Return the keypoints in px of the image's pinhole camera; NaN for those without a ray.
+
+    `intrinsics` is the model's pycolmap camera.
+    """
+    return undistort_points(intrinsics, pinhole_of(intrinsics), image.keypoints)
+
+
+def known(pixels: Float[Tensor, "K 2"]) -> Bool[Tensor, "K"]:
+    """Return which pixel positions are finite."""
+    return pixels.isfinite().all(dim=1)
+
+
+def unmeasured(model: Model) -> Unmeasured:
+    """Return how many of the observations of a model cannot be measured.
+
+    Raises:
+        InputError: a lens has no pinhole equivalent.
+    """
+    rays = [known(straight_keypoints(image, model.cameras[image.camera_id])) for image in model.images]
+    ahead = [(image.observed @ image.rotation.T + image.translation)[:, 2] > 0 for image in model.images]
+    return counted([image.name for image in model.images], rays, [~one for one in ahead])
+
+
+def counted(names: list[str], rays: list[Bool[Tensor, "_"]], behind: list[Bool[Tensor, "_"]]) -> Unmeasured:
+    """Return the counts of images by name: which keypoints have a ray, and which points lie behind the camera."""
+    return Unmeasured(
+        no_ray=sum(int((~one).sum()) for one in rays),
+        behind=sum(int((one & other).sum()) for one, other in zip(rays, behind, strict=True)),
+        blind=tuple(name for name, one in zip(names, rays, strict=True) if len(one) and not bool(one.any())),
+    )
