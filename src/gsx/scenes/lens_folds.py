@@ -100,8 +100,8 @@ def border_rays(camera: Any) -> Float[Tensor, "K 2"]:
     """Return rays of pixel centres along the photo's border; NaN where there is none."""
     x = torch.linspace(0.5, camera.width - 0.5, STEPS, dtype=torch.float64)
     y = torch.linspace(0.5, camera.height - 0.5, STEPS, dtype=torch.float64)
-    sides = [torch.stack([x, torch.full_like(x, row)], 1) for row in (y[0], y[-1])]
-    sides += [torch.stack([torch.full_like(y, column), y], 1) for column in (x[0], x[-1])]
+    sides = [torch.stack([x, torch.full_like(x, float(row))], 1) for row in (y[0], y[-1])]
+    sides += [torch.stack([torch.full_like(y, float(column)), y], 1) for column in (x[0], x[-1])]
     return torch.from_numpy(camera.cam_from_img(torch.cat(sides).numpy()))
 
 
