@@ -1,6 +1,7 @@
 """What is compiled before the first step, and beside what is drawn: there the settings are handed over when that is
 done, and only then."""
 
+import platform
 import signal
 import subprocess
 import sys
