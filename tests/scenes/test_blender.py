@@ -20,9 +20,10 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.inspect import describe
 from gsx.experiments.runs.open import open_run, start
 from gsx.formats.ply import write_ply
-from gsx.scenes.blender import BlenderOptions, box_averaged, load
+from gsx.scenes.blender import FORMAT, BlenderOptions, box_averaged, load
 
 FOV = 2 * math.atan(0.5)  # the focal length is the width
 # looks along +y from (0, -4, 0) with z up: right is +x, up is +z, back is -y
@@ -145,6 +146,29 @@ def test_validation_views_stand_in_for_test_views(folder: Path) -> None:
     (folder / "transforms_val.json").unlink()
     with pytest.raises(InputError, match=r"neither transforms_test\.json nor transforms_val\.json"):
         load(options(folder))
+
+
+def test_none_trains_on_the_images_of_both_files(folder: Path) -> None:
+    scene = load(options(folder, split="none"))
+    assert sorted(view.name for view in scene.train) == ["test/r_0", "train/r_0", "train/r_1"]
+    assert scene.test == []
+    with pytest.raises(ConfigError, match="use json, or none to train on all"):
+        load(options(folder, split="every:8"))
+
+
+def test_a_file_to_train_on_alone_is_split_by_rule(folder: Path) -> None:
+    """The remedy of the error is what `gsx FOLDER` and `gsx scenes` do."""
+    write(folder, "train", [FRONT, SIDE, FRONT])
+    (folder / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match=r"hold out training images with scene\.split=every:8, or none with"):
+        load(options(folder))
+    assert FORMAT.recognise(folder)
+    assert FORMAT.overrides(folder) == {"split": "every:8"}
+    scene = load(options(folder, **FORMAT.overrides(folder)))
+    assert [view.name for view in scene.test] == ["train/r_0"]
+    assert len(scene.train) == 2
+    assert len(load(options(folder, split="none")).train) == 3
+    assert describe(folder, plugins())[-1].endswith(f"gsx scene=blender scene.path={folder} scene.split=every:8")
 
 
 def test_missing_images_are_named_and_skipped(folder: Path) -> None:

@@ -74,6 +74,28 @@ def test_files_name_images_with_or_without_suffix(tmp_path: Path) -> None:
     assert split_names(NAMES, absolute) == ([0, 2], [1])
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32"])
+def test_byte_order_marks_of_lists_are_passed_over(tmp_path: Path, encoding: str) -> None:
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    (tmp_path / "train.txt").write_bytes(f"{mark}00.jpg\r\n02.jpg\r\n".encode(encoding))
+    (tmp_path / "test.txt").write_bytes(f"{mark}01.jpg".encode(encoding))
+    assert split_names(NAMES, "files:train.txt,test.txt", tmp_path) == ([0, 2], [1])
+
+
+def test_a_list_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_bytes("00.jpg\nf\u00fcr.jpg".encode("latin-1"))
+    (tmp_path / "test.txt").write_text("01.jpg")
+    with pytest.raises(InputError, match=r"train\.txt' is no UTF-8 text at byte 8: save it as UTF-8"):
+        split_names(NAMES, "files:train.txt,test.txt", tmp_path)
+
+
+def test_an_empty_list_to_test_on_names_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_text("00.jpg")
+    (tmp_path / "test.txt").write_text("\n")
+    with pytest.raises(InputError, match=r"1 training and 0 test images of 17.*scene\.split=none trains on all"):
+        split_names(NAMES, "files:train.txt,test.txt", tmp_path)
+
+
 def test_whole_names_win_over_stems(tmp_path: Path) -> None:
     (tmp_path / "train.txt").write_text("a.jpg\n")
     (tmp_path / "test.txt").write_text("b\n")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,15 @@ import torch
 from omegaconf import OmegaConf
 from synthetic_colmap import shipped
 
+from gsx.builtin import plugins
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import InputError
+from gsx.experiments.runs.inspect import readable
 from gsx.formats.ply import write_ply
+from gsx.scenes.blender import BlenderOptions
+from gsx.scenes.blender import load as load_blender
+from gsx.scenes.frame_names import plain_name
 from gsx.scenes.transforms import TransformsOptions, load
 
 WIDTH, HEIGHT = 120, 90
@@ -54,6 +60,14 @@ def options(folder: Path, **changes: Any) -> TransformsOptions:
     merged = OmegaConf.merge(OmegaConf.structured(TransformsOptions), shipped("transforms"), small, changes)
     made = OmegaConf.to_object(merged)
     assert isinstance(made, TransformsOptions)
+    return made
+
+
+def blender_options(folder: Path, **changes: Any) -> BlenderOptions:
+    small = {"path": str(folder), "random_points": 50}
+    merged = OmegaConf.merge(OmegaConf.structured(BlenderOptions), shipped("blender"), small, changes)
+    made = OmegaConf.to_object(merged)
+    assert isinstance(made, BlenderOptions)
     return made
 
 
@@ -105,6 +119,75 @@ def test_a_dot_of_a_bent_lens_lands_where_the_pinhole_says(
     assert any("undistorted" in note for note in scene.notes)
 
 
+def bend_fisheye(x: float, y: float, ks: list[float]) -> tuple[float, float]:
+    """OpenCV's fisheye as it documents it: the angle to the axis, theta, lies at theta (1 + sum of k_i theta^2i)."""
+    theta = math.atan(math.hypot(x, y))
+    radius = theta * (1 + sum(k * theta ** (2 * i) for i, k in enumerate(ks, 1)))
+    return x * radius / math.hypot(x, y), y * radius / math.hypot(x, y)
+
+
+def bend_aria(x: float, y: float, params: list[float]) -> tuple[float, float]:
+    """Fisheye624 as Project Aria documents it: a fisheye of six terms, two tangential ones, four of a thin prism."""
+    u, v = bend_fisheye(x, y, params[:6])
+    p0, p1, s0, s1, s2, s3 = params[6:]
+    r2 = u * u + v * v
+    tangent = 2 * (u * p0 + v * p1)
+    return u + u * tangent + r2 * p0 + s0 * r2 + s1 * r2**2, v + v * tangent + r2 * p1 + s2 * r2 + s3 * r2**2
+
+
+ARIA = [0.05, -0.02, 0.01, -0.004, 0.002, -0.001, 0.003, -0.002, 0.001, -0.0005, 0.002, 0.0004]
+WIDE = {"fl_x": 60.0, "fl_y": 58.0}
+LENSES: list[tuple[dict[str, Any], Callable[[float, float], tuple[float, float]]]] = [
+    ({"camera_model": "SIMPLE_RADIAL", "k1": -0.1, "k2": 0.0}, lambda x, y: bend(x, y, -0.1, 0, 0, 0)),
+    ({"camera_model": "RADIAL", "k1": -0.1, "k2": 0.02}, lambda x, y: bend(x, y, -0.1, 0.02, 0, 0)),
+    (
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": -0.004},
+        lambda x, y: bend_fisheye(x, y, ARIA[:4]),
+    ),
+    ({"camera_model": "OPENCV_FISHEYE"}, lambda x, y: bend_fisheye(x, y, [])),
+    ({"camera_model": "opencv_fisheye", "k1": 0.05}, lambda x, y: bend_fisheye(x, y, ARIA[:1])),
+    ({"is_fisheye": True, "k1": 0.05, "k2": -0.02}, lambda x, y: bend_fisheye(x, y, ARIA[:2])),
+    ({"camera_model": "RADIAL_FISHEYE", "k1": 0.05, "k2": -0.02}, lambda x, y: bend_fisheye(x, y, ARIA[:2])),
+    ({"camera_model": "FISHEYE624", "distortion_params": ARIA}, lambda x, y: bend_aria(x, y, ARIA)),
+]
+
+
+@pytest.mark.parametrize(("lens", "bent"), LENSES, ids=[str(i) for i in range(len(LENSES))])
+def test_a_dot_of_every_lens_that_nerfstudio_reads(
+    tmp_path: Path, lens: dict[str, Any], bent: Callable[[float, float], tuple[float, float]]
+) -> None:
+    """The middle camera looks along +y from (0, -4, 0): a point far from its axis is where the pinhole says, within
+    what stretching the bell moves its centroid; any other lens is farther off by far."""
+    point = (1.9, 0.0, -1.2)
+    x, y = bent(1.9 / 4, 1.2 / 4)
+    write(tmp_path, image=dot(63 + 60 * x, 41 + 58 * y), **WIDE, **lens)
+    scene = load(options(tmp_path))
+    view = views(scene)[1]
+    pixel, _ = view.camera.project(torch.tensor([point], dtype=torch.float64))
+    assert (centroid(view.image()) - pixel[0]).abs().max() < 0.12
+    assert math.hypot(60 * (x - 1.9 / 4), 58 * (y - 1.2 / 4)) > 0.9
+    assert any("undistorted" in note for note in scene.notes)
+
+
+def test_full_opencv_is_a_ratio_of_polynomials(tmp_path: Path) -> None:
+    x, y = 1.9 / 4, 1.2 / 4
+    r2 = x * x + y * y
+    ratio = (1 + 0.1 * r2 - 0.05 * r2**2 + 0.02 * r2**3) / (1 + 0.03 * r2 + 0.01 * r2**2 - 0.01 * r2**3)
+    keys = {"k1": 0.1, "k2": -0.05, "k3": 0.02, "k4": 0.03, "k5": 0.01, "k6": -0.01}
+    write(tmp_path, image=dot(63 + 60 * x * ratio, 41 + 58 * y * ratio), camera_model="FULL_OPENCV", **WIDE, **keys)
+    view = views(load(options(tmp_path)))[1]
+    pixel, _ = view.camera.project(torch.tensor([(1.9, 0.0, -1.2)], dtype=torch.float64))
+    assert (centroid(view.image()) - pixel[0]).abs().max() < 0.03
+
+
+def test_each_frame_may_have_a_lens_of_its_own(tmp_path: Path) -> None:
+    """As colmap2nerf and ns-process-data write several cameras: all of a camera stands in each frame."""
+    write(tmp_path, **WIDE, frames=frame_changes(is_fisheye=True, k1=0.05, fl_x=58.0))
+    first, second, third = views(load(options(tmp_path)))
+    assert first.camera.size == third.camera.size == (WIDTH, HEIGHT)
+    assert second.camera.size != (WIDTH, HEIGHT)
+
+
 def test_pycolmap_agrees_on_the_bent_lens(tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=[110, 100, 63, 41, *BENT.values()])
@@ -147,6 +230,16 @@ def test_angles_of_view_stand_in_for_focal_lengths(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy) == (pytest.approx(120), pytest.approx(120))
 
 
+def test_degrees_of_instant_ngp_and_a_frames_own_angle(tmp_path: Path) -> None:
+    """The width is 120: a quarter turn has a focal length of 60, and tan(x / 2) = 1 / 2 one of 120."""
+    own = frame_changes(camera_angle_x=2 * math.atan(0.5))
+    write(tmp_path, fl_x=None, fl_y=None, x_fov=90, frames=own)
+    cameras = [view.camera for view in views(load(options(tmp_path)))]
+    assert [camera.fx for camera in cameras] == [pytest.approx(60), pytest.approx(120), pytest.approx(60)]
+    write(tmp_path, fl_y=None, camera_angle_x=1.0, frames=own)  # fl_x of the file is in all but that frame
+    assert [view.camera.fx for view in views(load(options(tmp_path)))] == [110, pytest.approx(120), 110]
+
+
 def test_simple_pinhole_has_one_focal_length(tmp_path: Path) -> None:
     write(tmp_path, camera_model="SIMPLE_PINHOLE")
     camera = views(load(options(tmp_path)))[0].camera
@@ -162,9 +255,23 @@ def test_centred_principal_point(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE.*scene=colmap"),
         ({"camera_model": "PINHOL"}, r"camera_model PINHOL,.*Did you mean 'PINHOLE'\?"),
-        ({"is_fisheye": True}, "camera_model OPENCV_FISHEYE"),
+        ({"camera_model": 5}, "camera_model 5: give a name"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is OPENCV and has is_fisheye: remove the wrong one"),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "p1": 0.1},
+            "is OPENCV_FISHEYE and has distortion p1, of which that has k1",
+        ),
+        ({"camera_model": "SIMPLE_RADIAL", "k2": 0.1}, "is SIMPLE_RADIAL and has distortion k2"),
+        ({"is_fisheye": True, "fl_x": None, "camera_angle_x": 1.0}, "camera_angle_x does not give: add it in pixels"),
+        ({"camera_model": "FISHEYE624", "distortion_params": [0.1]}, r"distortion_params \[0\.1\]: give a list of 12"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR, which sees too wide for a pinhole: cut the photos"),
+        ({"equirectangular": True}, "EQUIRECTANGULAR, which sees too wide"),
+        ({"latlong": True}, "LATLONG, which sees too wide"),
+        ({"ftheta_p0": 0.0}, "FTHETA, which is not read .*undistort the photos, or load .*scene=colmap"),
+        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO, which has no perspective"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "THIN_PRISM_FISHEYE, which is not read .*scene=colmap"),
+        ({"x_fov": 180}, "x_fov 3.14159, no angle between 0 and pi"),
         ({"camera_model": "PINHOLE", "k1": 0.1}, "is PINHOLE and has distortion"),
         ({"k1": 0.1, "k4": 0.2}, "has distortion k4"),
         ({"fl_x": None}, "neither fl_x nor camera_angle_x"),
@@ -234,6 +341,76 @@ def test_a_copy_of_a_training_photo_cannot_be_tested_on(tmp_path: Path) -> None:
     assert len(load(options(tmp_path)).train) == 2  # trained on twice, which gives no test away
     photos[2].write_bytes(photos[0].read_bytes())
     with pytest.raises(InputError, match=r"1 test photographs .*'[^']*images/2\.png' is '[^']*images/0\.png' byte for"):
+        load(options(tmp_path))
+
+
+def test_a_name_without_suffix_is_that_of_the_photo_that_is_there(tmp_path: Path) -> None:
+    """instant-ngp tries suffixes, NeRF-synthetic means .png: that comes first."""
+    write(tmp_path)
+    (tmp_path / "images" / "1.png").rename(tmp_path / "images" / "1.JPG")
+    (tmp_path / "images" / "2.png").rename(tmp_path / "images" / "2.5.webp")
+    (tmp_path / "images" / "0.jpg").write_bytes(b"another")
+    frames = frame_changes(file_path=".\\images\\1")
+    frames[0]["file_path"], frames[2]["file_path"] = "./images/../images/0", str(tmp_path / "images" / "2.5")
+    (tmp_path / "transforms.json").write_text(json.dumps(COMMON | {"frames": frames}))
+    shown = {view.name: view.source.path.name for view in views(load(options(tmp_path)))}
+    assert shown == {"images/../images/0": "0.png", "images/1": "1.JPG", str(tmp_path / "images" / "2.5"): "2.5.webp"}
+
+
+@pytest.mark.parametrize(
+    ("named", "there"),
+    [
+        ("images/1.jpg", "images/1.png"),
+        ("Images/../images/1.PNG", "images/1.png"),
+        ("images/1.PNG", "images/1.png"),
+        ("/home/somebody/data/fox/images/1.png", "images/1.png"),
+        ("C:\\Users\\somebody\\fox\\images\\1.png", "images/1.png"),
+        ("../fox/images/1.png", "images/1.png"),
+        ("images/seven.png", ""),
+        ("elsewhere/images/0.png", ""),  # that one is another frame's
+    ],
+)
+def test_a_photo_under_another_name_is_named(tmp_path: Path, named: str, there: str) -> None:
+    write(tmp_path, frames=frame_changes(file_path=named))
+    remedy = f"'{there}' is there, correct '{plain_name(named)}' in the file" if there else "complete them"
+    with pytest.raises(InputError) as caught:
+        load(options(tmp_path))
+    assert f"{remedy}, or train on what is there with scene.missing=0.34" in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+def test_a_byte_order_mark_is_passed_over(tmp_path: Path, encoding: str) -> None:
+    """Editors and shells of Windows write them."""
+    write(tmp_path)
+    text = (tmp_path / "transforms.json").read_text()
+    (tmp_path / "transforms.json").write_bytes(text.encode(encoding))
+    assert len(views(load(options(tmp_path)))) == 3
+
+
+def test_what_is_left_out_of_instant_ngp_is_said(tmp_path: Path) -> None:
+    write(
+        tmp_path, rolling_shutter=[0, 0.5, 0, 0], white_transparent=False, aabb_scale=4, sharpness=3.0, offset=[1, 2, 3]
+    )
+    told = "transforms.json states rolling_shutter: left out, photos are taken as they are."
+    assert told in load(options(tmp_path)).notes
+    write(tmp_path, rolling_shutter=[0, 0, 0, 0], depth_file_path="a.png", orientation_override="none")
+    assert not any("left out" in note for note in load(options(tmp_path)).notes)
+
+
+def test_a_file_of_sdfstudio_is_refused_by_name(tmp_path: Path) -> None:
+    content = {"camera_model": "OPENCV", "frames": [{"rgb_path": "0.png", "camtoworld": [], "intrinsics": []}]}
+    (tmp_path / "meta_data.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"is of SDFStudio \(rgb_path\), which gsx does not read: export transforms"):
+        load(options(tmp_path / "meta_data.json"))
+
+
+def test_points_that_a_file_names_and_that_are_missing_are_refused(tmp_path: Path) -> None:
+    for name in ("sparse_pc.ply", "", ".", "a\0b.ply", "n" * 300 + ".ply"):
+        write(tmp_path, ply_file_path=name)
+        with pytest.raises(InputError, match=r"scene\.points=random"):
+            load(options(tmp_path))
+    write(tmp_path, ply_file_path=7)
+    with pytest.raises(InputError, match=r"ply_file_path 7.*scene\.points=random"):
         load(options(tmp_path))
 
 
@@ -340,6 +517,88 @@ def test_the_files_own_split(tmp_path: Path) -> None:
     assert [view.name for view in load(options(tmp_path)).test] == ["images/1.png"]
 
 
+def test_a_list_to_test_on_alone_leaves_the_others_to_train_on(tmp_path: Path) -> None:
+    write(tmp_path, test_filenames=["images/1.png"])
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.train] == ["images/0.png", "images/2.png"]
+    assert [view.name for view in scene.test] == ["images/1.png"]
+
+
+def write_pair(folder: Path, test: str = "transforms_test.json", common: dict[str, Any] = COMMON) -> None:
+    """Two files as instant-ngp's tools write them: two frames to train on, one to test on, all through a lens."""
+    write(folder)
+    frames = frame_changes()
+    for name, part in (("transforms_train.json", frames[:2]), (test, frames[2:])):
+        (folder / name).write_text(json.dumps(common | {"frames": part}))
+    (folder / "transforms.json").unlink()
+
+
+@pytest.mark.parametrize("test", ["transforms_test.json", "transforms_val.json"])
+def test_two_files_with_lenses_are_one_scene(tmp_path: Path, test: str) -> None:
+    write_pair(tmp_path, test)
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.train] == ["images/0.png", "images/1.png"]
+    assert [view.name for view in scene.test] == ["images/2.png"]
+    assert (scene.test[0].camera.fx, scene.test[0].camera.cy) == (110, 41)
+    assert f"Test views are those of {test}." in scene.notes
+    assert scene.provenance["test_file"] == test
+    assert len(load(options(tmp_path, split="none")).train) == 3
+    assert [view.name for view in load(options(tmp_path, split="every:3")).test] == ["images/0.png"]
+
+
+def test_of_two_files_that_share_an_image_none_is_read(tmp_path: Path) -> None:
+    write_pair(tmp_path)
+    (tmp_path / "transforms_test.json").write_text((tmp_path / "transforms_train.json").read_text())
+    with pytest.raises(InputError, match=r"transforms_test\.json' has 'images/0\.png' twice, perhaps to train"):
+        load(options(tmp_path))
+
+
+def test_a_file_to_train_on_alone_is_split(tmp_path: Path) -> None:
+    write_pair(tmp_path)
+    (tmp_path / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match="leaves 1 image to train on"):
+        load(options(tmp_path))
+    (tmp_path / "transforms_train.json").write_text(json.dumps(COMMON | {"frames": frame_changes()}))
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.test] == ["images/0.png"]
+    assert any("transforms_train.json lists no train_filenames: the split is every:8" in note for note in scene.notes)
+
+
+def test_frames_to_test_on_of_scannet(tmp_path: Path) -> None:
+    frames = frame_changes()
+    write(tmp_path, frames=frames[:2], test_frames=frames[2:])
+    scene = load(options(tmp_path))
+    assert [view.name for view in scene.train] == ["images/0.png", "images/1.png"]
+    assert [view.name for view in scene.test] == ["images/2.png"]
+    write(tmp_path, frames=frames, test_frames=frames[2:])
+    with pytest.raises(InputError, match=r"has 'images/2\.png' twice"):
+        load(options(tmp_path))
+
+
+def formats(folder: Path) -> list[str]:
+    return [loader.name for loader, _ in readable(folder, plugins()) if loader.name != "photos"]
+
+
+def test_a_folder_is_read_by_the_loader_that_knows_its_cameras(tmp_path: Path) -> None:
+    """No circle: whoever states more than an angle of view is read by scene=transforms, the others by scene=blender."""
+    write_pair(tmp_path)
+    assert formats(tmp_path) == ["transforms"]
+    with pytest.raises(InputError, match=r"camera_angle_x None, .*: with fl_x use scene=transforms"):
+        load_blender(blender_options(tmp_path))
+    plain = {"camera_angle_x": 2 * math.atan(60 / 110), "w": 120, "h": 90}
+    write_pair(tmp_path, common=plain)
+    assert formats(tmp_path) == ["blender"]
+    with pytest.raises(InputError, match="it is a scene=blender folder"):
+        load(options(tmp_path))
+    for stated in ({"fl_x": 110.0, "fl_y": 110.0, "cx": 60}, {"is_fisheye": False, "k1": 0}):  # the same camera
+        write_pair(tmp_path, common=plain | stated)
+        assert formats(tmp_path) == ["blender"]
+    for stated in ({"cx": 70}, {"k1": 0.1}, {"fl_x": 150}, {"camera_model": "OPENCV_FISHEYE"}):
+        write_pair(tmp_path, common=plain | {"fl_x": 110.0, "fl_y": 110.0} | stated)
+        assert formats(tmp_path) == ["transforms"]
+        assert len(load(options(tmp_path)).train) == 2
+
+
 def test_without_lists_every_eighth_is_held_out(tmp_path: Path) -> None:
     write(tmp_path)
     scene = load(options(tmp_path))
@@ -417,3 +676,43 @@ def test_provenance_is_json(tmp_path: Path) -> None:
     provenance = json.loads(json.dumps(load(options(tmp_path)).provenance))
     assert provenance["format"] == "transforms"
     assert provenance["undistortion"]
+
+
+ODD = [None, True, -1, math.nan, 1e300, 10**400, "", "x", "\0", "\ud800", [], [[]], [None], {}, {"a": 1}]
+"""Values of other kinds than keys of transforms files have."""
+RICH = COMMON | {
+    "camera_model": "OPENCV_FISHEYE", "is_fisheye": True, "k1": 0.05, "k4": 0.01, "p1": 0.0, "x_fov": None,
+    "camera_angle_x": 1.0, "camera_angle_y": 1.0, "distortion_params": [0.0] * 12, "ply_file_path": None,
+    "train_filenames": ["images/0.png", "images/1.png"], "test_filenames": ["images/2.png"], "test_frames": [],
+    "rolling_shutter": [0, 0, 0, 0], "applied_transform": POSES[0], "frames": None, "equirectangular": None,
+}  # fmt: skip
+
+
+FRAME = ("file_path", "transform_matrix", "mask_path", "fl_x", "k1", "camera_model", "w")
+SHARE = 30
+"""Of the values that are tried one in so many, each time others: all of them take half a minute."""
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FISHEYE624", "OPENCV"])
+def test_values_of_other_kinds_are_one_sentence(tmp_path: Path, model: str) -> None:
+    """No exception of Python's reaches anybody; what loads all the same has finite cameras."""
+    write(tmp_path)
+    cases = [({key: odd}, {}) for key in RICH for odd in ODD] + [({}, {key: odd}) for key in FRAME for odd in ODD]
+    for common, own in cases[len(model) % SHARE :: SHARE]:
+        fisheye = {"camera_model": model, "is_fisheye": model != "OPENCV"}
+        content = RICH | fisheye | {"frames": frame_changes(**own)} | common
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        outcome(tmp_path)
+
+
+def outcome(folder: Path) -> None:
+    """Load what is there: it is a scene of finite cameras, or refused in one line."""
+    try:
+        scene = load(options(folder, missing=0.5))
+    except InputError as error:
+        text = str(error)
+        assert text, "no sentence"
+        assert "\n" not in text
+        text.encode("utf-8", "strict")
+    else:
+        assert all(math.isfinite(view.camera.fx) for view in (*scene.train, *scene.test))

@@ -180,12 +180,12 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Parsed JSON file.
+    """Return what a JSON file holds, in UTF-8, UTF-16 or UTF-32, with or without a byte order mark.
 
     Raises:
         OSError, ValueError: it cannot be read or parsed.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_bytes())
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error

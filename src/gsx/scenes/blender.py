@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,15 +20,16 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
-from gsx.scenes.duplicates import refuse_shared
+from gsx.scenes.duplicates import photos_of, refuse_shared
+from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, needs_lens, test_file
+from gsx.scenes.frame_names import plain_name
+from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
-    finite_number,
     frames_line,
-    plain_name,
     pose_from_opengl,
     present_frames,
     provenance,
@@ -37,14 +38,17 @@ from gsx.scenes.posed import (
     refuse_too_few,
     views_of,
 )
-from gsx.scenes.splits import short
+from gsx.scenes.splits import short, split_names
 
 POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and conversions put a real one
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderOptions(SceneOptions):
-    """What `conf/scene/blender.yaml` sets; the files themselves say which images are held out (split=json)."""
+    """What `conf/scene/blender.yaml` sets; the files themselves say which images are held out (split=json).
+
+    `split` can be `none` as well, which trains on the images of both files, and any rule where there is but one file.
+    """
 
     points: str
     """auto: points3d.ply if the folder has one, else random | random | a PLY file, relative to `path`."""
@@ -67,22 +71,21 @@ class BlenderOptions(SceneOptions):
 
 
 def load(options: BlenderOptions) -> Scene:
-    """Loads a NeRF-synthetic scene; views keep the order of the files.
+    """Load a NeRF-synthetic scene; views keep the order of the files.
 
     Raises:
-        ConfigError: `split` is not `json`, or images are reduced by both `downscale` or `max_width` and `scales`.
+        ConfigError: `split` is neither `json` nor `none` where the files hold it, or images are reduced by both
+            `downscale` or `max_width` and `scales`.
         InputError: a file is missing or damaged, there are fewer than two training images, or a scale divides no image.
     """
-    if options.split != "json":
-        raise ConfigError(f"scene.split is '{short(options.split)}', but transforms_*.json hold the split: use json.")
     folder = at_home(options.path)
-    train_file, test_file = folder / "transforms_train.json", _test_file(folder)
+    train_file, held_out = folder / TRAIN_FILE, _test_file(folder, options.split)
     train_shots, train_notes = read_shots(train_file, options.missing)
-    test_shots, test_notes = read_shots(test_file, options.missing)
+    test_shots, test_notes = read_shots(held_out, options.missing) if held_out else ([], [])
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
-    train, test = views[: len(train_shots)], views[len(train_shots) :]
+    train, test = _split(views, len(train_shots), options.split, folder)
     refuse_too_few(train, train_file)
-    refuse_shared(train, test, test_file)
+    refuse_shared(train, test, held_out or train_file)
     grouped = list(options.test_scales) != [1]
     train = [reduced(view, factor) for factor in options.scales for view in train]
     test = [reduced(view, factor, grouped) for factor in options.test_scales for view in test]
@@ -95,9 +98,19 @@ def load(options: BlenderOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=Reduction() if list(options.scales) != [1] else reduction_of(options),
         extent=extent_of([view.camera for view in train]),
-        notes=[*train_notes, *test_notes, *_test_note(test_file), *mask_notes(views, options), points_note],
+        notes=[
+            *train_notes,
+            *test_notes,
+            *_test_note(held_out, options.split),
+            *mask_notes(views, options),
+            points_note,
+        ],
         provenance=provenance(
-            options, views, test_file=test_file.name, points=options.points, **_scales_named(options)
+            options,
+            views,
+            test_file=held_out.name if held_out else None,
+            points=options.points,
+            **_scales_named(options),
         ),
     )
 
@@ -152,21 +165,6 @@ def _scales_named(options: BlenderOptions) -> dict[str, Any]:
     return {} if scales == {"scales": [1], "test_scales": [1]} else scales
 
 
-BENDING = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Keys of nerfstudio's transforms for what a lens does to straight lines."""
-
-
-def left_out(node: Mapping[str, Any], angle: float) -> Iterator[str]:
-    """Keys of nerfstudio's transforms that make another camera than an angle of view does."""
-    width, height = (finite_number(node.get(key)) or 0.0 for key in ("w", "h"))
-    focal = width / (2 * math.tan(angle / 2))
-    for key, own in {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}.items():
-        value = finite_number(node.get(key))
-        if value is not None and abs(value - own) > 0.01 * own:
-            yield key
-    yield from (key for key in BENDING if node.get(key))
-
-
 def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
     """The shots of one transforms file, in its order, and a note where photos are missing.
 
@@ -174,18 +172,20 @@ def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
         InputError: the file is missing or damaged, or too few of its photos are there.
     """
     content, frames = read_frames(file)
-    angle = finite_number(content.get("camera_angle_x"))
-    if angle is None or not 0 < angle / 2 < math.pi / 2:  # its half is what the tangent is taken of
+    angle = angle_of(content)
+    if angle is None:
+        known = any(map(states_lens, (content, *frames)))
+        remedy = "with fl_x use scene=transforms" if known else "add the horizontal angle of view in radians"
         raise InputError(
             f"'{file}' has camera_angle_x {reprlib.repr(content.get('camera_angle_x'))}, which is no angle below pi: "
-            "with fl_x use scene=transforms."
+            f"{remedy}."
         )
     present, notes = present_frames(file.parent, frames, file, missing)
-    if stated := sorted({key for node in (content, *frames) for key in left_out(content | node, angle)}):
+    if stated := sorted({key for frame in ({}, *frames) for key in beyond_angle(content, frame)}):
         notes.append(
             f"{file.name} states {', '.join(stated)}, which the format's published readers leave out, and so does "
-            "scene=blender: pictures are taken for those of camera_angle_x, with nothing bent. With one "
-            "transforms.json, scene=transforms reads them."
+            "scene=blender: pictures are taken for those of camera_angle_x, with nothing bent. scene=transforms reads "
+            "them."
         )
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes
 
@@ -199,19 +199,37 @@ def _shot(frame: dict[str, Any], photo: Path, fov_x: float, file: Path) -> Shot:
     return Shot(name=name, photo=photo, whole=whole, expected_size=(width, height))
 
 
-def _test_file(folder: Path) -> Path:
-    files = [folder / f"transforms_{split}.json" for split in ("test", "val")]
-    present = next((file for file in files if file.is_file()), None)
-    if present is None:
+def _test_file(folder: Path, rule: str) -> Path | None:
+    """Return the file of the images to test on; None: all are in transforms_train.json.
+
+    Raises:
+        ConfigError: the files hold the split, and the rule is another one.
+        InputError: they should, and do not.
+    """
+    found = test_file(folder)
+    if found is None and rule == "json":
         raise InputError(
-            f"'{folder}' has neither transforms_test.json nor transforms_val.json: set scene.path to a NeRF-synthetic"
-            " folder, or use scene=transforms for a single transforms.json."
+            f"'{folder}' has neither {' nor '.join(TEST_FILES)}: hold out training images with scene.split=every:8, or "
+            "none with scene.split=none."
         )
-    return present
+    if found is not None and rule not in ("json", "none"):
+        raise ConfigError(
+            f"scene.split is '{short(rule)}', but transforms_*.json hold the split: use json, or none to train on all."
+        )
+    return found
 
 
-def _test_note(file: Path) -> list[str]:
-    return [] if file.stem.endswith("test") else [f"Test views are those of {file.name}: there is no test file."]
+def _split(views: Sequence[View], count: int, rule: str, folder: Path) -> tuple[list[View], list[View]]:
+    """Return training and test views: by the files, of which the first has `count` images, or by a rule."""
+    if rule == "json":
+        return list(views[:count]), list(views[count:])
+    train, test = split_names([view.name for view in views], rule, folder, photos_of(views))
+    return [views[i] for i in train], [views[i] for i in test]
+
+
+def _test_note(file: Path | None, rule: str) -> list[str]:
+    val = file is not None and not file.stem.endswith("test") and rule == "json"
+    return [f"Test views are those of {file.name}: there is no test file."] if file is not None and val else []
 
 
 def _points(options: BlenderOptions, folder: Path) -> tuple[PointCloud, str]:
@@ -231,9 +249,20 @@ def facts(path: Path) -> Iterator[str]:
     return (frames_line(file) for file in sorted(path.glob("transforms_*.json")))
 
 
+def recognise(path: Path) -> bool:
+    """Return whether a folder has transforms_train.json, and that no other camera than an angle of view makes."""
+    return (path / TRAIN_FILE).is_file() and not needs_lens(path / TRAIN_FILE)
+
+
+def overrides(path: Path) -> dict[str, str]:
+    """Return the split of a folder whose files hold none."""
+    return {} if test_file(path) else {"split": "every:8"}
+
+
 FORMAT = SceneFormat(
     meaning="NeRF-synthetic scene (transforms_train.json)",
-    sign="transforms_train.json",
-    recognise=lambda path: (path / "transforms_train.json").is_file(),
+    sign=TRAIN_FILE,
+    recognise=recognise,
     facts=facts,
+    overrides=overrides,
 )

@@ -2,9 +2,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,10 +17,11 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import at_home, is_file
+from gsx.core.files import at_home
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
+from gsx.scenes.frame_names import find_photo, lies_there, plain_name
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions, refuse_unknown
 from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
@@ -130,23 +131,39 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The content of a transforms file and its frames, each with a file name.
+    """Return the content of a transforms file and its frames, each with a file name.
 
     Raises:
         InputError: the file is missing or damaged, or lists no frames.
     """
     content = read_json(path)
-    frames = content.get("frames")
+    return content, frames_in(content, path)
+
+
+def frames_in(content: Mapping[str, Any], path: Path, key: str = "frames") -> list[dict[str, Any]]:
+    """Return the frames that a transforms file lists under a key, each with a file name.
+
+    Raises:
+        InputError: there are none, or one has no name, one that is no text, or that of another.
+    """
+    frames = content.get(key)
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"'{path}' lists no frames, export it anew.")
+        raise InputError(f"'{path}' lists no {key}, export it anew.")
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
+        if any(isinstance(frame, dict) and "rgb_path" in frame for frame in frames):
+            raise InputError(f"'{path}' is of SDFStudio (rgb_path), which gsx does not read: export transforms.json.")
         raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
-    refuse_no_text([frame["file_path"] for frame in frames], path)
-    counts = Counter(plain_name(frame["file_path"]) for frame in frames)
-    for name, count in counts.items():
+    masks = [frame["mask_path"] for frame in frames if isinstance(frame.get("mask_path"), str)]
+    refuse_no_text([*(frame["file_path"] for frame in frames), *masks], path)
+    refuse_twice([frame["file_path"] for frame in frames], path)
+    return frames
+
+
+def refuse_twice(names: Sequence[str], path: Path) -> None:
+    """Raise InputError if two names of a poses file are one."""
+    for name, count in Counter(map(plain_name, names)).items():
         if count > 1:
             raise InputError(f"'{path}' has '{name}' twice, perhaps to train on and to test on: remove one.")
-    return content, frames
 
 
 def refuse_no_text(names: Sequence[str], path: Path) -> None:
@@ -163,20 +180,6 @@ def finite_number(value: Any) -> float | None:
     except OverflowError:  # an integer of hundreds of digits
         return None
     return number if math.isfinite(number) else None
-
-
-def plain_name(file_path: str) -> str:
-    """A file name of a poses file with forward slashes and without a leading `./`."""
-    return str(PurePosixPath(file_path.replace("\\", "/")))
-
-
-def find_photo(folder: Path, file_path: str) -> Path | None:
-    """The photo of a frame, whose name may lack `.png` (as in NeRF-synthetic); None if it is not there."""
-    photo = folder / plain_name(file_path)
-    if not photo.name:
-        return None
-    candidates = (photo, photo.with_name(f"{photo.name}.png"))
-    return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def refuse_partial(
@@ -207,15 +210,23 @@ def present_frames(
     photos = [find_photo(folder, frame["file_path"]) for frame in frames]
     present = [(frame, photo) for frame, photo in zip(frames, photos, strict=True) if photo is not None]
     missing = [plain_name(frame["file_path"]) for frame, photo in zip(frames, photos, strict=True) if photo is None]
+    remedy = renaming(folder, missing, {photo for _, photo in present}) if len(missing) > allowed * len(frames) else ""
     if not present:
         raise InputError(
-            f"None of the {len(frames)} images of '{file}' is in '{folder}' (looked for {named(missing)}): put them"
-            " there or correct the names in the file."
+            f"None of the {len(frames)} images of '{file}' is in '{folder}' (looked for {named(missing)}): "
+            f"{remedy or 'put them there or correct the names in the file'}."
         )
-    refuse_partial(missing, len(frames), file, allowed)
+    refuse_partial(missing, len(frames), file, allowed, remedy=remedy or "complete them")
     refuse_file_twice([plain_name(frame["file_path"]) for frame, _ in present], [photo for _, photo in present], file)
     note = f"Skipped {len(missing)} of the {len(frames)} images of {file.name}, not on disk: {named(missing)}."
     return present, [note] if missing else []
+
+
+def renaming(folder: Path, missing: Sequence[str], taken: Container[Path]) -> str:
+    """Return what to do about missing photos if one lies there under another name, which no other frame has taken."""
+    found = ((name, lies_there(folder, name)) for name in missing[:NAMED_AT_MOST])
+    right = (pair for pair in found if pair[1] and folder / pair[1] not in taken)
+    return next((f"'{there}' is there, correct '{name}' in the file" for name, there in right), "")
 
 
 def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:

@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.quality.sharpness import sharpness
+from gsx.scenes.text_files import read_text
 
 RULES = ("every:K", "sharp:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
 DIGITS = 9  # of numbers of images
@@ -113,7 +114,7 @@ def _listed(names: list[str], file: Path) -> list[int]:
     """Positions of the names that `file` lists, in sorted order."""
     if not file.is_file():
         raise InputError(f"The split file '{file}' does not exist, check scene.split.")
-    lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
+    lines = [line.strip() for line in read_text(file).splitlines()]
     found = {_find(names, line, file) for line in lines if line}
     return sorted(found, key=lambda i: sort_key(names[i]))
 
@@ -145,9 +146,9 @@ def _count(text: str, rule: str) -> int:
 
 
 def _refuse_empty(total: int, train: int, test: int, rule: str) -> None:
-    """Only `none` may leave the test split empty."""
+    """Raise InputError for a split without training images, or without test images unless the rule is `none`."""
     if not train or not (test or rule == "none"):
         raise InputError(
             f"scene.split '{rule}' makes {train} training and {test} test images of {total}, both need at least"
-            " one: add images or choose another rule."
+            " one: add images or choose another rule; scene.split=none trains on all."
         )

@@ -1,40 +1,37 @@
-"""Scenes of a single transforms.json as nerfstudio and instant-ngp write it.
+"""Scenes of transforms.json as nerfstudio and instant-ngp write it, or of a file to train on and one to test on.
 
 Poses are camera-to-world with OpenGL axes. Poses and points are used in the frame they are stored in: what
-nerfstudio records as `applied_transform` is already applied to both. Photos of OPENCV cameras are undistorted as
-those of COLMAP scenes are.
+nerfstudio records as `applied_transform` and `applied_scale` is already applied to both. Photos of bent lenses are
+undistorted as those of COLMAP scenes are. Depth maps (`depth_file_path`) are not used.
 """
 
-import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsx.core.data.images import image_size
-from gsx.core.data.resize import Size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
-from gsx.core.files import at_home
+from gsx.core.files import at_home, is_file
 from gsx.core.ranges import Points, Seed
 from gsx.scenes.duplicates import photos_of, refuse_shared
+from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, needs_lens, nodes
+from gsx.scenes.frame_names import plain_name
+from gsx.scenes.lenses import completed, lens_of
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
-    finite_number,
     frames_line,
     lens_notes,
-    plain_name,
     pose_from_opengl,
     present_frames,
     provenance,
-    read_frames,
     reduction_of,
     refuse_too_few,
     shot_through,
@@ -43,20 +40,18 @@ from gsx.scenes.posed import (
 from gsx.scenes.splits import Split, split_names
 from gsx.scenes.undistort import METHOD
 
-FILE = "transforms.json"
-LARGEST_SIDE = 2**20
-"""Of photographs, px: larger numbers are none."""
-CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-FURTHER_DISTORTION = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
+LISTS = ("train_filenames", "test_filenames", "val_filenames")
+"""Keys of lists of names (nerfstudio): to train on, to test on, and to test on where there is no such list."""
 FALLBACK_SPLIT = "every:8"  # with split=json, for files without lists of names
+IGNORED = ("rolling_shutter", "transform_matrix_end", "white_transparent", "black_transparent", "sharpen")
+"""Keys of instant-ngp that change how it forms pictures; others, such as aabb_scale, change only what it shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsOptions(SceneOptions):
     """What `conf/scene/transforms.yaml` sets; `path` is the folder of transforms.json, or such a file itself.
 
-    `split` can be `json` as well: the file's own train_filenames and test_filenames, else every:8.
+    `split` can be `json` as well: the file's own train_filenames and test_filenames, or its second file, else every:8.
     """
 
     points: str
@@ -68,21 +63,20 @@ class TransformsOptions(SceneOptions):
 
 
 def load(options: TransformsOptions) -> Scene:
-    """Loads a transforms.json scene.
+    """Load a scene of transforms.json, or of transforms_train.json and a file to test on.
 
     Raises:
         InputError: a file is missing or damaged, a camera cannot be used, or there are fewer than two training images.
     """
-    file = _file(at_home(options.path))
-    content, frames = read_frames(file)
-    present, notes = present_frames(file.parent, frames, file, options.missing)
-    shots = [_shot({**content, **frame}, photo, file) for frame, photo in present]
-    views = views_of(shots, options)
-    (train, test), split_notes = _split(content, views, options.split, file)
+    parts = frame_files(at_home(options.path))
+    file, content = parts[0].file, parts[0].content
+    shots, notes = _shots(parts, options)
+    views = views_of([shot for part in shots for shot in part], options)
+    (train, test), split_notes = _split(parts, list(map(len, shots)), views, options.split)
     refuse_too_few(train, file)
     refuse_shared(train, test, file)
     points, points_note = _points(content, views, options, file)
-    bent = any(shot.remap is not None for shot in shots)
+    lenses = lens_notes([shot for part in shots for shot in part])
     return Scene(
         name=file.parent.resolve().name,
         train=train,
@@ -91,17 +85,39 @@ def load(options: TransformsOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
         extent=extent_of([view.camera for view in train]),
-        notes=[*notes, *lens_notes(shots), *mask_notes(views, options), *split_notes, points_note],
-        provenance=provenance(options, views, points=options.points, undistortion=METHOD if bent else None),
+        notes=[*notes, *lenses, *mask_notes(views, options), *split_notes, *_ignored(parts), points_note],
+        provenance=_provenance(options, views, parts, METHOD if lenses else None),
     )
 
 
-def _file(path: Path) -> Path:
-    """The transforms file that `path` is or holds."""
-    file = path if path.is_file() else path / FILE
-    if not file.is_file() and (path / "transforms_train.json").is_file():
-        raise InputError(f"'{path}' has transforms_train.json and no {FILE}: it is a scene=blender folder.")
-    return file
+def _provenance(
+    options: TransformsOptions, views: Sequence[View], parts: Sequence[FrameFile], method: str | None
+) -> dict[str, Any]:
+    """Return the provenance; the name of a second file is in it only where there is one: a protocol keeps its hash."""
+    other = {"test_file": parts[-1].file.name} if parts[-1].file != parts[0].file else {}
+    return provenance(options, views, points=options.points, undistortion=method, **other)
+
+
+def _shots(parts: Sequence[FrameFile], options: TransformsOptions) -> tuple[list[list[Shot]], list[str]]:
+    """Return the shots of each part whose photos are on disk, and notes on those that are not."""
+    shots, notes = list[list[Shot]](), list[str]()
+    for part in parts:
+        present, told = present_frames(part.file.parent, part.frames, part.file, options.missing)
+        shots.append([_shot(completed(part.content, frame), photo, part.file) for frame, photo in present])
+        notes += told
+    return shots, notes
+
+
+def _ignored(parts: Sequence[FrameFile]) -> list[str]:
+    """Return a note on keys that change pictures in instant-ngp and nothing here."""
+    stated = sorted({key for part in parts for node in nodes(part) for key in IGNORED if has_value(node.get(key))})
+    named = ", ".join(stated)
+    return [f"{parts[0].file.name} states {named}: left out, photos are taken as they are."] if stated else []
+
+
+def has_value(value: Any) -> bool:
+    """Return whether a value of a file is none of 0, false, empty, and lists of zeros."""
+    return any(map(has_value, value)) if isinstance(value, list) else bool(value)
 
 
 def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
@@ -114,93 +130,18 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
     return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
 
 
-def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
-    """The pycolmap camera of a frame: PINHOLE, OPENCV or, with k3, FULL_OPENCV.
-
-    The size defaults to the photo's, focal lengths to those of camera_angle_x and camera_angle_y, the principal
-    point to the middle.
-
-    Raises:
-        InputError: the camera model is none of `CAMERA_MODELS`, or a value is missing, contradictory or senseless.
-    """
-    import pycolmap
-
-    model = _model(entry, place)
-    width, height = _size(entry, photo, place)
-    focal = _focal(entry, width, height, place)
-    centre = [_number(entry, "cx", width / 2, place), _number(entry, "cy", height / 2, place)]
-    bend = [_number(entry, name, 0.0, place) for name in DISTORTION]
-    if model != "OPENCV" and any(bend):
-        raise InputError(f"{place} is {model} and has distortion {bend}, set camera_model to OPENCV or remove it.")
-    if not any(bend):
-        return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[*focal, *centre])
-    k1, k2, p1, p2, k3 = bend
-    params = [*focal, *centre, k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])]
-    return pycolmap.Camera(model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params)
-
-
-def _model(entry: Mapping[str, Any], place: str) -> str:
-    """The camera model; instant-ngp files name none and mean OPENCV, or a fisheye by `is_fisheye`."""
-    model = "OPENCV_FISHEYE" if entry.get("is_fisheye") else str(entry.get("camera_model", "OPENCV"))
-    if model not in CAMERA_MODELS:
-        raise InputError(
-            f"{place} has camera_model {model}, but only {', '.join(CAMERA_MODELS)} can be used: undistort the photos"
-            f" beforehand, or load their COLMAP model with scene=colmap.{nearest(model, CAMERA_MODELS)}"
-        )
-    further = [name for name in FURTHER_DISTORTION if _number(entry, name, 0.0, place)]
-    if further:
-        raise InputError(f"{place} has distortion {', '.join(further)}, but only {', '.join(DISTORTION)} are known.")
-    return model
-
-
-def _size(entry: Mapping[str, Any], photo: Path, place: str) -> Size:
-    width, height = (_number(entry, name, math.nan, place) for name in ("w", "h"))
-    if math.isnan(width) or math.isnan(height):
-        return image_size(photo)
-    if not 1 <= min(width, height) <= max(width, height) <= LARGEST_SIDE:
-        raise InputError(f"{place} has size {width:g} x {height:g}, correct w and h.")
-    return round(width), round(height)
-
-
-def _focal(entry: Mapping[str, Any], width: int, height: int, place: str) -> tuple[float, float]:
-    """Focal lengths in pixels: fl_x, fl_y, else from the angles of view, else fl_y as fl_x."""
-    fl_x = _number(entry, "fl_x", _focal_of_angle(entry, "camera_angle_x", width, place), place)
-    fl_y = _number(entry, "fl_y", _focal_of_angle(entry, "camera_angle_y", height, place), place)
-    if math.isnan(fl_x):
-        raise InputError(f"{place} has neither fl_x nor camera_angle_x, add the focal length in pixels as fl_x.")
-    fl_y = fl_x if math.isnan(fl_y) or entry.get("camera_model") == "SIMPLE_PINHOLE" else fl_y
-    if min(fl_x, fl_y) <= 0:
-        raise InputError(f"{place} has focal lengths {fl_x:g}, {fl_y:g}, they must be above 0.")
-    return fl_x, fl_y
-
-
-def _focal_of_angle(entry: Mapping[str, Any], key: str, side: int, place: str) -> float:
-    angle = _number(entry, key, math.nan, place)
-    if angle / 2 <= 0 or angle >= math.pi:  # its half is what the tangent is taken of
-        raise InputError(f"{place} has {key} {angle:g}, no angle between 0 and pi: give fl_x and fl_y instead.")
-    return side / (2 * math.tan(angle / 2))
-
-
-def _number(entry: Mapping[str, Any], key: str, default: float, place: str) -> float:
-    """A finite number of the file, or `default` where it is missing."""
-    value = entry.get(key)
-    if value is None:
-        return default
-    number = finite_number(value)
-    if number is None:
-        raise InputError(f"{place} has {key} {reprlib.repr(value)}, which is no finite number.")
-    return number
-
-
 def _split(
-    content: Mapping[str, Any], views: Sequence[View], rule: str, file: Path
+    parts: Sequence[FrameFile], counts: Sequence[int], views: Sequence[View], rule: str
 ) -> tuple[tuple[list[View], list[View]], list[str]]:
-    """Training and test views, and a note where `json` had to fall back."""
-    names = [view.name for view in views]
+    """Return training and test views, and a note where `json` falls back; `counts`: views of each part."""
+    names, file, content = [view.name for view in views], parts[0].file, parts[0].content
     notes = []
     if rule != "json":
         train, test = split_names(names, rule, file.parent, photos_of(views))
-    elif "train_filenames" in content:
+    elif len(parts) > 1:
+        train, test = list(range(counts[0])), list(range(counts[0], len(views)))
+        notes = [f"Test views are those of {parts[1].file.name}."]
+    elif any(key in content for key in LISTS):
         train, test = _listed_split(content, names, file)
     else:
         train, test = split_names(names, FALLBACK_SPLIT)
@@ -209,15 +150,23 @@ def _split(
 
 
 def _listed_split(content: Mapping[str, Any], names: Sequence[str], file: Path) -> Split:
-    """Positions of the names in the file's lists; names of photos that are not on disk are passed over."""
-    test_key = "test_filenames" if "test_filenames" in content else "val_filenames"
+    """Return positions of the names in the file's lists; names of photos that are not on disk are passed over.
+
+    Without train_filenames all names are trained on that the other list does not hold.
+    """
+    train_key, *others = LISTS
+    test_key = next((key for key in others if key in content), others[0])
     known = {plain_name(frame["file_path"]) for frame in content["frames"]}
-    train, test = (_listed(content, key, known, file) for key in ("train_filenames", test_key))
+    test = _listed(content, test_key, known, file)
+    train = _listed(content, train_key, known, file) if train_key in content else known - test
     if train & test:
-        raise InputError(f"'{min(train & test)}' is in train_filenames and {test_key} of '{file}', remove it from one.")
+        raise InputError(f"'{min(train & test)}' is in {train_key} and {test_key} of '{file}', remove it from one.")
     split = [i for i, name in enumerate(names) if name in train], [i for i, name in enumerate(names) if name in test]
     if not split[1]:
-        raise InputError(f"{test_key} of '{file}' names no image that is on disk, use another scene.split.")
+        raise InputError(
+            f"{test_key} of '{file}' names no image that is on disk, use another scene.split: every:8, or none to hold "
+            "out no image."
+        )
     return split
 
 
@@ -228,7 +177,7 @@ def _listed(content: Mapping[str, Any], key: str, known: set[str], file: Path) -
     listed = {plain_name(str(name)) for name in names}
     unknown = sorted(listed - known)
     if unknown:
-        raise InputError(f"{key} of '{file}' names '{unknown[0]}', which is no frame.{nearest(unknown[0], known)}")
+        raise InputError(f"{key} of '{file}' names {unknown[0]!r}, which is no frame.{nearest(unknown[0], known)}")
     return listed
 
 
@@ -236,9 +185,9 @@ def _points(
     content: Mapping[str, Any], views: Sequence[View], options: TransformsOptions, file: Path
 ) -> tuple[PointCloud, str]:
     """Points and a note on where they come from."""
-    stored = content.get("ply_file_path") if options.points == "auto" else options.points
+    stored = _stored(content, file) if options.points == "auto" else options.points
     if stored is not None and stored != "random":
-        cloud = read_points(file.parent / plain_name(str(stored)))
+        cloud = read_points(file.parent / stored)
         return cloud, f"Starts from the {len(cloud)} points of {stored}."
     centres = torch.stack([view.camera.centre for view in views])
     low, high = centres.amin(0), centres.amax(0)
@@ -248,9 +197,36 @@ def _points(
     return cloud, f"Starts from {len(cloud)} random points in the cube around the cameras."
 
 
+def _stored(content: Mapping[str, Any], file: Path) -> str | None:
+    """Return the PLY file that a transforms file names, relative to its folder; None: it names none.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    name = content.get("ply_file_path")
+    if name is None or (isinstance(name, str) and is_file(file.parent / plain_name(name))):
+        return None if name is None else plain_name(name)
+    raise InputError(
+        f"ply_file_path {repr(name)[:200]} of '{file}' is no file there: restore it, or set scene.points=random."
+    )
+
+
+def recognise(path: Path) -> bool:
+    """Return whether a path is a transforms file, or the folder of one that states its cameras."""
+    single = (path / FILE).is_file() or (path.suffix == ".json" and path.is_file())
+    return single or ((path / TRAIN_FILE).is_file() and needs_lens(path / TRAIN_FILE))
+
+
+def facts(path: Path) -> Iterator[str]:
+    """Yield how many images of each transforms file are there."""
+    single = path if path.is_file() else path / FILE
+    files = [single] if single.is_file() else [path / name for name in (TRAIN_FILE, *TEST_FILES)]
+    return (frames_line(file) for file in files if file.is_file())
+
+
 FORMAT = SceneFormat(
-    meaning="poses in one transforms.json (nerfstudio, instant-ngp)",
+    meaning="poses and lenses in transforms.json (nerfstudio, instant-ngp)",
     sign=FILE,
-    recognise=lambda path: (path / FILE).is_file() or (path.suffix == ".json" and path.is_file()),
-    facts=lambda path: [frames_line(path if path.is_file() else path / FILE)],
+    recognise=recognise,
+    facts=facts,
 )

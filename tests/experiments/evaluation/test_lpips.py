@@ -1,6 +1,8 @@
 """LPIPS with random weights in files shaped like torchvision's and the lpips package's, against plain convolutions."""
 
+import io
 import logging
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -171,10 +173,59 @@ def test_file_without_the_state_dict_is_refused(content: object, weights: dict, 
             load_lpips(options(trunk, head, "alex"))
 
 
-def test_text_file_is_refused(weights: dict, tmp_path: Path) -> None:
-    (tmp_path / "page.pth").write_text("<html>not found</html>")
-    with pytest.raises(InputError, match=r"page\.pth cannot be read as weights"):
-        load_lpips(options(tmp_path / "page.pth", weights["alex"][1], "alex"))
+def saved(content: object) -> bytes:
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "it is empty"),
+        (b"<html>not found</html>", "it is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "it is a Git LFS pointer"),
+        (b"hello", "it is no file of torch.save"),
+        (b"\x02\0\0\0\0\0\0\0{}", "it is a safetensors file"),
+        (b"PK\x03\x04 and no more", "it is damaged, or holds other things than tensors"),
+        (b"\x80\x02junk", "it is damaged, or holds other things than tensors"),
+        (saved(torch.nn.Linear(2, 2)), "it is damaged, or holds other things than tensors"),
+        (saved(torch.zeros(3)), "it holds a Tensor, not a state dict"),
+    ],
+)
+def test_a_file_that_is_no_weights_is_refused_in_one_sentence(
+    content: bytes, reason: str, weights: dict, tmp_path: Path
+) -> None:
+    """The whole message is ours: torch's own advises to run what the file holds."""
+    file = tmp_path / "page.pth"
+    file.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_lpips(options(file, weights["alex"][1], "alex"))
+    start, end = f"metrics.lpips.trunk={file} cannot be read as weights ({reason}", "): give a local .pth file"
+    assert str(caught.value).startswith(start)
+    assert end in str(caught.value)
+    assert "torch.load" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_is_refused_by_what_the_system_says(weights: dict, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be read as weights \(Is a directory\)"):
+        load_lpips(options(tmp_path, weights["alex"][1], "alex"))
+
+
+def test_weights_that_are_not_finite_are_refused_by_name(weights: dict, tmp_path: Path) -> None:
+    head = torch.load(weights["alex"][1], weights_only=True)
+    head["lin2.model.1.weight"][0, 5] = math.nan
+    torch.save(head, tmp_path / "head.pth")
+    with pytest.raises(InputError, match=r"the head file lacks finite 'lin2\.model\.1\.weight'\): check both"):
+        load_lpips(options(weights["alex"][0], tmp_path / "head.pth", "alex"))
+
+
+def test_files_that_are_swapped_or_of_the_other_net_are_refused_with_the_remedy(weights: dict) -> None:
+    with pytest.raises(InputError, match=r"lacks finite 'features\.0\.weight'\): swap them"):
+        load_lpips(options(*weights["alex"][::-1], "alex"))
+    with pytest.raises(InputError, match=r"64x3x11x11 instead of 64x3x3x3 numbers\): set metrics\.lpips\.net=alex"):
+        load_lpips(options(*weights["alex"], "vgg"))
 
 
 def test_files_of_another_network_are_refused(weights: dict) -> None:

@@ -5,8 +5,8 @@ linear layers of the lpips package (`vgg.pth`, `alex.pth`). Published 3D-GS figu
 network expects [-1, 1] (3D-GS, metrics.py): `input_range` selects, and the name of the figure says which.
 """
 
-import hashlib
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from gsx.core.errors import InputError
-from gsx.core.files import at_home
 from gsx.core.shapes import Float
+from gsx.experiments.evaluation.weight_files import read_weights
 
 logger = logging.getLogger(__name__)
 
@@ -91,20 +91,41 @@ class Lpips(nn.Module):
         return total
 
 
-def load_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
-    """State dict and sha256 prefix of a weights file.
+def shapes_of(net: str) -> tuple[dict[str, torch.Size], dict[str, int]]:
+    """Return what net `vgg` or `alex` needs: shapes of the trunk's tensors, lengths of the head's, by name."""
+    with torch.device("meta"):
+        stages = stages_of(net)
+    trunk = {f"features.{name.partition('.')[2]}": value.shape for name, value in stages.state_dict().items()}
+    return trunk, {f"lin{index}.model.1.weight": layers[-1][0] for index, (_, layers) in enumerate(STAGES[net])}
 
-    Raises:
-        InputError: the file is missing or no state dict.
-    """
-    try:
-        data = at_home(path).read_bytes()
-        weights = torch.load(at_home(path), map_location="cpu", weights_only=True)
-        if not isinstance(weights, dict):
-            raise TypeError(f"it holds a {type(weights).__name__}, not a state dict")
-    except Exception as error:
-        raise InputError(f"{option}={path} cannot be read as weights ({error}): give a local .pth file") from error
-    return weights, hashlib.sha256(data).hexdigest()[:8]
+
+def misfit(trunk: Mapping[str, Tensor], head: Mapping[str, Tensor], net: str) -> str:
+    """Return what is wrong with the two files for a net, in words; empty if both fit."""
+    shapes, lengths = shapes_of(net)
+    for file, weights, needed in (("trunk", trunk, shapes), ("head", head, lengths)):
+        for name, size in needed.items():
+            if name not in weights:
+                return f"the {file} file lacks finite '{name}'"
+            found = weights[name].shape if file == "trunk" else weights[name].numel()
+            if found != size:
+                return f"'{name}' of the {file} file has {words_of(found)} instead of {words_of(size)} numbers"
+    return ""
+
+
+def words_of(size: int | torch.Size) -> str:
+    """Return a shape or a length as text."""
+    return str(size) if isinstance(size, int) else "x".join(map(str, size))
+
+
+def refuse_misfit(trunk: Mapping[str, Tensor], head: Mapping[str, Tensor], net: str) -> None:
+    """Raise InputError if the two files do not hold the weights of a net."""
+    problem = misfit(trunk, head, net)
+    if not problem:
+        return
+    other = next((name for name in STAGES if not misfit(trunk, head, name)), None)
+    swapped = not misfit(head, trunk, net)
+    remedy = f"set metrics.lpips.net={other}" if other else "swap them" if swapped else "check both files"
+    raise InputError(f"metrics.lpips weights do not fit net '{net}' ({problem}): {remedy}")
 
 
 def load_lpips(options: LpipsOptions) -> Lpips | None:
@@ -120,16 +141,14 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
         logger.info("LPIPS: n/a (no weights); give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE")
         return None
     network = Lpips(options.net, options.input_range)
-    trunk, trunk_hash = load_weights(options.trunk, "metrics.lpips.trunk")
-    head, head_hash = load_weights(options.head, "metrics.lpips.head")
-    try:
-        for stage in network.stages:
-            for number, layer in stage.named_children():
-                if isinstance(layer, nn.Conv2d):
-                    layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
-        for index, parameter in enumerate(network.heads):
-            parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
-    except (KeyError, RuntimeError) as error:
-        raise InputError(f"metrics.lpips weights do not fit net '{options.net}' ({error}): check both files") from error
+    trunk, trunk_hash = read_weights(options.trunk, "metrics.lpips.trunk")
+    head, head_hash = read_weights(options.head, "metrics.lpips.head")
+    refuse_misfit(trunk, head, options.net)
+    for stage in network.stages:
+        for number, layer in stage.named_children():
+            if isinstance(layer, nn.Conv2d):
+                layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
+    for index, parameter in enumerate(network.heads):
+        parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
     network.note = f", trunk {trunk_hash}, head {head_hash}"
     return network.eval()

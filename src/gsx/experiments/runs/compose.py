@@ -192,7 +192,7 @@ def quoted(text: str) -> str:
 
 def word_of(key: str, text: str) -> str:
     """An override with a text for its value, quoted unless it would be read as that text anyway."""
-    plain = re.fullmatch(r"[A-Za-z/][\w./-]*( [\w./-]+)*", text, re.ASCII)
+    plain = re.fullmatch(r"[A-Za-z/][\w./:-]*( [\w./:-]+)*", text, re.ASCII)
     bare = plain and text.lower() not in ("null", "true", "false", "nan", "inf")
     return f"{key}={text if bare else quoted(text)}"
 

@@ -1,0 +1,82 @@
+"""Which transforms files a folder holds: one with all frames, or one to train on and one to test on."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsx.core.errors import InputError
+from gsx.scenes.lenses import beyond_angle, states_lens
+from gsx.scenes.posed import frames_in, read_frames, read_json, refuse_twice
+
+FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
+TEST_FILES = ("transforms_test.json", "transforms_val.json")
+TEST_FRAMES = "test_frames"
+"""Key of ScanNet++ for the frames to test on."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFile:
+    """Frames of one transforms file that are all trained on, all tested on, or yet to be split."""
+
+    file: Path
+    content: Mapping[str, Any]
+    """Values common to all frames."""
+    frames: list[dict[str, Any]]
+
+
+def frame_files(path: Path) -> list[FrameFile]:
+    """Return what `path`, a transforms file or its folder, holds: all frames, or those to train and those to test on.
+
+    Raises:
+        InputError: a file is missing or damaged, one image is in both, or they are those of a NeRF-synthetic scene.
+    """
+    file = path if path.is_file() else path / FILE
+    if not file.is_file() and (path / TRAIN_FILE).is_file():
+        return _pair(path)
+    content, frames = read_frames(file)
+    parts = [FrameFile(file, content, frames)]
+    if content.get(TEST_FRAMES):
+        parts.append(FrameFile(file, content, frames_in(content, file, TEST_FRAMES)))
+    return without_shared(parts)
+
+
+def _pair(folder: Path) -> list[FrameFile]:
+    """Return the parts of a folder with transforms_train.json, which states more of its cameras than an angle."""
+    content = read_json(folder / TRAIN_FILE)
+    frames = content.get("frames")
+    listed = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+    if not any(map(states_lens, (content, *listed))):
+        raise InputError(f"'{folder}' has {TRAIN_FILE} and no {FILE}: it is a scene=blender folder.")
+    files = [folder / TRAIN_FILE, test_file(folder)]
+    return without_shared([FrameFile(file, *read_frames(file)) for file in files if file])
+
+
+def without_shared(parts: list[FrameFile]) -> list[FrameFile]:
+    """Return the parts.
+
+    Raises:
+        InputError: one image is in two of them.
+    """
+    refuse_twice([frame["file_path"] for part in parts for frame in part.frames], parts[-1].file)
+    return parts
+
+
+def test_file(folder: Path) -> Path | None:
+    """Return the file that says what to test on, if there is one: transforms_test.json, else transforms_val.json."""
+    return next((folder / name for name in TEST_FILES if (folder / name).is_file()), None)
+
+
+def nodes(part: FrameFile) -> Iterator[Mapping[str, Any]]:
+    """Yield what may state a camera: the file's common values, then each frame."""
+    yield part.content
+    yield from part.frames
+
+
+def needs_lens(file: Path) -> bool:
+    """Return whether a transforms file states other cameras than its angle of view makes; False for a damaged one."""
+    try:
+        content, frames = read_frames(file)
+    except InputError:
+        return False
+    return any(beyond_angle(content, node) for node in (content, *frames))
