@@ -121,7 +121,14 @@ def scene_files(kind: str) -> Callable[[Path], list[Path]]:
             for image in made.images.values()
         ]
         content = {"w": 64, "h": 48, "fl_x": 80.0, "fl_y": 82.0, "cx": 30.0, "cy": 25.0, "frames": frames}
-        if kind == "transforms":
+        if kind == "lenses":
+            fisheye = content | {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k4": 0.0, "test_frames": frames[3:]}
+            frames[0] |= {"fl_x": 85.0, "k2": 0.01, "is_fisheye": True, "mask_path": frames[0]["file_path"]}
+            contents = {"transforms.json": fisheye | {"frames": frames[:3], "rolling_shutter": [0, 0, 0, 0]}}
+        elif kind == "pair":
+            halves = {"transforms_train.json": frames[:3], "transforms_val.json": frames[3:]}
+            contents = {name: content | {"frames": half} for name, half in halves.items()}
+        elif kind == "transforms":
             contents = {"transforms.json": content | {"k1": 0.01, "camera_model": "OPENCV"}}
         else:
             halves = {"transforms_train.json": frames[:3], "transforms_test.json": frames[3:]}
@@ -232,6 +239,8 @@ READERS = {
     "splat file": Reader(splats, read_splats, PURE),
     "compact splat file": Reader(compact, read_compact, PURE // 10),
     "transforms.json": Reader(scene_files("transforms"), load("transforms"), PURE),
+    "transforms.json of fisheyes": Reader(scene_files("lenses"), load("transforms"), NATIVE * 5),
+    "transforms to train and test on": Reader(scene_files("pair"), load("transforms"), NATIVE * 5),
     "transforms of NeRF-synthetic": Reader(scene_files("blender"), load("blender"), PURE),
     "COLMAP binary": Reader(scene_files("bin"), load("colmap"), NATIVE * 5),
     "COLMAP text": Reader(scene_files("txt"), load("colmap"), NATIVE * 5),
