@@ -1,37 +1,55 @@
 """Scenes from a folder with nothing but photos: reconstructed once, kept in the cache, then a COLMAP scene."""
 
 import logging
-import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from gsx.core.cache import cache_folder, content_key, file_stamp
-from gsx.core.data.images import image_size, read_image
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import at_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
-from gsx.scenes import colmap, sfm
+from gsx.scenes import colmap, sfm, sfm_copies
 from gsx.scenes.colmap_model import Model, error_told, read_model
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.posed import named, refuse_partial
+from gsx.scenes.readable import readable_size
 
 logger = logging.getLogger(__name__)
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")  # what both pycolmap and gsx read
-HEIC = (".heic", ".heif")
+PHOTO_SUFFIXES = (
+    ".jpg",
+    ".jpeg",
+    ".png",
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".webp",
+)
+"""What gsx reads; COLMAP gets copies of what it reads otherwise (gsx.scenes.sfm_copies)."""
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
+FOREIGN = {".heic": "HEIC", ".heif": "HEIC", ".hif": "HEIC", ".avif": "AVIF"} | dict.fromkeys(RAW, "raw")
+"""Kinds of photos by suffix that neither library decodes."""
+REMEDIES = {
+    "HEIC": "which neither OpenImageIO nor COLMAP reads here: convert them, for example by "
+    "'magick mogrify -format jpg *.heic', and set the phone to take JPEG",
+    "AVIF": "which neither OpenImageIO nor COLMAP reads here: convert them, for example by "
+    "'magick mogrify -format png *.avif'",
+    "raw": "which are not developed here: export them as JPEG or PNG from a raw converter",
+}
 MATCHERS = ("auto", "exhaustive", "sequential")
 CAMERA_MODES = ("auto", "single", "per_image")
 MIN_PHOTOS = 2
 METHOD = "sfm/2"  # part of the cache key: raise the number when the reconstruction changes
+COPIES = "copies/1"  # likewise, where photos are converted for COLMAP
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +73,8 @@ def load(options: PhotosOptions) -> Scene:
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
     notes += passed_over(path, folder)
-    refuse_partial(
-        sorted({*photos} - sizes.keys()), len(photos), folder, options.missing, "cannot be read", "export them again"
-    )
+    broken = sorted({*photos} - sizes.keys())
+    refuse_partial(broken, len(photos), folder, options.missing, "cannot be read", remedy_of(folder, broken))
     model = read_model(reconstruct(folder, sizes, options))
     notes += report(model, list(sizes))
     scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
@@ -87,8 +104,8 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     names = photos_in(folder, "*") or photos_in(folder, "**/*")
     if len(names) < MIN_PHOTOS:
         found = ", ".join(sorted({file.suffix for file in folder.rglob("*") if file.is_file()})) or "nothing"
-        if heic_in(folder):
-            raise InputError(f"{folder} holds {len(names)} photos in other formats, and {heic_sentence(folder)}")
+        if foreign := foreign_sentences(folder):
+            raise InputError(f"{folder} holds {len(names)} photos in other formats, and {' '.join(foreign)}")
         raise InputError(
             f"{folder} holds {len(names)} photos ({', '.join(PHOTO_SUFFIXES)}; found: {found}), but reconstruction "
             f"needs at least {MIN_PHOTOS}: name another folder or convert the photos to JPEG."
@@ -115,27 +132,16 @@ def aside(name: str) -> bool:
     return name.startswith(".") or name in ("@eaDir", "__MACOSX")
 
 
-def heic_in(folder: Path) -> int:
-    """How many photographs of phones, in the format that nothing here reads, lie in a folder."""
-    return sum(file.suffix.lower() in HEIC for file in folder.iterdir())
+def foreign_sentences(folder: Path) -> list[str]:
+    """Return a sentence with the remedy for each kind of photo that lies in a folder and that nothing here reads.
 
-
-def heic_sentence(folder: Path) -> str:
-    """What to do with them."""
-    return (
-        f"{heic_in(folder)} HEIC photos, which neither OpenImageIO nor COLMAP reads here: convert them, for example by "
-        "'magick mogrify -format jpg *.heic', and set the phone to take JPEG."
-    )
-
-
-def may_be_cut(photo: Path) -> bool:
-    """Whether a JPEG has no mark of its end behind the begin of its last picture; other bytes behind may look so."""
-    with photo.open("rb") as file:
-        file.seek(-2, os.SEEK_END)
-        if file.read() == b"\xff\xd9":  # as nearly all end: the rest need not be read
-            return False
-    content = photo.read_bytes()
-    return content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda")
+    A raw file beside a photo of the same name is that photo once more.
+    """
+    files = [file for file in folder.iterdir() if not aside(file.name)]
+    stems = {file.stem for file in files if file.suffix.lower() in PHOTO_SUFFIXES}
+    alone = [file.suffix.lower() for file in files if not (file.suffix.lower() in RAW and file.stem in stems)]
+    counts = Counter(FOREIGN[suffix] for suffix in alone if suffix in FOREIGN)
+    return [f"{count} {kind} photos, {REMEDIES[kind]}." for kind, count in sorted(counts.items())]
 
 
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
@@ -147,15 +153,24 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
     sizes = {}
     for name in photos:
         with suppress(InputError):
-            size = image_size(folder / name)
-            if may_be_cut(folder / name):
-                read_image(folder / name)
-            sizes[name] = size
+            sizes[name] = readable_size(folder / name)
     broken = [name for name in photos if name not in sizes]
     if len(sizes) < MIN_PHOTOS:
-        raise InputError(f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: export them again.")
+        raise InputError(
+            f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: {remedy_of(folder, broken)}."
+        )
     notes = [f"Skipped {len(broken)} photos that cannot be read: {named(broken)}."] if broken else []
-    return sizes, [*notes, f"Passed over {heic_sentence(folder)}"] if heic_in(folder) else notes
+    return sizes, [*notes, *(f"Passed over {sentence}" for sentence in foreign_sentences(folder))]
+
+
+def remedy_of(folder: Path, broken: Sequence[str]) -> str:
+    """Return what to do about photos that cannot be read, with the reason of the first."""
+    for name in broken[:1]:
+        try:
+            readable_size(folder / name)
+        except InputError as problem:
+            return f"export them again ({str(problem).rstrip('.')})"
+    return "export them again"
 
 
 def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path:
@@ -164,24 +179,26 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path
     Raises:
         InputError: no two photos can be placed.
     """
-    final = cache_folder("sfm", _key(folder, sizes, options))
+    doubtful = sfm_copies.candidates(folder, dict.fromkeys(sizes, 1))
+    final = cache_folder("sfm", _key(folder, sizes, options, doubtful))
     if intact(final):
         logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
         return final
 
     def make(work: Path) -> Any:
-        best = sfm.reconstruct(folder, sizes, options, work)
+        best = sfm.reconstruct(sfm_copies.prepared(folder, list(sizes), doubtful, work), sizes, options, work)
         _refuse_nothing(best, folder, sizes)
         return best
 
     return kept_model(final, make)
 
 
-def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> str:
+def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, doubtful: Mapping[str, int]) -> str:
     import pycolmap
 
     stamps = [(name, *file_stamp(folder / name)) for name in sizes]
-    return content_key(METHOD, pycolmap.__version__, stamps, settings(options))
+    copies = [(COPIES, *doubtful.items())] if doubtful else []
+    return content_key(METHOD, pycolmap.__version__, stamps, settings(options), *copies)
 
 
 def settings(options: sfm.SfmOptions) -> dict[str, Any]:

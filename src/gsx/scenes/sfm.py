@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from gsx.core.data.images import lens_of
 from gsx.core.errors import InputError
 from gsx.core.ranges import Count, Range
+from gsx.scenes.exif import lens_of
 
 logger = logging.getLogger(__name__)
 

@@ -134,17 +134,6 @@ def test_nan_is_refused(tmp_path: Path) -> None:
         read_image(save(tmp_path / "a.exr", pixels))
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_is_applied_only_when_asked_for(tmp_path: Path, orientation: int) -> None:
-    path = save(tmp_path / "a.jpg", noise(16, 32, 3), Orientation=orientation)
-    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.UINT8)
-    expected = torch.from_numpy(upright).permute(2, 0, 1)
-    assert torch.equal(read_image(path, upright=True), expected)
-    assert image_size(path, upright=True) == (expected.shape[2], expected.shape[1])
-    assert read_image(path).shape == (3, 16, 32)
-    assert image_size(path) == (32, 16)
-
-
 def test_stored_raster_is_what_pycolmap_reads(tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     path = save(tmp_path / "a.jpg", noise(16, 32, 3), Orientation=6)

@@ -4,11 +4,10 @@ Images are uint8 display values [C, H, W], red first, alpha (if any) straight an
 """
 
 import errno
-import math
 import os
 import shutil
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,24 +24,14 @@ from gsx.core.shapes import Float, Shaped, UInt8
 JPEG_QUALITY = 95
 PNG_EFFORT = {"png:compressionLevel": 1, "png:filter": 0x80}
 """Little of zlib, rows by Paeth's predictor alone: less time than what libpng chooses by itself, and more bytes."""
-ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
-    1: (False, ()),
-    2: (False, (-1,)),
-    3: (False, (-2, -1)),
-    4: (False, (-2,)),
-    5: (True, ()),
-    6: (True, (-1,)),
-    7: (True, (-2, -1)),
-    8: (True, (-2,)),
-}  # EXIF 2.3 tag 0x0112: exchange rows and columns?, then which axes to flip
 
 
-def read_image(path: str | Path, *, upright: bool = False) -> UInt8[Tensor, "C H W"]:
+def read_image(path: str | Path) -> UInt8[Tensor, "C H W"]:
     """Decodes an image to 3 or, with alpha, 4 channels.
 
     Grey becomes RGB, 16 bits are rounded to 8, floating-point files are taken as scene-linear light and get the
-    sRGB curve, premultiplied colours are divided by their alpha. With `upright` the EXIF orientation is applied;
-    by default the raster is as stored, which is what COLMAP, nerfstudio and 3D-GS state their cameras for.
+    sRGB curve, premultiplied colours are divided by their alpha. The raster is as stored, which is what COLMAP,
+    nerfstudio and 3D-GS state their cameras for: EXIF's orientation is not applied (gsx.scenes.orientation).
 
     Raises:
         InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
@@ -50,42 +39,18 @@ def read_image(path: str | Path, *, upright: bool = False) -> UInt8[Tensor, "C H
     pixels, spec = _decode(Path(path))
     told = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
     straight = spec.alpha_channel < 0 or told  # OpenImageIO does not say so of BMP
-    image = _display_bytes(_rgb_or_rgba(pixels, spec, path), straight, path)
-    image = image.permute(2, 0, 1).contiguous()
-    exchange, flips = ORIENTATIONS[_orientation(spec)] if upright else (False, ())
-    return (image.transpose(1, 2) if exchange else image).flip(flips).contiguous()
+    image = _display_bytes(_rgb_or_rgba(pixels), straight, path)
+    return image.permute(2, 0, 1).contiguous()
 
 
-def image_size(path: str | Path, *, upright: bool = False) -> Size:
-    """(width, height) as `read_image` with the same `upright` gives it, from the header alone.
+def image_size(path: str | Path) -> Size:
+    """(width, height) as `read_image` gives it, from the header alone.
 
     Raises:
         InputError: the file is missing or is no image.
     """
-    reader = _open(Path(path))
-    spec = reader.spec()
-    reader.close()
-    swapped = upright and ORIENTATIONS[_orientation(spec)][0]
-    return (spec.height, spec.width) if swapped else (spec.width, spec.height)
-
-
-Lens = tuple[str, str, float, float]
-"""Maker, model, focal length in mm, and that of the same view on 35 mm film; empty or 0 where a file does not tell."""
-
-
-def lens_of(path: str | Path) -> Lens:
-    """What took a photograph, from EXIF alone.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
-    reader = _open(Path(path))
-    spec = reader.spec()
-    reader.close()
-    maker, model = (spec.get_string_attribute(name, "") for name in ("Make", "Model"))
-    lengths = [spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm")]
-    focal, film = (round(length, 3) if 0 < length < math.inf else 0.0 for length in lengths)  # 0/0 is read as nan
-    return maker, model, focal, film
+    spec = header_of(path)
+    return spec.width, spec.height
 
 
 def has_alpha(path: str | Path) -> bool:
@@ -94,10 +59,7 @@ def has_alpha(path: str | Path) -> bool:
     Raises:
         InputError: the file is missing or is no image.
     """
-    reader = _open(Path(path))
-    alpha = reader.spec().alpha_channel
-    reader.close()
-    return alpha >= 0
+    return bool(header_of(path).alpha_channel >= 0)
 
 
 def checked_size(path: str | Path, expected: Size) -> Size:
@@ -111,8 +73,14 @@ def checked_size(path: str | Path, expected: Size) -> Size:
     return size
 
 
-def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
+def write_image(
+    path: str | Path,
+    image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
     """Writes RGB as PNG or JPEG, by suffix, or straight RGBA as PNG; floats are rounded by `to_uint8`.
+
+    `attributes`: more of the file's header, by OpenImageIO's names, EXIF for example.
 
     The file appears whole or not at all.
 
@@ -130,7 +98,7 @@ def write_image(path: str | Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, 
     rounded = image if image.dtype == torch.uint8 else to_uint8(image)
     buffer = oiio.ImageBuf(np.ascontiguousarray(rounded.detach().cpu().permute(1, 2, 0).numpy()))
     buffer.specmod().attribute("Compression", f"jpeg:{JPEG_QUALITY}")
-    for name, value in PNG_EFFORT.items():
+    for name, value in (PNG_EFFORT | dict(attributes or {})).items():
         buffer.specmod().attribute(name, value)
     buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
     try:
@@ -189,8 +157,20 @@ def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, flo
     return ((colour * alpha + behind * (1 - alpha)) * 255).to(torch.uint8)
 
 
-def _open(path: Path) -> Any:
-    """An OpenImageIO reader that leaves straight alpha alone."""
+def header_of(path: str | Path) -> Any:
+    """Return OpenImageIO's description of a file, from its header alone.
+
+    Raises:
+        InputError: the file is missing or is no image.
+    """
+    reader = open_image(Path(path))
+    spec = reader.spec()
+    reader.close()
+    return spec
+
+
+def open_image(path: Path) -> Any:
+    """Return an OpenImageIO reader that leaves straight alpha alone."""
     import OpenImageIO as oiio
 
     if not path.is_file():
@@ -205,21 +185,38 @@ def _open(path: Path) -> Any:
 
 def _decode(path: Path) -> tuple[np.ndarray, Any]:
     """Pixels [H, W, C] in the file's own number type, and OpenImageIO's description of the file."""
-    reader = _open(path)
+    reader = open_image(path)
     spec = reader.spec()
-    pixels = None if _is_cmyk(spec) else reader.read_image(spec.format)
+    refuse_unusable(path, spec)
+    pixels = reader.read_image(spec.format)
     error = reader.geterror()
     reader.close()
+    if pixels is None or error:
+        raise damaged(path, error)
+    return pixels, spec
+
+
+def damaged(path: Path, error: str) -> InputError:
+    """Return the error of a file whose pixels cannot be decoded; `error` is the library's."""
+    if "not configured" in error or "not implemented" in error:  # libtiff, of compressions it was built without
+        return InputError(f"Image '{path}' cannot be decoded here ({in_one_line(error)}), save it as PNG or JPEG.")
+    return InputError(f"Image '{path}' is damaged ({in_one_line(error)}), copy or export it anew.")
+
+
+def refuse_unusable(path: str | Path, spec: Any) -> None:
+    """Raise InputError for a header of inks, of a part of a picture, or of channels beyond grey or RGB and alpha."""
     if _is_cmyk(spec):
         raise InputError(f"Image '{path}' is CMYK, whose colours need a printing profile: convert it to sRGB.")
-    if pixels is None or error:
-        raise InputError(f"Image '{path}' is damaged ({in_one_line(error)}), copy or export it anew.")
     if (spec.width, spec.height) != (spec.full_width, spec.full_height):
         raise InputError(
             f"Image '{path}' stores only a {spec.width} x {spec.height} window of its {spec.full_width} x"
             f" {spec.full_height} pixels, write it whole."
         )
-    return pixels, spec
+    channels = spec.nchannels
+    if channels not in (1, 2, 3, 4) or (channels % 2 == 0 and spec.alpha_channel != channels - 1):
+        raise InputError(
+            f"Image '{path}' has channels {', '.join(spec.channelnames)}, keep only grey or RGB, with or without alpha."
+        )
 
 
 def in_one_line(text: str) -> str:
@@ -232,13 +229,9 @@ def _is_cmyk(spec: Any) -> bool:
     return any(spec.get_string_attribute(name).lower() in ("cmyk", "ycbcrk", "color separated") for name in names)
 
 
-def _rgb_or_rgba(pixels: np.ndarray, spec: Any, path: str | Path) -> np.ndarray:
-    """Grey repeated to three channels; anything but grey or RGB, with or without alpha, is refused."""
+def _rgb_or_rgba(pixels: np.ndarray) -> np.ndarray:
+    """Grey, with or without alpha, repeated to three channels."""
     channels = pixels.shape[2]
-    if channels not in (1, 2, 3, 4) or (channels % 2 == 0 and spec.alpha_channel != channels - 1):
-        raise InputError(
-            f"Image '{path}' has channels {', '.join(spec.channelnames)}, keep only grey or RGB, with or without alpha."
-        )
     return pixels[..., (0, 0, 0, 1)[: channels + 2]] if channels < 3 else pixels
 
 
@@ -257,19 +250,19 @@ def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt
     return to_uint8(torch.cat([display_from_linear(colour) if is_light else colour, alpha], dim=-1))
 
 
-def _orientation(spec: Any) -> int:
-    """EXIF orientation, 1 (as stored) where it is missing or undefined."""
-    value = spec.get_int_attribute("Orientation", 1)
-    return value if value in ORIENTATIONS else 1
-
-
-def refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
-    """One factor of at least 1 must bring both expected sides to within a pixel of the file's."""
+def is_reduction(size: Size, expected: Size) -> bool:
+    """Return whether one factor of at least 1 brings both expected sides to within a pixel of the file's."""
     (width, height), (model_width, model_height) = size, expected
     least = max(model_width / (width + 1), model_height / (height + 1))
     most = min(model_width / max(width - 1, 1e-9), model_height / max(height - 1, 1e-9))
-    if not max(least, 1) <= most:
+    return max(least, 1) <= most
+
+
+def refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
+    """Raise InputError unless `is_reduction`."""
+    (width, height), (model_width, model_height) = size, expected
+    if not is_reduction(size, expected):
         raise InputError(
             f"Image '{path}' is {width} x {height} and the camera model says {model_width} x {model_height}: use the"
-            " images the cameras were computed from, as stored (a rotation kept in EXIF is not applied)."
+            " images the cameras were computed from."
         )

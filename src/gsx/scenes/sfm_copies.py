@@ -1,0 +1,105 @@
+"""Copies of photos that COLMAP would read otherwise than gsx does, for structure from motion.
+
+COLMAP's wheel decodes no WebP, takes some compressions of TIFF for black pictures, and floating-point pictures as they
+are stored. Mirrored photos (EXIF) match none of the others and have no rigid camera: their copies are not mirrored.
+"""
+
+import logging
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gsx.core.data.images import header_of, open_image, read_image, write_image
+from gsx.core.shapes import UInt8
+from gsx.scenes.orientation import oriented
+
+logger = logging.getLogger(__name__)
+
+SAME = ("jpeg", "png", "bmp")
+"""Formats, by OpenImageIO's names, that both decode to the same pixels (a test compares them)."""
+TOLERANCE = 2.0
+"""Mean difference of 8-bit values up to which a decoded photo is the same: JPEG decoders round differently."""
+KEPT = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
+"""What COLMAP derives focal lengths and shared cameras from."""
+
+
+def candidates(folder: Path, first: Mapping[str, int]) -> dict[str, int]:
+    """Return the photos that may need a copy, with the orientation to apply to it, by their headers.
+
+    `first`: the orientation that brings each stored photo into the raster of its camera.
+    """
+    return {name: turn for name, turn in first.items() if turn != 1 or format_of(folder / name) not in SAME}
+
+
+def format_of(photo: Path) -> str:
+    """Return OpenImageIO's name of a file's format, by its content."""
+    reader = open_image(photo)
+    name = str(reader.format_name())
+    reader.close()
+    return name
+
+
+def prepared(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], work: Path) -> Path:
+    """Return the folder for COLMAP: `folder`, or one below `work` with links to its photos and with copies of some.
+
+    Copies have the names of their photos, whatever their suffix says: COLMAP recognises formats by content.
+
+    Raises:
+        InputError: a photo is damaged, or a copy cannot be written.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        needed = list(pool.map(lambda name: doubtful[name] != 1 or not reads_alike(folder / name), doubtful))
+        copies = [name for name, need in zip(doubtful, needed, strict=True) if need]
+        if not copies:
+            return folder
+        logger.info("sfm: %d of %d photos are converted for COLMAP", len(copies), len(names))
+        target = work / "photos"
+        for name in {*names} - {*copies}:
+            link(folder / name, target / name)
+        list(pool.map(lambda name: copy(folder / name, target / name, doubtful[name]), copies))
+    return target
+
+
+def reads_alike(photo: Path) -> bool:
+    """Return whether COLMAP decodes a photo to the colours that gsx trains on."""
+    import pycolmap
+
+    bitmap = pycolmap.Bitmap.read(photo, True)
+    if bitmap is None:
+        return False
+    here, there = read_image(photo)[:3].permute(1, 2, 0).numpy(), bitmap.to_array()
+    return here.shape == there.shape and bool(np.abs(here.astype(np.int16) - there).mean() <= TOLERANCE)
+
+
+def link(photo: Path, place: Path) -> None:
+    """Make a file available at another place, as a link where the system allows one."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.symlink_to(photo.resolve())
+    except OSError:  # Windows without the privilege
+        shutil.copyfile(photo, place)
+
+
+def copy(photo: Path, place: Path, orientation: int) -> None:
+    """Write the colours of a photo as PNG of 8 bits, turned by an EXIF orientation, with its lens's EXIF."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    written = place.with_name(f"{place.name}.png")
+    write_image(written, colours_of(photo, orientation), lens_attributes(photo))
+    os.replace(written, place)
+
+
+def colours_of(photo: Path, orientation: int) -> UInt8[Tensor, "3 h w"]:
+    """Return the decoded photo without alpha, turned."""
+    return oriented(read_image(photo)[:3], orientation)
+
+
+def lens_attributes(photo: Path) -> dict[str, Any]:
+    """Return those of `KEPT` that a photo states."""
+    values = ((name, header_of(photo).getattribute(name)) for name in KEPT)
+    return {name: value for name, value in values if value is not None}
