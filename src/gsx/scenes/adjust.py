@@ -59,8 +59,9 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
     key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
     after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [
+        *([model.conflict] if model.conflict else []),
         f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_told(before)}, then "
-        f"{fit_told(shift_of(after))}{unmeasured(after)}{lenses_told(model, after)}."
+        f"{fit_told(shift_of(after))}{unmeasured(after)}{lenses_told(model, after)}.",
     ]
 
 
@@ -157,7 +158,7 @@ def bundle_adjusted(folder: Path) -> Any:
     Raises:
         InputError: nothing could be solved.
     """
-    found, _ = reconstruction_of(folder)
+    found, *_ = reconstruction_of(folder)
     if not found.num_points3D():
         raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
     logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())

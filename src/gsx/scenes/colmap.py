@@ -188,7 +188,7 @@ def _misses(model: Model, median: float, limit: float, rest: Unmeasured) -> str:
     return (
         f"The cameras of {model.folder} {missed} (median; the limit is scene.max_reprojection_px={limit:g}{rest}): "
         "poses, intrinsics or files of different reconstructions are mixed. Where they are only inexact, "
-        "scene.adjust=auto finds them anew from these observations."
+        f"scene.adjust=auto finds them anew from these observations.{model.conflict and ' '}{model.conflict}"
     )
 
 

@@ -25,6 +25,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import refuse_lfs_pointer
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_folders import model_files
+from gsx.scenes.colmap_poses import pose_conflict, text_conflict, unmatched
 from gsx.scenes.colmap_records import U64, check_binary, contradiction
 from gsx.scenes.colmap_text import write_as_binary
 from gsx.scenes.points import read_points
@@ -61,6 +62,8 @@ class Model:
     mean_error: float
     """Mean reprojection error of the points that state a finite one, in pixels; NaN: none does."""
     notes: list[str]
+    conflict: str = ""
+    """A note where its files contradict each other about poses; also among `notes`."""
 
 
 def read_model(folder: Path) -> Model:
@@ -70,7 +73,7 @@ def read_model(folder: Path) -> Model:
         InputError: a file is missing, truncated or corrupt, a camera model is unknown, or there are no points.
     """
     file = model_files(folder)["points3D"]
-    reconstruction, notes = reconstruction_of(folder)
+    reconstruction, notes, conflict = reconstruction_of(folder)
     read = _points_of_ply if file.suffix.lower() == ".ply" else _points
     points, positions, point_notes = read(reconstruction, file)
     mean_error, error_notes = stated_error(reconstruction)
@@ -80,7 +83,8 @@ def read_model(folder: Path) -> Model:
         images=_images(reconstruction, positions, file),
         points=points,
         mean_error=mean_error,
-        notes=[*notes, *point_notes, *error_notes],
+        notes=[*notes, *([conflict] if conflict else []), *point_notes, *error_notes],
+        conflict=conflict,
     )
 
 
@@ -149,8 +153,10 @@ def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
         yield folder, notes
 
 
-def reconstruction_of(folder: Path) -> tuple[Any, list[str]]:
-    """Return the pycolmap.Reconstruction of a model folder, and notes on what its text states.
+def reconstruction_of(folder: Path) -> tuple[Any, list[str], str]:
+    """Return the pycolmap.Reconstruction of a model folder, notes on what its text states, and a note on poses.
+
+    The last says where files contradict each other about poses, and is empty otherwise.
 
     Raises:
         InputError: a file is missing, truncated or corrupt, or files contradict each other.
@@ -164,12 +170,21 @@ def reconstruction_of(folder: Path) -> tuple[Any, list[str]]:
             check_binary(name, file)
     with binary_model(files) as (binary, notes):
         try:
-            return pycolmap.Reconstruction(binary), notes
+            found = pycolmap.Reconstruction(binary)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
             raise InputError(
                 f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in files.values())}): "
-                f"{contradiction(binary) or plain(problem)}; copy or make the model again."
+                f"{contradiction(binary) or unmatched(binary) or plain(problem)}; {remedy_of(files)}."
             ) from None
+        return found, notes, pose_conflict(binary, files, found) or text_conflict(files, found)
+
+
+def remedy_of(files: Mapping[str, Path]) -> str:
+    """Return what to do about a model that cannot be read."""
+    if "frames" not in files:
+        return "copy or make the model again"
+    poses, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
+    return f"copy or make the model again, or remove {frames} and {rigs} to use the poses in {poses}"
 
 
 def plain(problem: Exception) -> str:

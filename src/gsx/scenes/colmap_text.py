@@ -7,6 +7,7 @@ to the end of the line, as COLMAP writes them, and an error names its line.
 import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 
@@ -96,6 +97,14 @@ def stated_count(file: Path) -> int | None:
 def count_text_images(file: Path) -> int:
     """The number of images in an images.txt, which may be damaged."""
     return sum(1 for _ in _image_lines(Lines(file, errors="replace")))
+
+
+def text_poses(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield (name, quaternion w, x, y, z and translation) of each image of an images.txt; damaged lines are skipped."""
+    for header, _ in _image_lines(Lines(file, errors="replace")):
+        *numbers, name = _header_words(header)
+        with suppress(ValueError):
+            yield name, _floats(numbers[1:8])
 
 
 # -- records -----------------------------------------------------------------------------------------------------------
