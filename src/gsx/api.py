@@ -43,6 +43,7 @@ from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table
 from gsx.formats.splat_files import read_gaussians
+from gsx.formats.suffixes import splat_file_at
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
 
@@ -186,13 +187,15 @@ def train(*given: str, **values: Any) -> TrainedRun:
 
 
 def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
-    """A run folder, or a splat file of any kind that is written; raster: what that is drawn by, if not as it says.
+    """Open a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
+
+    raster: the rules by which a splat file is drawn, in place of those that it states.
 
     Raises:
         InputError: it is neither, or damaged; or `raster` is given for a run, which has its own.
         CheckpointError: the run has no usable checkpoint.
     """
-    path = at_home(path)
+    path = splat_file_at(at_home(path))
     if path.is_dir():
         if raster is not None:
             raise InputError(f"{path} is a run, drawn as it was trained: raster is for splat files")

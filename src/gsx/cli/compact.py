@@ -8,6 +8,7 @@ from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_ta
 from gsx.core.collector import loading
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
+from gsx.formats.suffixes import META, READABLE, splat_file_at
 
 
 def verb_compact(arguments: list[str]) -> int:
@@ -19,7 +20,7 @@ def verb_compact(arguments: list[str]) -> int:
         "not need go, the rest learns on for a while. A run folder comes out, with splat files and a page that shows "
         "both. FILE: of any program, with the scene that judges it (scene=colmap scene.path=FOLDER).",
     )
-    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder or splat file")
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help=f"run folder, or splat file: {READABLE}")
     parser.add_overrides("values in place of the run's own")
     parser.add_argument(
         "--max-drop-db",
@@ -38,8 +39,14 @@ def verb_compact(arguments: list[str]) -> int:
     with loading():
         from gsx.experiments.compact.compact import compact
 
-    target = given.target.resolve()
-    to = given.to or target.with_name(f"{target.name.split('.')[0] if target.is_file() else target.name}_compact")
-    page = compact(given.target, to, given.max_drop_db, given.steps, given.overrides, plugins())
+    file = splat_file_at(given.target)
+    to = given.to or beside(file.resolve())
+    page = compact(file, to, given.max_drop_db, given.steps, given.overrides, plugins())
     sys.stdout.write(f"{page}\n")
     return 0
+
+
+def beside(target: Path) -> Path:
+    """Return the new folder next to a run or a splat file, named after it."""
+    place = target.parent if target.name.lower() == META else target
+    return place.with_name(f"{place.name.split('.')[0] if place.is_file() else place.name}_compact")

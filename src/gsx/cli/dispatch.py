@@ -34,7 +34,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade training [K=V ...]  what fewer primitives, steps, bands ... cost: --budget-mb 20, --target-seconds 300
-  gsx trade rasterizer RUN  which settings draw a model (RUN, FILE.ply, or none) fastest within an error
+  gsx trade rasterizer RUN  which settings draw a model (RUN, FILE, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
   gsx explain KEY           a key or group of the configuration: value, range, comment, and the file that sets it

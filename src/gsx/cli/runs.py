@@ -13,7 +13,7 @@ from gsx.core.collector import loading
 from gsx.core.errors import InputError
 from gsx.core.ranges import Range
 from gsx.experiments.runs.job import train
-from gsx.formats.suffixes import suffix_of
+from gsx.formats.suffixes import READABLE, WRITTEN, splat_file_at, suffix_of
 
 logger = logging.getLogger("gsx.cli")
 
@@ -25,11 +25,13 @@ def verb_eval(arguments: list[str]) -> int:
     """gsx eval RUN|FILE [KEY=VALUE ...]"""
     told = (
         "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it; or a splat "
-        "file of any program on a scene, in a run folder of its own: gsx eval FILE scene=colmap scene.path=FOLDER"
+        "file of any program on a scene, in a run folder of its own: gsx eval FILE scene=colmap scene.path=FOLDER. "
+        f"FILE: {READABLE}"
     )
     folder, overrides = run_arguments("eval", arguments, told)
-    if suffix_of(folder) and not folder.is_dir():
-        return evaluate_file(folder, overrides)
+    file = splat_file_at(folder)
+    if suffix_of(file) and not file.is_dir():
+        return evaluate_file(file, overrides)
     with loading():
         from gsx.experiments.runs.again import evaluate_again
 
@@ -75,7 +77,8 @@ def verb_photographs(arguments: list[str]) -> int:
 def verb_render(arguments: list[str]) -> int:
     """gsx render RUN|FILE [--orbit FILE | --path CAMERAS.json [--movie FILE]] ..."""
     parser = Parser(prog="gsx render", description="Render test views, an orbit as an animation, or a camera path.")
-    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder, or splat file (with --path)")
+    kinds = f"run folder, or, with --path, a splat file: {READABLE}"
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help=kinds)
     parser.add_argument("--orbit", type=Path, metavar="FILE", help="animate a closed orbit: .gif, .webp or .mp4")
     parser.add_argument("--frames", type=int, default=60, help="frames of the orbit (60)")
     parser.add_argument("--fps", type=positive(float), default=20, help="frames per second of the orbit (20)")
@@ -112,11 +115,12 @@ def rendered(given: argparse.Namespace) -> Path:
         from gsx.experiments.viewer.camera_path import read_camera_path
 
     way = read_camera_path(given.path) if given.path else None
-    if given.target.is_file():
+    file = splat_file_at(given.target)
+    if file.is_file():
         if way is None:
             raise InputError(f"gsx render {given.target}: a splat file has no views; give cameras with --path JSON")
-        to = given.movie or given.to or given.target.parent / "path"
-        return render_path(way, file_pictures(given.target), to, bool(given.movie), given.zoom)
+        to = given.movie or given.to or file.parent / "path"
+        return render_path(way, file_pictures(file), to, bool(given.movie), given.zoom)
     run, settings = open_run(given.target, plugins())
     remove_partial(given.target / "renders")
     if way is not None:
@@ -133,7 +137,8 @@ def rendered(given: argparse.Namespace) -> Path:
 def verb_view(arguments: list[str]) -> int:
     """gsx view RUN|FILE [--host ADDRESS] [--port N]"""
     parser = Parser(prog="gsx view", description="Look around in a model with a browser, until Ctrl-C.")
-    parser.add_argument("target", type=Path, metavar="RUN|FILE", help="run folder, also of a run under way; splat file")
+    kinds = f"run folder, also of a run under way; splat file: {READABLE}"
+    parser.add_argument("target", type=Path, metavar="RUN|FILE", help=kinds)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     parser.add_argument("--port", type=whole, default=8080, help="port (8080); 0: any that is free")
     given = parser.parse_args(arguments)
@@ -148,23 +153,24 @@ def verb_view(arguments: list[str]) -> int:
         sys.stdout.flush()
 
     try:
-        if given.target.is_dir():
-            view_run(given.target, plugins(), given.host, given.port, announce)
+        file = splat_file_at(given.target)
+        if file.is_dir():
+            view_run(file, plugins(), given.host, given.port, announce)
         else:
-            view_file(given.target, given.host, given.port, announce)
+            view_file(file, given.host, given.port, announce)
     except KeyboardInterrupt:
         return 0
     return 0
 
 
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN [FILE] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
+    """gsx export RUN|FILE [FILE] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
     told = (
-        "Write a splat file, read back and compared; its suffix says which: .ply, .compressed.ply, .spz, .sog, .glb; "
-        "or .html, one page with a viewer in it that opens from disk."
+        f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
+        "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
     )
     parser = Parser(prog="gsx export", description=told)
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    parser.add_argument("run", type=Path, metavar="RUN|FILE", help=f"run folder, or splat file: {READABLE}")
     parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     parser.add_argument(
@@ -193,6 +199,10 @@ def verb_export(arguments: list[str]) -> int:
         raise InputError(f"gsx export: --axes {given.axes} is of .spz files: give one, for example model.spz")
     if given.view and given.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
+    source = splat_file_at(given.run)
+    if suffix_of(source) and not source.is_dir():
+        sys.stdout.write(f"{converted(source, given)}\n")
+        return 0
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
@@ -207,3 +217,20 @@ def verb_export(arguments: list[str]) -> int:
         write_report(given.run)  # it links to its pages
     sys.stdout.write(f"{path}\n")
     return 0
+
+
+def converted(source: Path, given: argparse.Namespace) -> Path:
+    """Write the splats of a file as a file of another kind; return that.
+
+    Raises:
+        InputError: it names no file to write, an option is for runs alone, or the file cannot be read or written.
+    """
+    from gsx.experiments.runs.convert import convert
+
+    if given.file is None:
+        raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")
+    if given.view or given.bake:
+        raise InputError(f"gsx export: --view and --bake are for runs, and {source} is a splat file: leave them out")
+    convert(source, given.file, given.axes)
+    file: Path = given.file
+    return file

@@ -21,12 +21,13 @@ from gsx.cli.arguments import (
 from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.ranges import Range
+from gsx.formats.suffixes import READABLE, splat_file_at
 
 logger = logging.getLogger("gsx.cli")
 
 MOST_VIEWS = 100
 """Pictures that settings of the rasterizer are measured on: a float64 truth of each is made first."""
-USAGE = "gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] or gsx trade training [KEY=VALUE ...]"
+USAGE = "gsx trade rasterizer [RUN or FILE] [KEY=VALUE ...] or gsx trade training [KEY=VALUE ...]"
 
 
 def trade_arguments(arguments: list[str]) -> argparse.Namespace:
@@ -37,9 +38,10 @@ def trade_arguments(arguments: list[str]) -> argparse.Namespace:
     """
     parser = Parser(
         prog="gsx trade rasterizer",
-        usage="%(prog)s [RUN or FILE.ply] [KEY=VALUE ...] [options]",
+        usage="%(prog)s [RUN or FILE] [KEY=VALUE ...] [options]",
         description="Try the rasterizer's settings on a model: time each, compare with a float64 truth, recommend "
-        "some. Without a model the built-in scene stands in; KEY=VALUE changes the settings to start from.",
+        "some. Without a model the built-in scene stands in; KEY=VALUE changes the settings to start from. FILE: "
+        f"{READABLE}.",
     )
     parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
     add = parser.add_argument
@@ -60,7 +62,7 @@ def trade_arguments(arguments: list[str]) -> argparse.Namespace:
     given.overrides = [word for word in given.words if word not in targets]
     if len(targets) > 1:
         raise InputError(f"gsx trade rasterizer takes one run or one splat file, got {' and '.join(targets)}")
-    given.target = Path(targets[0]) if targets else None
+    given.target = splat_file_at(Path(targets[0])) if targets else None
     return given
 
 
@@ -95,7 +97,7 @@ def training_arguments(arguments: list[str]) -> argparse.Namespace:
 
 
 def verb_trade(arguments: list[str]) -> int:
-    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..., gsx trade training [KEY=VALUE ...] ..."""
+    """gsx trade rasterizer [RUN or FILE] [KEY=VALUE ...] ..., gsx trade training [KEY=VALUE ...] ..."""
     verbs = {"rasterizer": trade_rasterizer, "training": trade_training}
     if arguments[:1] in (["--help"], ["-h"]):
         both = "rasterizer: how fast against how exact. training: what it costs against what it brings."
@@ -145,7 +147,7 @@ def trade_training(arguments: list[str]) -> int:
 
 
 def trade_rasterizer(arguments: list[str]) -> int:
-    """gsx trade rasterizer [RUN or FILE.ply] [KEY=VALUE ...] ..."""
+    """gsx trade rasterizer [RUN or FILE] [KEY=VALUE ...] ..."""
     given = trade_arguments(arguments)
     with loading():
         from gsx.experiments.trade.rasterizer.advice import advice_lines, table

@@ -44,17 +44,21 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
         bad = int((~np.isfinite(value)).sum())
         if bad:
             raise InputError(f"no splat file is written: {bad} of {value.size} values of '{name}' are not finite")
-    quats = raw["quats"]
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0])
     return Arrays(
         means=raw["means"],
         log_scales=raw["log_scales"],
-        quats=unit,
+        quats=unit_quaternions(raw["quats"]),
         opacities=1 / (1 + np.exp(-raw["opacity_logits"].clip(-700, 700))),
         sh_dc=raw["sh_dc"],
         sh_rest=raw["sh_rest"],
     )
+
+
+def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Return quaternions (w, x, y, z) of length 1; one of length 0 becomes the identity."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # infinite ones become nan
+        return np.where(norms == 0, [1.0, 0.0, 0.0, 0.0], quats / np.where(norms == 0, 1, norms))
 
 
 def gaussians_from(arrays: Arrays) -> Gaussians:

@@ -7,8 +7,8 @@ from gsx.formats.suffixes import STANDARD, suffix_of
 
 MOST_HEADER = 1 << 16
 """Bytes within which the header of a splat file ends."""
-FIRST_BYTES = {b"glTF": ".glb", b"PK\x03\x04": ".sog", b"\x1f\x8b": ".spz", b"NGSP": ".spz"}
-"""First bytes of each format but PLY."""
+FIRST_BYTES = {b"glTF": ".glb", b"PK\x03\x04": ".sog", b"\x1f\x8b\x08": ".spz", b"NGSP": ".spz"}
+"""First bytes of each format that has some of its own, but for PLY; three of gzip, as a `.splat` may begin with two."""
 PACKED_PROPERTY = b" packed_position"
 """A property that only compressed PLY has."""
 

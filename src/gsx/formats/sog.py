@@ -1,14 +1,13 @@
 """SOG, version 2: a ZIP of lossless WebP pictures and meta.json, of PlayCanvas (playcanvas/splat-transform, MIT).
 
-A pixel is a splat in every picture. Axes are those of training worlds, as splat-transform writes them. WebP is written
-and read by Pillow (`gsx[sog]`).
+A pixel is a splat in every picture. Axes are those of training worlds, as splat-transform writes them. Pillow writes
+WebP (`gsx[sog]`). `sog_reading` reads both versions.
 """
 
 import io
 import json
 import math
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from gsx.core.errors import InputError
 from gsx.core.packages import require
 from gsx.core.shapes import Float, Int, UInt8
-from gsx.formats.arrays import Arrays, from_smallest_three, smallest_three
+from gsx.formats.arrays import Arrays, rounded, smallest_three
 from gsx.formats.clusters import nearest_number, number_book, vector_book
 from gsx.formats.compressed_ply import morton_order
 
@@ -27,7 +26,6 @@ PALETTE = 64
 """Vectors of higher bands in a row of their picture; and at most so many times 1024 in all."""
 FIRST_LARGEST = 252
 """Alpha of quaternions whose first component is the largest."""
-MOST_SPLATS = 1 << 26
 HIGHER = ("shN_centroids.webp", "shN_labels.webp")
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
@@ -62,7 +60,7 @@ def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
         "scales.webp": raster(with_alpha(nearest_number(arrays.log_scales[order], scales))),
         "quats.webp": raster(quaternion_bytes(arrays.quats[order])),
         "sh0.webp": raster(
-            with_alpha(nearest_number(arrays.sh_dc[order], constants), np.trunc(255 * arrays.opacities[order]))
+            with_alpha(nearest_number(arrays.sh_dc[order], constants), rounded(255 * arrays.opacities[order]))
         ),
     }
     if arrays.sh_rest.shape[1]:
@@ -81,13 +79,13 @@ def mean_words(
 ) -> Int[np.ndarray, "N 3"]:
     """Logarithms of positions in 16 bits."""
     span = np.where(most > least, most - least, 1.0)
-    return np.trunc(65535 * ((logs - least) / span)).clip(0, 65535).astype(np.int64)
+    return rounded(65535 * ((logs - least) / span)).clip(0, 65535).astype(np.int64)
 
 
 def quaternion_bytes(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
     """The three smallest of (w, x, y, z), and in alpha which is the largest."""
     largest, three = smallest_three(quats)
-    return with_alpha(np.trunc(255 * (three * 0.5**0.5 + 0.5)).clip(0, 255), FIRST_LARGEST + largest)
+    return with_alpha(rounded(255 * (three * 0.5**0.5 + 0.5)).clip(0, 255), FIRST_LARGEST + largest)
 
 
 def with_alpha(
@@ -137,92 +135,3 @@ def zipped(meta: dict[str, Any], pictures: dict[str, UInt8[np.ndarray, "H W 4"]]
             Image.fromarray(pixels).save(packed, "WEBP", lossless=True, exact=True)
             archive.writestr(zipfile.ZipInfo(name), packed.getvalue())
     return whole.getvalue()
-
-
-def decode_sog(content: bytes) -> Arrays:
-    """Splats of a file.
-
-    Raises:
-        InputError: it is damaged, or of another version.
-        ConfigError: Pillow is not installed.
-    """
-    require("a .sog file", ("PIL",), "gsx[sog]")
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            return arrays_in(archive)
-    except InputError:
-        raise
-    except Exception as error:  # of zip, JSON, WebP and numbers: all say that it is damaged
-        raise InputError(f"it is no whole SOG ({type(error).__name__}): export it anew") from None
-
-
-def sog_is_antialiased(path: Path) -> bool:
-    """Whether meta.json says that opacities are compensated; False for what is no SOG."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return bool(json.loads(archive.read("meta.json"))["model"] == "antialiased")
-    except Exception:  # what is wrong with it is told by who reads it
-        return False
-
-
-def arrays_in(archive: zipfile.ZipFile) -> Arrays:
-    """Splats of an archive; whatever is wrong with it raises."""
-    meta = json.loads(archive.read("meta.json"))
-    count = meta.get("count")
-    if meta.get("version") != VERSION or not isinstance(count, int) or not 0 < count <= MOST_SPLATS:
-        raise InputError(f"it is no SOG of version {VERSION} with splats: export it anew")
-
-    def pixels(part: str, number: int = 0) -> UInt8[np.ndarray, "N 4"]:
-        return picture(archive, meta[part]["files"][number]).reshape(-1, 4)[:count]
-
-    def looked_up(part: str, indices: UInt8[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        return np.array(meta[part]["codebook"], float)[indices]
-
-    low, high = (pixels("means", number)[:, :3].astype(np.int64) for number in (0, 1))
-    least, most = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
-    logs = least + (high << 8 | low) / 65535 * (most - least)
-    quats, sh0 = pixels("quats"), pixels("sh0")
-    largest = quats[:, 3].astype(np.int64) - FIRST_LARGEST
-    three = np.where(largest[:, None] < 0, 0.0, (quats[:, :3] / 255 - 0.5) * 2**0.5)
-    return checked(
-        Arrays(
-            means=np.sign(logs) * np.expm1(np.abs(logs)),
-            log_scales=looked_up("scales", pixels("scales")[:, :3]),
-            quats=from_smallest_three(largest.clip(0), three),
-            opacities=sh0[:, 3] / 255,
-            sh_dc=looked_up("sh0", sh0[:, :3]),
-            sh_rest=rest_of(archive, meta.get("shN"), count),
-        ),
-        count,
-    )
-
-
-def rest_of(archive: zipfile.ZipFile, entry: dict[str, Any] | None, count: int) -> Float[np.ndarray, "N B 3"]:
-    """Coefficients beside the constant one; none where there is no entry."""
-    if entry is None:
-        return np.zeros((count, 0, 3))
-    coefficients = COEFFICIENTS[entry["bands"]]
-    centroids, labels = (picture(archive, name) for name in entry["files"])
-    palette = centroids[:, : PALETTE * coefficients, :3].reshape(-1, coefficients, 3)
-    numbers = labels.reshape(-1, 4)[:count].astype(np.int64)
-    return np.array(entry["codebook"], float)[palette[numbers[:, 0] | numbers[:, 1] << 8]]
-
-
-def checked(arrays: Arrays, count: int) -> Arrays:
-    """Splats, of which there are as many as told and all finite.
-
-    Raises:
-        InputError: they are not.
-    """
-    values = list(vars(arrays).values())
-    if any(len(value) != count or not np.isfinite(value).all() for value in values):
-        raise InputError("its pictures or code books are not those of its splats: export it anew")
-    return arrays
-
-
-def picture(archive: zipfile.ZipFile, name: str) -> UInt8[np.ndarray, "H W 4"]:
-    """One picture."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(archive.read(name)), formats=["WEBP"]) as shown:
-        return np.asarray(shown.convert("RGBA"))

@@ -15,13 +15,19 @@ from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.formats.detect import MOST_HEADER, format_of
 from gsx.formats.glb import decode_glb, encode_glb
+from gsx.formats.ksplat import decode_ksplat
 from gsx.formats.ply import HEADER_END, write_ply, write_whole
-from gsx.formats.sog import decode_sog, encode_sog, sog_is_antialiased
+from gsx.formats.sog import encode_sog
+from gsx.formats.sog_reading import decode_sog, sog_is_antialiased
+from gsx.formats.splat import decode_splat
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
-from gsx.formats.standard_ply import decode_standard_ply
-from gsx.formats.suffixes import STANDARD, suffix_of
+from gsx.formats.standard_ply import decode_standard_ply, finite_rows
+from gsx.formats.suffixes import STANDARD, splat_file_at, suffix_of
 
 logger = logging.getLogger(__name__)
+
+DECODERS = {".compressed.ply": decode_compressed_ply, ".splat": decode_splat, ".ksplat": decode_ksplat}
+"""Those that need nothing but a file's content."""
 
 MODE_WORDS = ("splatrendermode:", "antialiased")
 """First words of the comments that say how a file is to be drawn."""
@@ -86,6 +92,7 @@ def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
     Raises:
         InputError: it is damaged, or lacks a property.
     """
+    path = splat_file_at(path)
     try:
         content = path.read_bytes()
         kind = format_of(content[:MOST_HEADER], path)
@@ -108,18 +115,23 @@ def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
         return gaussians_from(decode_spz(content, axes))
     if kind == ".glb":
         return gaussians_from(decode_glb(content, name, Path(name).parent))
-    return gaussians_from({".sog": decode_sog, ".compressed.ply": decode_compressed_ply}[kind](content))
+    if kind == ".sog":
+        return gaussians_from(decode_sog(content, Path(name)))
+    with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out
+        gaussians = gaussians_from(DECODERS[kind](content))
+    return Gaussians(**finite_rows(vars(gaussians), name))
 
 
 def compensated(path: Path) -> bool:
     """Whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
 
-    SPZ has a flag for it, SOG an entry; PLY a comment, `SplatRenderMode: mip` (Brush, SuperSplat) or `antialiased 1`
-    (Postshot), of which the last counts.
+    SPZ has a flag for it, SOG an entry (`sog_is_antialiased`); PLY a comment, `SplatRenderMode: mip` (Brush,
+    SuperSplat) or `antialiased 1` (Postshot), of which the last counts. `.splat` and `.ksplat` do not say.
 
     Raises:
         InputError: it cannot be read.
     """
+    path = splat_file_at(path)
     try:
         with path.open("rb") as file:
             head = file.read(MOST_HEADER)
@@ -132,6 +144,8 @@ def compensated(path: Path) -> bool:
         return sog_is_antialiased(path)
     if kind == ".glb":
         return b"SplatRenderMode: mip" in head  # a comment of ours
+    if kind in (".splat", ".ksplat"):
+        return False
     lines = head.partition(HEADER_END)[0].decode("latin-1").lower().splitlines()
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
     told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from gsx.core.options import label, without_effect
 from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Share, Steps
-from gsx.formats.suffixes import SUFFIXES, suffix_of
+from gsx.formats.suffixes import READABLE, suffix_of
 
 BEGINNINGS = ("scratch", "warm_start")
 """Values of `init` that are no file; both train the same."""
@@ -55,8 +55,7 @@ class GeneralOptions:
     def __post_init__(self) -> None:
         file = splat_file(self.init)
         if file is not None and not suffix_of(file):
-            kinds = ", ".join(SUFFIXES)
-            raise ValueError(f"init is '{self.init}'; choose scratch, warm_start, or a splat file ({kinds})")
+            raise ValueError(f"init is '{self.init}'; choose scratch, warm_start, or a splat file ({READABLE})")
         if self.iterations < 1 and file is None:
             raise ValueError("iterations is 0; give 1 or more steps, or init=FILE, a splat file to evaluate as it is")
         if self.reuse and self.folder:

@@ -29,7 +29,7 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.renamed import RENAMED, renamed
-from gsx.formats.suffixes import suffix_of
+from gsx.formats.suffixes import splat_file_at, suffix_of
 
 COMPONENT_KINDS = ("scene", "backbone")
 """Groups whose node names a registered component."""
@@ -130,8 +130,8 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
             raise ConfigError(f"{key} is '{text}'; a run's configuration holds no ${{...}}: name it otherwise")
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):  # a run folder must open from anywhere
         raw["scene"]["path"] = str(at_home(str(raw["scene"]["path"])).resolve())
-    if (file := splat_file(raw.get("init"))) is not None and suffix_of(file):
-        raw["init"] = str(at_home(file).resolve())
+    if (named := splat_file(raw.get("init"))) is not None and suffix_of(file := splat_file_at(at_home(named))):
+        raw["init"] = str(file.resolve())
     values = {key: value for key, value in raw.items() if key != "experiment"}
     checks = {r: typed(Checks, n, f"checks.{r}") for r, n in named_nodes(values.pop("checks", None), "checks").items()}
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)

@@ -24,7 +24,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 from gsx.formats.splat_files import read_gaussians
-from gsx.formats.suffixes import SUFFIXES, suffix_of
+from gsx.formats.suffixes import READABLE, suffix_of
 
 FILE_SIZE = (640, 480)
 """Raster of the views of a splat file, px."""
@@ -75,8 +75,9 @@ def open_subject(target: Path | None, overrides: Sequence[str], views: int, plug
             f"'{target}' does not exist: give a run folder, a splat file, or nothing for the built-in scene"
         )
     if not suffix_of(target):
-        kinds = ", ".join(SUFFIXES)
-        raise InputError(f"'{target}' is neither a run folder nor a splat file ({kinds}): `gsx export RUN` writes one")
+        raise InputError(
+            f"'{target}' is neither a run folder nor a splat file ({READABLE}): `gsx export RUN` writes one"
+        )
     return subject_of_file(target, overrides, views, plugins)
 
 

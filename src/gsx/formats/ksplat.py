@@ -1,0 +1,234 @@
+"""`.ksplat`, version 0.1 (mkkellogg/GaussianSplats3D, MIT): a header, headers of sections, and the sections.
+
+A section has the sizes of its partly filled buckets, the centres of all buckets, and its splats. Compression level 0
+holds floats. Levels 1 and 2 hold positions in 16 bits around the centre of a bucket; scales and quaternions, which
+begin with w, as halves. Coefficients of higher bands are halves in level 1, bytes in level 2. Axes are those of
+training worlds.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsx.core.errors import InputError
+from gsx.core.shapes import Float, Int
+from gsx.formats.arrays import Arrays, unit_quaternions
+from gsx.formats.splat import constants_of, log_scales_of
+
+HEADER_BYTES, SECTION_BYTES = 4096, 1024
+HEADER = struct.Struct("<BB2xIIIIHxx3fff")
+"""Version, most sections, sections, most splats, splats, level, centre of the scene, range of coefficients in bytes."""
+SECTION = struct.Struct("<IIIIfHxxIIIIH")
+"""Splats, most splats, bucket size, buckets, side of a bucket's block, bytes of a bucket, range, bytes, full buckets,
+partly filled ones, degree."""
+MAJOR, LEAST_MINOR = 0, 1
+CENTRE_BYTES = 12
+"""Of a bucket."""
+HALF_RANGE = 32767
+"""Steps from a bucket's centre to its side, where a section states none."""
+COEFFICIENT_RANGE = 1.5
+"""Largest coefficient in bytes, where the header states none."""
+BANDS = {0: (), 1: (3,), 2: (3, 5), 3: (3, 5, 7)}
+"""Coefficients of each band, by degree."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Types in which a level of compression holds its values."""
+
+    mean: str
+    value: str
+    """Of scales and quaternions."""
+    coefficient: str
+
+    def row(self, coefficients: int) -> np.dtype:
+        """Return the type of a splat's row; coefficients: beside the constant ones, of all colours."""
+        parts = [("mean", self.mean, 3), ("scale", self.value, 3), ("quat", self.value, 4), ("colour", "u1", 4)]
+        return np.dtype([*parts, ("rest", self.coefficient, coefficients)])
+
+
+LEVELS = (
+    Level(mean="<f4", value="<f4", coefficient="<f4"),
+    Level(mean="<u2", value="<f2", coefficient="<f2"),
+    Level(mean="<u2", value="<f2", coefficient="u1"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """Header of a file."""
+
+    sections: int
+    splats: int
+    level: int
+    least: float
+    most: float
+    """Coefficients that bytes 0 and 255 stand for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """Header of a section."""
+
+    splats: int
+    bucket_size: int
+    buckets: int
+    block: float
+    """Side of a bucket's block, scene units."""
+    bucket_bytes: int
+    half_range: int
+    full: int
+    """Full buckets, which come first."""
+    partial: int
+    degree: int
+
+    @property
+    def coefficients(self) -> int:
+        """Beside the constant ones, of all colours."""
+        return 3 * sum(BANDS[self.degree])
+
+
+def decode_ksplat(content: bytes) -> Arrays:
+    """Return the splats of a file; rows may hold values that are not finite.
+
+    Raises:
+        InputError: it is damaged, of another version, or its counts contradict each other.
+    """
+    header = header_of(content)
+    start = HEADER_BYTES + header.sections * SECTION_BYTES
+    if len(content) < start:
+        raise InputError(f"it ends within the headers of its {header.sections:,} sections: copy or export it anew")
+    parts = []
+    for number in range(header.sections):
+        section = section_of(content, number, header.level)
+        arrays, start = splats_of(content, start, section, header)
+        parts.append(arrays)
+    count = sum(len(part.means) for part in parts)
+    if count != header.splats:
+        raise InputError(f"its header says {header.splats:,} splats, its sections {count:,}: save it anew")
+    return joined(parts)
+
+
+def header_of(content: bytes) -> Header:
+    """Return the header.
+
+    Raises:
+        InputError: it is none of a version that is read, or says that not all splats are there.
+    """
+    if len(content) < HEADER_BYTES:
+        raise InputError("it is no .ksplat, or ends within its header: copy or export it anew")
+    major, minor, sections, _, most, splats, level, *_, least, greatest = HEADER.unpack_from(content)
+    if major != MAJOR or minor < LEAST_MINOR:
+        raise InputError(f"it is no .ksplat, or of version {major}.{minor}; gsx reads 0.1: save it anew as that")
+    if level >= len(LEVELS):
+        raise InputError(f"it has compression level {level}; gsx reads 0, 1 and 2: save it anew with one of them")
+    if splats != most:
+        raise InputError(f"it holds {splats:,} of {most:,} splats: it was saved half loaded, save it anew")
+    return Header(
+        sections=sections,
+        splats=most,
+        level=level,
+        least=least or -COEFFICIENT_RANGE,
+        most=greatest or COEFFICIENT_RANGE,
+    )
+
+
+def section_of(content: bytes, number: int, level: int) -> Section:
+    """Return the header of a section.
+
+    Raises:
+        InputError: its degree is none, or its buckets are not those of its splats.
+    """
+    values = SECTION.unpack_from(content, HEADER_BYTES + number * SECTION_BYTES)
+    _, splats, bucket_size, buckets, block, bucket_bytes, half_range, _, full, partial, degree = values
+    section = Section(
+        splats=splats,
+        bucket_size=bucket_size,
+        buckets=buckets,
+        block=block,
+        bucket_bytes=bucket_bytes,
+        half_range=half_range or HALF_RANGE,
+        full=full,
+        partial=partial,
+        degree=degree,
+    )
+    if degree not in BANDS:
+        raise InputError(f"section {number} has degree {degree}; gsx reads 0 to 3: save it anew")
+    if level and (bucket_bytes != CENTRE_BYTES or full + partial != buckets or full * bucket_size > splats):
+        raise InputError(f"the buckets of section {number} are not those of its splats: save it anew")
+    return section
+
+
+def splats_of(content: bytes, start: int, section: Section, header: Header) -> tuple[Arrays, int]:
+    """Return the splats of a section that begins at a byte, and where it ends.
+
+    Raises:
+        InputError: the file ends before it, or its buckets are not those of its splats.
+    """
+    kind = LEVELS[header.level].row(section.coefficients)
+    centres = start + 4 * section.partial
+    first = centres + section.bucket_bytes * section.buckets
+    end = first + section.splats * kind.itemsize
+    if end > len(content):
+        raise InputError(f"it ends after {len(content):,} of {end:,} bytes or more: copy or export it anew")
+    rows = np.frombuffer(content, kind, section.splats, first)
+    means = rows["mean"].astype(float)
+    if header.level:
+        sizes = np.frombuffer(content, "<u4", section.partial, start).astype(np.int64)
+        bucket = buckets_of(sizes, section)
+        middle = np.frombuffer(content, "<f4", 3 * section.buckets, centres).reshape(-1, 3).astype(float)
+        means = middle[bucket] + (means - section.half_range) * (section.block / 2 / section.half_range)
+    arrays = Arrays(
+        means=means,
+        log_scales=log_scales_of(rows["scale"].astype(float)),
+        quats=unit_quaternions(rows["quat"].astype(float)),
+        opacities=rows["colour"][:, 3] / 255,
+        sh_dc=constants_of(rows["colour"][:, :3]),
+        sh_rest=higher_bands(coefficients_of(rows["rest"], header), section.degree),
+    )
+    return arrays, end
+
+
+def buckets_of(partial: Int[np.ndarray, "P"], section: Section) -> Int[np.ndarray, "N"]:
+    """Return the bucket of each splat of a section; partial: sizes of the buckets that are not full.
+
+    Raises:
+        InputError: the buckets hold more or fewer splats than the section.
+    """
+    held = section.full * section.bucket_size + int(partial.sum())
+    if held != section.splats:
+        raise InputError(f"its buckets hold {held:,} splats, their section {section.splats:,}: save it anew")
+    sizes = np.concatenate([np.full(section.full, section.bucket_size), partial])
+    return np.repeat(np.arange(section.buckets), sizes)
+
+
+def coefficients_of(stored: np.ndarray, header: Header) -> Float[np.ndarray, "N C"]:
+    """Return coefficients of higher bands as numbers."""
+    if stored.dtype != np.uint8:
+        return stored.astype(float)
+    return header.least + stored / 255 * (header.most - header.least)
+
+
+def higher_bands(values: Float[np.ndarray, "N C"], degree: int) -> Float[np.ndarray, "N B 3"]:
+    """Return coefficients as (coefficient, colour); in a file each band has all of red, then green, then blue."""
+    bands, begin = [np.zeros((len(values), 0, 3))], 0
+    for size in BANDS[degree]:
+        bands.append(values[:, begin : begin + 3 * size].reshape(-1, 3, size).transpose(0, 2, 1))
+        begin += 3 * size
+    return np.concatenate(bands, 1)
+
+
+def joined(parts: Sequence[Arrays]) -> Arrays:
+    """Return the splats of all sections; bands that some lack are 0 there.
+
+    Raises:
+        InputError: there are none.
+    """
+    if not sum(len(part.means) for part in parts):
+        raise InputError("it holds no splats: choose another file")
+    most = max(part.sh_rest.shape[1] for part in parts)
+    rest = [np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))) for part in parts]
+    padded = [replace(part, sh_rest=values) for part, values in zip(parts, rest, strict=True)]
+    return Arrays(**{name: np.concatenate([vars(part)[name] for part in padded]) for name in vars(padded[0])})

@@ -1,0 +1,302 @@
+"""SOG, versions 1 and 2, from a ZIP or from a folder: meta.json and lossless pictures, a pixel a splat.
+
+Version 1 (playcanvas/sogs) holds scales, colours and logits of opacities as bytes between a least and a most value;
+version 2 (playcanvas/splat-transform) holds indices of code books. Pillow reads the pictures (`gsx[sog]`).
+"""
+
+import io
+import json
+import logging
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsx.core.errors import InputError
+from gsx.core.packages import require
+from gsx.core.shapes import Float, UInt8
+from gsx.formats.arrays import Arrays, from_smallest_three
+from gsx.formats.pixels import MOST_SIDE, header_of
+from gsx.formats.sog import BOOK, COEFFICIENTS, FIRST_LARGEST, PALETTE, VERSION
+from gsx.formats.suffixes import META, MOST_META
+
+logger = logging.getLogger(__name__)
+
+MOST_SPLATS = 1 << 26
+SPARE_PIXELS = 1 << 22
+"""Pixels that a picture may have beyond four times those that it needs."""
+COMPENSATED, FLAT = "antialiased", "2dgs"
+MODELS = (COMPENSATED, FLAT, "default")
+"""Values of `model`."""
+BYTES_PER_PIXEL = 8
+"""More than any encoder needs for one."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Archive:
+    """Files of a SOG by name."""
+
+    read: Callable[[str, int], bytes]
+    """Content of a file of at most so many bytes; raises InputError."""
+    meta: dict[str, Any]
+    """Content of meta.json."""
+
+    @property
+    def version(self) -> int:
+        """1 where meta.json states none.
+
+        Raises:
+            InputError: it is neither 1 nor 2.
+        """
+        version = self.meta.get("version", 1)
+        if version not in (1, VERSION) or isinstance(version, bool):
+            raise InputError(f"its meta.json has version {version!r}; gsx reads SOG 1 and 2: export it anew")
+        return int(version)
+
+    @property
+    def count(self) -> int:
+        """Number of splats.
+
+        Raises:
+            InputError: meta.json states none, too many, or different ones.
+        """
+        parts = (self.meta.get(part) for part in ("means", "scales", "quats", "sh0"))
+        shapes = [part["shape"] for part in parts if isinstance(part, dict) and "shape" in part]
+        stated = [self.meta["count"]] if "count" in self.meta else []
+        stated += [shape[0] if isinstance(shape, list) and shape else shape for shape in shapes]
+        if not stated or any(type(count) is not int or count != stated[0] for count in stated):
+            raise InputError(f"its meta.json states no one number of splats ({stated}): export it anew")
+        if not 0 < stated[0] <= MOST_SPLATS:
+            raise InputError(f"its meta.json states {stated[0]:,} splats; SOG has 1 to {MOST_SPLATS:,}: export it anew")
+        return int(stated[0])
+
+
+def decode_sog(content: bytes, path: Path) -> Arrays:
+    """Return the splats of a ZIP, or of a meta.json and the pictures next to it. path: of the file.
+
+    Raises:
+        InputError: it is damaged, of another version, or of flat splats.
+        ConfigError: Pillow is not installed.
+    """
+    require("SOG", ("PIL",), "gsx[sog]")
+    archive = archive_of(content, path)
+    refuse_model(archive.meta)
+    try:
+        return finite(splats_in(archive))
+    except InputError:
+        raise
+    except Exception as error:  # of JSON's and pictures' content: all say that it is damaged
+        raise InputError(f"it is no whole SOG ({type(error).__name__}): export it anew") from None
+
+
+def sog_is_antialiased(path: Path) -> bool:
+    """Tell if meta.json states that opacities are compensated; False for what is no SOG.
+
+    `model` (splat-transform since 3.2) counts before the older `antialias`.
+    """
+    try:
+        meta = archive_of(path.read_bytes(), path).meta
+    except (InputError, OSError):  # the reader reports it
+        return False
+    if "model" in meta:
+        return bool(meta["model"] == COMPENSATED)
+    return meta.get("antialias") is True
+
+
+def refuse_model(meta: dict[str, Any]) -> None:
+    """Raise InputError for flat splats; a model that gsx does not know is a warning."""
+    model = meta.get("model", "default")
+    if model == FLAT:
+        raise InputError(f"its meta.json has model '{FLAT}': it holds flat splats, which gsx does not draw")
+    if model not in MODELS:
+        logger.warning("meta.json has model %r, which gsx does not know: its splats are drawn as usual ones", model)
+
+
+def archive_of(content: bytes, path: Path) -> Archive:
+    """Return the files of a ZIP, or of the folder of a meta.json. path: of the file with that content.
+
+    Raises:
+        InputError: it is no ZIP, or has no readable meta.json.
+    """
+    read = in_folder(path) if path.name.lower() == META else in_zip(content)
+    try:
+        meta = json.loads(read(META, MOST_META))
+    except (ValueError, RecursionError):
+        raise InputError("its meta.json is no JSON: export it anew") from None
+    if not isinstance(meta, dict) or "means" not in meta:
+        raise InputError("its meta.json describes no SOG: give that of a SOG, or another file")
+    return Archive(read=read, meta=meta)
+
+
+def in_folder(path: Path) -> Callable[[str, int], bytes]:
+    """Return a reader of the files next to a meta.json."""
+
+    def read(name: str, most: int) -> bytes:
+        file = path if name == META else path.parent / name
+        if not file.resolve().is_relative_to(path.parent.resolve()):
+            raise InputError(f"its meta.json names '{name}', which is outside of its folder: export it anew")
+        if name != META and not file.is_file():
+            raise InputError(f"'{name}' is missing next to {META}: copy all pictures of the folder")
+        if file.stat().st_size > most:
+            raise InputError(f"'{name}' has {file.stat().st_size:,} bytes, more than its splats need: export it anew")
+        return file.read_bytes()
+
+    return read
+
+
+def in_zip(content: bytes) -> Callable[[str, int], bytes]:
+    """Return a reader of the files of a ZIP, which lie in its root or all in one folder.
+
+    Raises:
+        InputError: it is no ZIP, or has no or several meta.json.
+    """
+    try:
+        entries = {info.filename: info for info in zipfile.ZipFile(io.BytesIO(content)).infolist()}
+    except Exception as error:  # a damaged ZIP raises errors of many kinds
+        raise InputError(f"it is no whole ZIP ({type(error).__name__}): copy or export it anew") from None
+    folder = folder_of_meta(list(entries))
+
+    def read(name: str, most: int) -> bytes:
+        info = entries.get(str(folder / name))
+        if info is None:
+            raise InputError(f"it has no '{name}': export it anew")
+        if info.file_size > most:
+            raise InputError(f"its '{name}' has {info.file_size:,} bytes, more than its splats need: export it anew")
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                return archive.read(info)
+        except Exception as error:  # damaged, encrypted, or packed in a way that Python does not know
+            problem = type(error).__name__
+            raise InputError(f"its '{name}' cannot be unpacked ({problem}): copy or export it anew") from None
+
+    return read
+
+
+def folder_of_meta(names: list[str]) -> PurePosixPath:
+    """Return the folder of a ZIP in which meta.json lies.
+
+    Raises:
+        InputError: there is none, or several.
+    """
+    paths = [PurePosixPath(name) for name in names if not name.startswith("__MACOSX/")]
+    folders = sorted({path.parent for path in paths if path.name == META}, key=lambda folder: len(folder.parts))
+    if not folders:
+        raise InputError(f"it is a ZIP without {META}: give a SOG, or unpack it")
+    if len(folders) > 1 and folders[0].parts:
+        raise InputError(f"it has {META} in {len(folders)} folders: unpack it, and give one of them")
+    return folders[0]
+
+
+def splats_in(archive: Archive) -> Arrays:
+    """Return the splats of the files; damaged content raises errors of many kinds."""
+    meta, count = archive.meta, archive.count
+    first = archive.version == 1
+    least, most = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
+    low, high = (pixels(archive, "means", number)[:, :3].astype(np.int64) for number in (0, 1))
+    logs = least + (high << 8 | low) / 65535 * (most - least)
+    sh0 = pixels(archive, "sh0")
+    value = interpolated if first else looked_up
+    colours = value(meta["sh0"], sh0 if first else sh0[:, :3])
+    return Arrays(
+        means=np.sign(logs) * np.expm1(np.abs(logs)),
+        log_scales=value(meta["scales"], pixels(archive, "scales")[:, :3]),
+        quats=quaternions(meta["quats"], pixels(archive, "quats")),
+        opacities=1 / (1 + np.exp(-colours[:, 3].clip(-700, 700))) if first else sh0[:, 3] / 255,
+        sh_dc=colours[:, :3],
+        sh_rest=rest_of(archive) if meta.get("shN") else np.zeros((count, 0, 3)),
+    )
+
+
+def interpolated(entry: dict[str, Any], stored: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
+    """Return values of version 1: bytes between the least and the most of each column."""
+    least, most = (np.array(entry[end], float) for end in ("mins", "maxs"))
+    if least.shape not in ((), (1,), stored.shape[1:]) or most.shape != least.shape:
+        raise InputError(f"its ranges are of {least.size} columns, its picture has {stored.shape[1]}: export it anew")
+    return least + stored / 255 * (most - least)
+
+
+def looked_up(entry: dict[str, Any], indices: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
+    """Return values of version 2: entries of a code book."""
+    return code_book(entry)[indices]
+
+
+def code_book(entry: dict[str, Any]) -> Float[np.ndarray, "E"]:
+    """Return a code book; a first entry that is null, as early writers left it, continues the steps of the others."""
+    book = np.array(entry["codebook"], float)
+    if len(book) == BOOK and entry["codebook"][0] is None:
+        book[0] = book[1] + (book[1] - book[-1]) / (BOOK - 1)
+    return book
+
+
+def quaternions(entry: dict[str, Any], stored: UInt8[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Return unit quaternions (w, x, y, z); an alpha that names no component stands for the identity."""
+    encoding = entry.get("encoding", "quaternion_packed")
+    if encoding != "quaternion_packed":
+        raise InputError(f"its quaternions are encoded as {encoding!r}; gsx reads quaternion_packed: export it anew")
+    largest = stored[:, 3].astype(np.int64) - FIRST_LARGEST
+    three = np.where(largest[:, None] < 0, 0.0, (stored[:, :3] / 255 - 0.5) * 2**0.5)
+    return from_smallest_three(largest.clip(0), three)
+
+
+def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
+    """Return coefficients of higher bands: of a palette of vectors, the one that a splat's label names."""
+    entry = archive.meta["shN"]
+    centroids = picture(archive, entry["files"][0], 1)
+    bands = {64 * count: count for count in COEFFICIENTS.values()}
+    coefficients = bands.get(centroids.shape[1], 0)
+    if coefficients != COEFFICIENTS.get(entry.get("bands", 0), coefficients) or not coefficients:
+        stated = f" of {entry['bands']} bands" if "bands" in entry else ""
+        raise InputError(f"its palette{stated} is {centroids.shape[1]} pixels wide; bands 1 to 3 have 192, 512, 960")
+    palette = centroids[..., :3].reshape(-1, coefficients, 3)[: entry.get("count", PALETTE * len(centroids))]
+    numbers = pixels(archive, "shN", 1).astype(np.int64)
+    labels = numbers[:, 0] | numbers[:, 1] << 8
+    if labels.max() >= len(palette):
+        raise InputError(f"a splat has vector {labels.max():,} of a palette of {len(palette):,}: export it anew")
+    vectors = palette.reshape(len(palette), -1)
+    values = interpolated(entry, vectors) if archive.version == 1 else looked_up(entry, vectors)
+    return values[labels].reshape(len(labels), coefficients, 3)
+
+
+def pixels(archive: Archive, part: str, number: int = 0) -> UInt8[np.ndarray, "N 4"]:
+    """Return the pixels of all splats in a picture of a part of meta.json."""
+    name = archive.meta[part]["files"][number]
+    return picture(archive, name, archive.count).reshape(-1, 4)[: archive.count]
+
+
+def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 4"]:
+    """Return a lossless picture as RGBA; needed: its least number of pixels.
+
+    Raises:
+        InputError: it has fewer or far more, or is lossy or damaged.
+    """
+    from PIL import Image
+
+    most = 4 * max(needed, archive.count) + SPARE_PIXELS
+    content = archive.read(name, BYTES_PER_PIXEL * most)
+    header = header_of(content, name)
+    if header.width * header.height < needed:
+        raise InputError(f"'{name}' is {header.width}x{header.height}, too small for {needed:,} splats: export it anew")
+    if header.width * header.height > most or max(header.width, header.height) > MOST_SIDE:
+        raise InputError(f"'{name}' is {header.width}x{header.height}, far more than {archive.count:,} splats need")
+    if not header.lossless:
+        raise InputError(f"'{name}' is a lossy picture, which has changed its values: export it anew, lossless")
+    try:
+        with Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image:
+            return np.asarray(image.convert("RGBA"))
+    except Exception as error:  # of Pillow's decoders
+        raise InputError(f"'{name}' is no whole picture ({type(error).__name__}): copy or export it anew") from None
+
+
+def finite(arrays: Arrays) -> Arrays:
+    """Return splats whose values are all finite.
+
+    Raises:
+        InputError: they are not.
+    """
+    for name, values in vars(arrays).items():
+        if not np.isfinite(values).all():
+            raise InputError(f"its ranges or code books give '{name}' that are not finite: export it anew")
+    return arrays
