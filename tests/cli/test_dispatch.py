@@ -580,7 +580,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         "--to FOLDER says where the smaller run goes",
     ),
     "a photograph of no run": (lambda t: ["photographs"], "the following arguments are required: RUN. See"),
-    "an export of no run": (lambda t: ["export"], "the following arguments are required: RUN. See"),
+    "an export of no run": (lambda t: ["export"], "the following arguments are required: RUN|FILE. See"),
     "trade with a place of its own": (
         lambda t: ["trade", "training", f"output={t / 'o'}", "--to", str(t / "t")],
         "runs go below --to FOLDER",

@@ -30,7 +30,7 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
   gsx photographs RUN       what is wrong with training photographs: exposure, pose, blur, passers-by; the ten worst
   gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
-  gsx export RUN [FILE]     splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
+  gsx export RUN|FILE [TO]  splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
   gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
   gsx trade training [K=V ...]  what fewer primitives, steps, bands ... cost: --budget-mb 20, --target-seconds 300

@@ -164,14 +164,14 @@ def verb_view(arguments: list[str]) -> int:
 
 
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN|FILE [FILE] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
+    """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
     told = (
         f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
         "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
     )
     parser = Parser(prog="gsx export", description=told)
     parser.add_argument("run", type=Path, metavar="RUN|FILE", help=f"run folder, or splat file: {READABLE}")
-    parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help="splat file to write (RUN/point_cloud.ply)")
+    parser.add_argument("file", type=Path, nargs="?", metavar="TO", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
     parser.add_argument(
         "--bake",
