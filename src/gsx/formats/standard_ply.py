@@ -16,6 +16,7 @@ from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.smoothing import smoothed_raw
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
+from gsx.formats.activated import activated_words
 from gsx.formats.arrays import SMALLEST_OPACITY
 from gsx.formats.colours import COLOUR_NAMES, colours_among, full_scale_of
 from gsx.formats.ply import header_in, vertices_of
@@ -62,7 +63,10 @@ def decode_standard_ply(content: bytes, name: str) -> Gaussians:
     if "filter_3D" in columns:
         drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], float_column(columns, "filter_3D"))
         raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
-    return Gaussians(**finite_rows(raw, name))
+    gaussians = Gaussians(**finite_rows(raw, name))
+    for sentence in activated_words(gaussians):
+        logger.warning("%s: %s", name, sentence)
+    return gaussians
 
 
 def problem_of(columns: Columns, content: bytes) -> str:

@@ -38,7 +38,7 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings, write_config
-from gsx.experiments.runs.start_file import composition_of, starting_splats
+from gsx.experiments.runs.start_file import composition_of, start_doubts, starting_splats
 from gsx.experiments.runs.verified import verified
 from gsx.formats.splat_files import read_gaussians
 from gsx.formats.suffixes import STANDARD
@@ -132,7 +132,9 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
         return run, settings
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
     settings = compose([*words, f"iterations={FILE_STEPS}"], plugins)
-    run = build(settings, verified(load_scene(settings)), Path(), training=True, start=starting_splats(settings))
+    scene, start = verified(load_scene(settings)), starting_splats(settings)
+    start_doubts(settings, scene, start)
+    run = build(settings, scene, Path(), training=True, start=start)
     run.step = run.iterations
     return run, settings
 

@@ -132,8 +132,14 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
     of_photographs = exposure_remarks, pose_remarks, distractor_remarks, blur_remarks
-    kinds = (cap_remarks, pseudo_remarks, left_out_remarks, *of_photographs)
+    kinds = (start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, *of_photographs)
     return [remark for kind in kinds for remark in kind(evaluation)]
+
+
+def start_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Yield why the splat file that a run begins with may not belong to its scene."""
+    doubts = evaluation.get("start")
+    yield from (str(doubt) for doubt in (doubts if isinstance(doubts, list) else []))
 
 
 def cap_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:

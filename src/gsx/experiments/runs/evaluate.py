@@ -32,7 +32,10 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
-    tell_of_paths(read_run(run.folder).evaluation, evaluation)
+    files = read_run(run.folder)
+    if doubts := files.environment.get("start"):
+        evaluation["start"] = doubts
+    tell_of_paths(files.evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)

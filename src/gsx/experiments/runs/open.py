@@ -38,7 +38,7 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import help_at_once
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
-from gsx.experiments.runs.start_file import starting_splats
+from gsx.experiments.runs.start_file import start_doubts, starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
 
@@ -103,14 +103,15 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         require("viewer=true", ("viser",), "gsx[viewer]")
     start = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
+    doubts = start_doubts(settings, scene, start)
     run = build(settings, scene, Path(), training=True, start=start)
-    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims))
+    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims, doubts))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run, training=True)
     return run
 
 
-def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None) -> Path:
+def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None, doubts: Sequence[str] = ()) -> Path:
     """The folder of a new run, with what is known before its first step; `init=warm_start`: at the state of another."""
     run.folder = new_folder(settings, run.scene)
     if claims is not None:
@@ -118,7 +119,7 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
         refuse_used(settings.general.folder)  # by another process that was faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
-        write_json(run.folder / "environment.json", environment(run, plugins))
+        write_json(run.folder / "environment.json", environment(run, plugins) | ({"start": doubts} if doubts else {}))
         if settings.general.init == "warm_start":
             run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
             warm_start.adopt(run, run.warm_starts)

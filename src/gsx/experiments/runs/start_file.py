@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import PointCloud
+from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians
@@ -17,6 +17,7 @@ from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.start_checks import doubts_about
 from gsx.formats.splat_files import compensated, read_gaussians
 
 logger = logging.getLogger(__name__)
@@ -41,6 +42,18 @@ def starting_splats(settings: Settings) -> Gaussians | None:
         raise InputError(f"init: {path} holds no splats: choose another file")
     logger.info("beginning with the %d splats of %s", len(gaussians.means), path)
     return gaussians
+
+
+def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> list[str]:
+    """Return why the splat file that a run begins with may not belong to its scene; see `doubts_about`.
+
+    Raises:
+        InputError: no splat is in view.
+    """
+    path = splat_file(settings.general.init)
+    if start is None or path is None:
+        return []
+    return doubts_about(start, scene, path, trains=settings.general.iterations > 0)
 
 
 def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
