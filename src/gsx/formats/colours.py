@@ -4,8 +4,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gsx.core.shapes import Float
-
 COLOUR_NAMES = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
@@ -17,8 +15,8 @@ OVERSHOOT = 0.5
 """Floats may lie this far beyond [0, 1] and are still of that unit: colours of harmonics are not clipped."""
 
 
-def colours_among(columns: Mapping[str, np.ndarray]) -> Float[np.ndarray, "N 3"] | None:
-    """Return the three colour columns, in the type and unit stored; None: there are none."""
+def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the three colour columns [N, 3], in the type and unit stored; None: there are none."""
     for names in COLOUR_NAMES:
         if set(names) <= columns.keys():
             return np.stack([columns[name] for name in names], axis=1)

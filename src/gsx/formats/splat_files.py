@@ -93,6 +93,8 @@ def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
         InputError: it is damaged, or lacks a property.
     """
     path = splat_file_at(path)
+    if not path.exists():
+        raise InputError(f"'{path}' does not exist: check the path")
     try:
         content = path.read_bytes()
         kind = format_of(content[:MOST_HEADER], path)
