@@ -26,6 +26,7 @@ from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
+    SAME_PLACE,
     Shot,
     frames_line,
     lens_notes,
@@ -192,6 +193,12 @@ def _points(
     centres = torch.stack([view.camera.centre for view in views])
     low, high = centres.amin(0), centres.amax(0)
     middle, half = (low + high) / 2, (high - low).max() / 2
+    if not float(2 * half) * options.unit > SAME_PLACE:
+        raise InputError(
+            f"All {len(views)} cameras of '{file}' stand within {float(2 * half):.3g} units of each other, as on a "
+            "tripod, and random points between them would have no depth: set scene.points to a PLY file of the scene, "
+            "or use photos from different places."
+        )
     generator = torch.Generator().manual_seed(options.seed)
     cloud = random_points(options.random_points, middle - half, middle + half, generator)
     return cloud, f"Starts from {len(cloud)} random points in the cube around the cameras."

@@ -16,6 +16,7 @@ from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.runs.orbit import axes_about, nearest_to_rays
+from gsx.experiments.runs.scene_extent import in_one_place
 
 POINTS = 3000
 """Looked at, evenly drawn from all."""
@@ -56,7 +57,8 @@ def capture_lines(scene: Scene) -> Iterator[str]:
         yield exposure_line(views, gains)
         points = scene.points.positions[:: max(1, len(scene.points) // POINTS)]
         yield coverage_line(views, torch.stack([view.camera.sees(points) for view in views]))
-    around = ring(views)
+    still = in_one_place([view.camera for view in scene.train], scene.points)
+    around = None if still else ring(views)  # the place that rays from one place are nearest to is that place
     if around is not None:
         yield ring_line(views, around)
 

@@ -17,6 +17,7 @@ from gsx.core.plugins import Component, Plugins
 from gsx.experiments.run_folder.files import BEGUN
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
+from gsx.experiments.runs.scene_extent import in_one_place, measured
 from gsx.experiments.runs.settings import typed
 
 logger = logging.getLogger(__name__)
@@ -119,7 +120,7 @@ def scene_lines(
     overrides = its.overrides(path)
     found.command = training_command(loader, path, overrides)
     if its.quick or patient:
-        scene = loader.factory(options_for(loader, path, overrides, plugins))
+        scene = measured(loader.factory(options_for(loader, path, overrides, plugins)))
         yield from loaded_lines(scene)
         found.ask(lambda: capture_lines(scene))
     else:
@@ -146,5 +147,7 @@ def loaded_lines(scene: Scene) -> Iterator[str]:
         yield f"views     {count} of {width}x{height}"
     yield f"split     {len(scene.train)} to train on, {len(scene.test)} to test on"
     yield f"points    {len(scene.points)}"
-    yield f"extent    {scene.extent:.4g} scene units (1.1 x the farthest camera from their mean)"
+    still = in_one_place([view.camera for view in scene.train], scene.points)
+    source = "median distance of the points: cameras stand in one place" if still else "farthest camera from their mean"
+    yield f"extent    {scene.extent:.4g} scene units (1.1 x the {source})"
     yield from (f"note      {note}" for note in scene.notes)

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.camera import Camera
 from gsx.core.data.disturbed import Disturbable, disturbed
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
@@ -14,6 +14,7 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
+from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
@@ -118,16 +119,6 @@ def in_units(scene: Scene, unit: float) -> Scene:
 def rescaled(view: View, unit: float) -> View:
     """The view with its camera's position multiplied by `unit`."""
     return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
-
-
-def measured(scene: Scene) -> Scene:
-    """The scene; one whose training cameras stand in one place takes its extent from the points' median distance."""
-    if scene.extent > 0 or len(scene.points) == 0:
-        return scene
-    distance = offsets_from(scene.points.positions, scene.train[0].camera.centre).norm(dim=1)
-    extent = 1.1 * float(distance.median())
-    note = f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance"
-    return replace(scene, extent=extent, notes=[*scene.notes, note])
 
 
 def hidden_share(scene: Scene) -> float:
