@@ -1,6 +1,7 @@
 """Parsers of verbs, whose mistakes are errors of ours."""
 
 import argparse
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,8 +14,10 @@ RESUME_FLAGS = ("--trust", "--changed")
 
 
 def is_override(word: str) -> bool:
-    """Whether a word is a flag or changes the configuration: a path that says so (./a=b/c) is none."""
-    return not word.startswith((".", "/", "~/")) and (word.startswith(("-", "+", "~")) or "=" in word)
+    """Return whether a word is a flag or changes the configuration; a path (`./a=b`, or `a=b` that exists) does not."""
+    if word.startswith((".", "/", "~/")):
+        return False
+    return word.startswith(("-", "+", "~")) or ("=" in word and not os.path.exists(word))
 
 
 PLACES = ("output", "folder", "reuse")

@@ -77,7 +77,7 @@ def fill_table(arguments: list[str]) -> int:
 def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     with loading():
-        from gsx.experiments.runs.compose import check_overrides, hydra_main, launch, quoted
+        from gsx.experiments.runs.compose import check_overrides, hydra_main, launch, quoted, with_quoted_paths
         from gsx.experiments.runs.launched import waiting_for_all
         from gsx.experiments.tables.sweep import is_table
 
@@ -85,13 +85,14 @@ def hand_to_hydra(arguments: list[str]) -> int:
         raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
     loaded = plugins()
     if not {"-m", "--multirun"} & set(arguments):
+        arguments = with_quoted_paths(arguments)
         try:
             with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
                 hydra_main(arguments, loaded, sweep_job)
         finally:  # it may end the program
             sys.stdout.write(text.getvalue())
         return 0
-    given = [word for word in arguments if not word.startswith("-")]
+    given = with_quoted_paths([word for word in arguments if not word.startswith("-")])
     refuse_for_sweeps(arguments)
     output, of_launcher = check_overrides(given, loaded)
     sweep, code = new_sweep(output), 0

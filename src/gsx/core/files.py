@@ -156,17 +156,20 @@ def finite(content: Any) -> Any:
 
 LFS_POINTER = b"version https://git-lfs"
 """First bytes of the small text that stands in for a file until Git LFS downloads it."""
+LFS_REMEDY = "a Git LFS pointer, not the file itself: run 'git lfs pull' in its repository"
+
+
+def is_lfs_pointer(path: Path) -> bool:
+    """Recognise a file that Git LFS has not downloaded yet."""
+    with suppress(OSError), path.open("rb") as stream:
+        return stream.read(len(LFS_POINTER)) == LFS_POINTER
+    return False
 
 
 def refuse_lfs_pointer(path: Path) -> None:
     """Raise InputError for a file that Git LFS has not downloaded yet."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(len(LFS_POINTER))
-    except OSError:
-        return
-    if head == LFS_POINTER:
-        raise InputError(f"'{path}' is a Git LFS pointer, not the file itself: run 'git lfs pull' in its repository.")
+    if is_lfs_pointer(path):
+        raise InputError(f"'{path}' is {LFS_REMEDY}.")
 
 
 def is_file(path: Path) -> bool:
@@ -189,3 +192,5 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except RecursionError as error:
         raise ValueError("its brackets are nested too deeply") from error
+    except ValueError as error:
+        raise (ValueError(f"it is {LFS_REMEDY}") if is_lfs_pointer(path) else error) from None

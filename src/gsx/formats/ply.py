@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsx.core.errors import InputError
-from gsx.core.files import replace_file
+from gsx.core.files import refuse_lfs_pointer, replace_file
 
 TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
@@ -77,6 +77,7 @@ def read_ply(path: str | Path) -> dict[str, np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"Point file '{path}' does not exist, check the path.")
+    refuse_lfs_pointer(path)
     try:
         return vertices_of(path.read_bytes())
     except (OSError, InputError) as problem:

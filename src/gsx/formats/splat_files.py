@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
+from gsx.core.files import refuse_lfs_pointer
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
@@ -95,6 +96,7 @@ def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
     path = splat_file_at(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: check the path")
+    refuse_lfs_pointer(path)
     try:
         content = path.read_bytes()
         kind = format_of(content[:MOST_HEADER], path)
@@ -134,6 +136,7 @@ def compensated(path: Path) -> bool:
         InputError: it cannot be read.
     """
     path = splat_file_at(path)
+    refuse_lfs_pointer(path)
     try:
         with path.open("rb") as file:
             head = file.read(MOST_HEADER)

@@ -35,7 +35,6 @@ from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints
 from gsx.scenes.options import SceneOptions, refuse_other
-from gsx.scenes.photo_names import similar_photo
 from gsx.scenes.posed import (
     MIN_IMAGES,
     Shot,
@@ -48,6 +47,7 @@ from gsx.scenes.posed import (
     shot_through,
     views_of,
 )
+from gsx.scenes.similar_photos import similar_photo
 from gsx.scenes.splits import split_names
 from gsx.scenes.undistort import METHOD, pinhole_of
 

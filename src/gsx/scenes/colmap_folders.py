@@ -19,7 +19,7 @@ AUTO = "auto"
 
 PLACES = {
     "sparse", "colmap", "glomap", "hloc", "sfm", "dense", "distorted", "undistorted", "model", "models", "output",
-    "reconstruction", "reconstructions", "triangulated", "export", "poses",
+    "outputs", "reconstruction", "reconstructions", "triangulated", "export", "poses",
 }  # fmt: skip
 """First or last words of folders in which COLMAP, INRIA's convert.py, hloc, GLOMAP, instant-ngp and nerfstudio keep
 models, beside `sparse`."""

@@ -20,6 +20,7 @@ from gsx.scenes.colmap_model import Model, error_told, read_model
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
+from gsx.scenes.passed_models import refuse_passed_over
 from gsx.scenes.posed import named, refuse_partial
 from gsx.scenes.readable import readable_size
 
@@ -254,5 +255,6 @@ FORMAT = SceneFormat(
     sign=f"photos ({', '.join(PHOTO_SUFFIXES)})",
     recognise=recognise,
     facts=facts,
+    overrides=refuse_passed_over,
     quick=False,
 )

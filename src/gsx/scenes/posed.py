@@ -17,7 +17,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import at_home
+from gsx.core.files import at_home, refuse_lfs_pointer
 from gsx.core.files import read_json as parsed
 from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
@@ -121,6 +121,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: scene.path must be the folder that holds it.")
+    refuse_lfs_pointer(path)
     try:
         content = parsed(path)
     except (OSError, ValueError) as problem:

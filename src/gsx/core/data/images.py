@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsx.core.data.resize import Size, display_from_linear, to_uint8
 from gsx.core.errors import InputError
-from gsx.core.files import replacing
+from gsx.core.files import refuse_lfs_pointer, replacing
 from gsx.core.shapes import Float, Shaped, UInt8
 
 JPEG_QUALITY = 95
@@ -179,6 +179,7 @@ def open_image(path: Path) -> Any:
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
     if reader is None:
+        refuse_lfs_pointer(path)
         raise InputError(f"Image '{path}' cannot be read ({in_one_line(oiio.geterror())}), convert it to PNG or JPEG.")
     return reader
 

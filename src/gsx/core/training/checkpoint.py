@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
-from gsx.core.files import read_json, replace_file, write_json
+from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, write_json
 from gsx.core.training.blur import Blur
 from gsx.core.training.distractors import Distractors
 from gsx.core.training.exposure import Exposures
@@ -123,6 +123,7 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not isinstance(meta, dict):
         raise CheckpointError(f"checkpoint {sidecar} holds no JSON object: remove it to use an older one")
     refuse_other_schema(meta, path)
+    refuse_lfs_pointer(path)
     if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
         raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
     if meta.get("schema") != SCHEMA or not sound(meta, step_of(sidecar)):

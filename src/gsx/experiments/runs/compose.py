@@ -197,6 +197,20 @@ def word_of(key: str, text: str) -> str:
     return f"{key}={text if bare else quoted(text)}"
 
 
+ODD = re.compile(r"[^\w./+~ -]", re.ASCII)
+"""A character of a value that means something to Hydra."""
+
+
+def with_quoted_paths(overrides: Sequence[str]) -> list[str]:
+    """Return overrides in which a path that exists stands for itself, also one such as `a=b` or `a (1)`."""
+    return [_with_quoted_path(word) for word in overrides]
+
+
+def _with_quoted_path(word: str) -> str:
+    key, _, value = word.partition("=")
+    return word_of(key, value) if ODD.search(value) and os.path.exists(at_home(value)) else word
+
+
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
     """Compose and check an experiment.
 
@@ -217,9 +231,10 @@ def compose_raw(overrides: Sequence[str]) -> DictConfig:
     from hydra import compose as hydra_compose
     from hydra.errors import HydraException
 
+    overrides = with_quoted_paths(overrides)
     check_groups(overrides)
     try:
-        return hydra_compose("config", overrides=list(overrides))
+        return hydra_compose("config", overrides=overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, overrides)) from error
 
