@@ -42,8 +42,10 @@ from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table
-from gsx.formats.splat_files import read_gaussians
+from gsx.formats.origin import NO_ORIGIN
+from gsx.formats.splat_files import read_around
 from gsx.formats.suffixes import splat_file_at
+from gsx.scenes.origin import moved
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
 
@@ -73,7 +75,10 @@ class TrainedRun:
 
     @property
     def scene(self) -> Scene:
-        """Training and test views with their cameras: `scene.test[0].camera`, `scene.test[0].image()`."""
+        """Training and test views with their cameras: `scene.test[0].camera`, `scene.test[0].image()`.
+
+        Positions of cameras count from `scene.origin`, which is (0, 0, 0) but for georeferenced scenes.
+        """
         return self.run.scene
 
     @yielding_cores()
@@ -102,15 +107,15 @@ class TrainedRun:
         words = [f"eval.{name}={json.dumps(plain(name, value))}" for name, value in options.items()]
         return evaluate_again(self.folder, plugins(), words)
 
-    def export(self, path: str | Path, seen: Camera | View | str | None = None) -> Path:
+    def export(self, path: str | Path, seen: Camera | View | str | None = None, local: bool = False) -> Path:
         """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view, or by
-        that camera.
+        that camera; `local`: relative to `scene.origin`, which the file states where it can.
 
         Raises:
             InputError: the suffix is that of no format that is written, or there is no such view.
         """
         refuse_export(path := Path(path))
-        export(self.run, path, None if seen is None else camera_in(self.run, seen))
+        export(self.run, path, None if seen is None else camera_in(self.run, seen), local=local)
         return path
 
     def __repr__(self) -> str:
@@ -125,6 +130,8 @@ class SplatFile:
     gaussians: Gaussians
     raster: RasterSettings
     """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
 
     @yielding_cores()
     def render(
@@ -141,7 +148,7 @@ class SplatFile:
             raise InputError(f"background is {background!r}: give three values, red, green and blue") from error
         if not bool(((over >= 0) & (over <= 1)).all()):  # nor is nan
             raise InputError(f"background is {background!r}: give red, green and blue in [0, 1]")
-        return render_gaussians(self.gaussians, camera_of(seen), self.raster, over)
+        return render_gaussians(self.gaussians, moved(camera_of(seen), self.origin), self.raster, over)
 
     def __repr__(self) -> str:
         return f"<{len(self.gaussians.means):,} splats of {self.path}>"
@@ -186,10 +193,14 @@ def train(*given: str, **values: Any) -> TrainedRun:
     return load_run(folders[0])
 
 
-def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun | SplatFile:
+def load(
+    path: str | Path, raster: RasterSettings | None = None, origin: tuple[float, float, float] = NO_ORIGIN
+) -> TrainedRun | SplatFile:
     """Open a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
 
     raster: the rules by which a splat file is drawn, in place of those that it states.
+
+    origin: from where the coordinates of cameras count, `run.scene.origin` for the views of a georeferenced run.
 
     Raises:
         InputError: it is neither, or damaged; or `raster` is given for a run, which has its own.
@@ -202,7 +213,8 @@ def load(path: str | Path, raster: RasterSettings | None = None) -> TrainedRun |
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
-    return SplatFile(path, read_gaussians(path), raster or rules_of(path))
+    gaussians, own = read_around(path, base=origin)
+    return SplatFile(path, gaussians, raster or rules_of(path), own)
 
 
 def load_run(folder: Path) -> TrainedRun:

@@ -164,7 +164,7 @@ def verb_view(arguments: list[str]) -> int:
 
 
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf]"""
+    """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--local]"""
     told = (
         f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
         "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
@@ -183,6 +183,8 @@ def verb_export(arguments: list[str]) -> int:
     )
     parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
                         "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
+    parser.add_argument("--local", action="store_true", help="of a scene far from (0, 0, 0): positions relative to the "
+                        "origin that it was trained around, which the file states where it can")  # fmt: skip
     given = parser.parse_args(arguments)
     with loading():
         from gsx.core.files import remove_partial
@@ -208,10 +210,12 @@ def verb_export(arguments: list[str]) -> int:
     stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
     path = given.file or given.run / f"{stem}.ply"
     remove_partial(path.parent, below=False)
-    written = export(run, path, view.camera if view else None, given.axes, given.bake)
+    if given.local and not any(run.scene.origin):
+        logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
+    written = export(run, path, view.camera if view else None, given.axes, given.bake, given.local)
     if written:
         views = [view] if view else run.scene.test
-        for line in losses(run, settings, path, views, written, given.axes):
+        for line in losses(run, settings, path, views, written, given.axes, given.local):
             logger.info("read back and rendered again: %s", line)
     if is_page(path) and path.parent.resolve() == given.run.resolve():
         write_report(given.run)  # it links to its pages
@@ -231,6 +235,6 @@ def converted(source: Path, given: argparse.Namespace) -> Path:
         raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")
     if given.view or given.bake:
         raise InputError(f"gsx export: --view and --bake are for runs, and {source} is a splat file: leave them out")
-    convert(source, given.file, given.axes)
+    convert(source, given.file, given.axes, given.local)
     file: Path = given.file
     return file

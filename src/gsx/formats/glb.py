@@ -68,8 +68,8 @@ OVERSHOOT = 1e-3
 """Opacities this far beyond [0, 1] are rounding."""
 
 
-def encode_glb(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
-    """A file.
+def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[float] = (0.0, 0.0, 0.0)) -> bytes:
+    """A file. origin: added to positions, by the node.
 
     Raises:
         InputError: there are no splats.
@@ -95,7 +95,7 @@ def encode_glb(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": TURN}],
+        "nodes": [{"mesh": 0, "rotation": TURN, **translation_by(origin)}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -104,6 +104,12 @@ def encode_glb(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
     text = json.dumps(content, separators=(",", ":")).encode()
     chunks = chunk(JSON_CHUNK, text, b" ") + chunk(BINARY_CHUNK, body, b"\0")
     return struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks
+
+
+def translation_by(origin: Sequence[float]) -> dict[str, list[float]]:
+    """Return what a node has that moves splats by an origin, in glTF's world; nothing without an origin."""
+    x, y, z = origin
+    return {"translation": [-x, -y, z]} if any(origin) else {}
 
 
 def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_
 from gsx.formats.detect import MOST_HEADER, format_of
 from gsx.formats.glb import decode_glb, encode_glb
 from gsx.formats.ksplat import decode_ksplat
+from gsx.formats.origin import NO_ORIGIN, Origin, around, away, origin_of_positions, stated_in
 from gsx.formats.ply import HEADER_END, write_ply, write_whole
 from gsx.formats.sog import encode_sog
 from gsx.formats.sog_reading import decode_sog, sog_is_antialiased
@@ -49,9 +51,15 @@ def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
 
 
 def write_gaussians(
-    path: Path, gaussians: Gaussians, comments: Sequence[str] = (), compensated: bool = False, axes: str = "rub"
+    path: Path,
+    gaussians: Gaussians,
+    comments: Sequence[str] = (),
+    compensated: bool = False,
+    axes: str = "rub",
+    origin: Origin = NO_ORIGIN,
 ) -> None:
-    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; axes: of SPZ.
+    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; axes: of SPZ;
+    origin: added to positions, in float64.
 
     Raises:
         InputError: a value is not finite; the property and the number of rows are named. Or the format cannot hold
@@ -59,9 +67,11 @@ def write_gaussians(
     """
     suffix = suffix_of(path)
     if suffix in (STANDARD, ""):
-        write_columns(path, columns_of(gaussians), comments)
+        write_columns(path, columns_of(gaussians), comments, origin)
+    elif suffix == ".glb":
+        write_whole(path, encode_glb(arrays_of(gaussians), comments, origin))
     else:
-        write_compact(path, suffix, arrays_of(gaussians), comments, compensated, axes)
+        write_compact(path, suffix, arrays_of(away(gaussians, origin)), comments, compensated, axes)
 
 
 def write_compact(
@@ -73,26 +83,46 @@ def write_compact(
     elif suffix == ".sog":
         content = encode_sog(arrays, compensated)
     else:
-        content = (encode_glb if suffix == ".glb" else encode_compressed_ply)(arrays, comments)
+        content = encode_compressed_ply(arrays, comments)
     write_whole(path, content)
 
 
-def write_columns(path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = ()) -> None:
-    """Write a splat file of any properties; errors as `write_gaussians`."""
+def write_columns(
+    path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = (), origin: Origin = NO_ORIGIN
+) -> None:
+    """Write a splat file of any properties. origin: added to x, y and z, which are doubles then; errors as
+    `write_gaussians`."""
     columns = {name: value.detach().float().cpu().numpy() for name, value in values.items()}
     for name, value in columns.items():
         bad = int((~np.isfinite(value)).sum())
         if bad:
             raise InputError(f"{path} is not written: {bad} of {len(value)} values of '{name}' are not finite")
+    if any(origin):
+        columns |= {axis: columns[axis].astype(float) + by for axis, by in zip("xyz", origin, strict=True)}
     write_ply(path, columns, comments)
 
 
-def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
-    """Read a splat file of any SH degree, of the format that its first bytes show. axes: of SPZ, which does not tell.
+def read_gaussians(path: Path, axes: str = "rub", origin: Origin = NO_ORIGIN) -> Gaussians:
+    """Read a splat file of any SH degree, of the format that its first bytes show. axes: of SPZ, which does not tell;
+    origin: subtracted from positions in float64.
 
     Raises:
         InputError: it is damaged, or lacks a property.
     """
+    return around(read_in_double(path, axes), origin)
+
+
+def read_around(path: Path, axes: str = "rub", base: Origin = NO_ORIGIN) -> tuple[Gaussians, Origin]:
+    """Read a splat file as (Gaussians around an origin of their own, that origin), where coordinates count from `base`;
+    errors as `read_gaussians`."""
+    x, y, z = base
+    gaussians = away(read_in_double(path, axes), (-x, -y, -z))
+    origin = origin_of_positions(gaussians.means)
+    return around(gaussians, origin), origin
+
+
+def read_in_double(path: Path, axes: str = "rub") -> Gaussians:
+    """Read a splat file as `read_gaussians`, with means in float64; the origin that a file states is added to them."""
     path = splat_file_at(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: check the path")
@@ -102,13 +132,13 @@ def read_gaussians(path: Path, axes: str = "rub") -> Gaussians:
         kind = format_of(content[:MOST_HEADER], path)
         if kind != suffix_of(path):
             logger.info("%s is read as %s, which its first bytes show", path, kind)
-        return decode(content, kind, axes, str(path))
+        return away(decode(content, kind, axes, str(path)), stated_in(content[:MOST_HEADER]))
     except (OSError, InputError) as problem:
         raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
 
 
 def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
-    """Return the splats of a file's content. kind: one of SUFFIXES; name: of the file, for the log.
+    """Return the splats of a file's content, means in float64. kind: one of SUFFIXES; name: of the file, for the log.
 
     Raises:
         InputError: it is damaged, or lacks a property.
@@ -116,14 +146,20 @@ def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
     if kind == STANDARD:
         return decode_standard_ply(content, name)
     if kind == ".spz":
-        return gaussians_from(decode_spz(content, axes))
+        return in_double(decode_spz(content, axes))
     if kind == ".glb":
-        return gaussians_from(decode_glb(content, name, Path(name).parent))
+        return in_double(decode_glb(content, name, Path(name).parent))
     if kind == ".sog":
-        return gaussians_from(decode_sog(content, Path(name)))
+        return in_double(decode_sog(content, Path(name)))
     with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out
-        gaussians = gaussians_from(DECODERS[kind](content))
+        gaussians = in_double(DECODERS[kind](content))
     return Gaussians(**finite_rows(vars(gaussians), name))
+
+
+def in_double(arrays: Arrays) -> Gaussians:
+    """Return Gaussians of arrays, means in float64; those that float32 cannot hold are NaN."""
+    gaussians, means = gaussians_from(arrays), torch.from_numpy(arrays.means)
+    return replace(gaussians, means=torch.where(gaussians.means.isfinite(), means, torch.nan))
 
 
 def compensated(path: Path) -> bool:

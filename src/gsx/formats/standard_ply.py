@@ -44,7 +44,7 @@ ANCHORS = ("f_anchor_feat_0", "f_offset_0")
 
 
 def decode_standard_ply(content: bytes, name: str) -> Gaussians:
-    """Return the splats of a file's content. name: of the file, for the log.
+    """Return the splats of a file's content, means in float64. name: of the file, for the log.
 
     Raises:
         InputError: it is damaged, or holds no splats of 3D-GS.
@@ -63,10 +63,16 @@ def decode_standard_ply(content: bytes, name: str) -> Gaussians:
     if "filter_3D" in columns:
         drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], float_column(columns, "filter_3D"))
         raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
+    raw["means"] = torch.where(raw["means"].isfinite(), in_double(columns), torch.nan)
     gaussians = Gaussians(**finite_rows(raw, name))
     for sentence in activated_words(gaussians):
         logger.warning("%s: %s", name, sentence)
     return gaussians
+
+
+def in_double(columns: Columns) -> Float[Tensor, "N 3"]:
+    """Return positions as a file has them."""
+    return torch.from_numpy(np.stack([columns[axis].astype(float) for axis in "xyz"], 1))
 
 
 def problem_of(columns: Columns, content: bytes) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import pinhole
+from gsx.core.data.camera import Camera, pinhole
 from gsx.core.data.images import image_size
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
@@ -20,12 +20,14 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
+from gsx.formats.origin import in_words
 from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, needs_lens, test_file
 from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
+from gsx.scenes.origin import origin_of_cameras, point_looked_at
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     Shot,
@@ -89,7 +91,7 @@ def load(options: BlenderOptions) -> Scene:
     grouped = list(options.test_scales) != [1]
     train = [reduced(view, factor) for factor in options.scales for view in train]
     test = [reduced(view, factor, grouped) for factor in options.test_scales for view in test]
-    points, points_note = _points(options, folder)
+    points, points_note = _points(options, folder, [view.camera for view in views])
     return Scene(
         name=folder.resolve().name,
         train=train,
@@ -232,14 +234,18 @@ def _test_note(file: Path | None, rule: str) -> list[str]:
     return [f"Test views are those of {file.name}: there is no test file."] if file is not None and val else []
 
 
-def _points(options: BlenderOptions, folder: Path) -> tuple[PointCloud, str]:
-    """Points and a note on where they come from."""
+def _points(options: BlenderOptions, folder: Path, cameras: Sequence[Camera]) -> tuple[PointCloud, str]:
+    """Points and a note on where they come from; random ones lie about (0, 0, 0), or about what far cameras look at."""
     stored = folder / (POINTS_FILE if options.points == "auto" else options.points)
     if options.points == "random" or (options.points == "auto" and not stored.is_file()):
         corner = torch.full((3,), options.points_bound, dtype=torch.float64)
         generator = torch.Generator().manual_seed(options.seed)
-        cloud = random_points(options.random_points, -corner, corner, generator)
-        return cloud, f"Starts from {len(cloud)} random points in [-{options.points_bound}, {options.points_bound}]^3."
+        far = any(origin_of_cameras(cameras, options.points_bound))
+        middle = point_looked_at(cameras) if far else torch.zeros_like(corner)
+        cloud = random_points(options.random_points, middle - corner, middle + corner, generator)
+        about = f" about {in_words(middle.round(decimals=3).tolist())}, which the cameras look at" if far else ""
+        cube = f"[-{options.points_bound}, {options.points_bound}]^3{about}"
+        return cloud, f"Starts from {len(cloud)} random points in {cube}."
     cloud = read_points(stored)
     return cloud, f"Starts from the {len(cloud)} points of {stored.name}."
 

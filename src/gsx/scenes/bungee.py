@@ -31,6 +31,7 @@ from gsx.scenes import colmap
 from gsx.scenes.colmap_folders import model_folders
 from gsx.scenes.duplicates import photos_of, refuse_shared
 from gsx.scenes.masked import mask_notes
+from gsx.scenes.origin import moved, origin_of_cameras
 from gsx.scenes.points import grey_points, read_points
 from gsx.scenes.posed import (
     Shot,
@@ -208,7 +209,12 @@ def _points(
         )
     generator = torch.Generator().manual_seed(options.seed)
     cameras = [view.camera for view in views]
-    cloud = city_points(cameras, options.random_points, BUILDING_HEIGHT * scale, generator)
+    x, y, _ = origin_of_cameras(cameras)
+    below = (x, y, 0.0)  # heights count from the ground
+    local = [moved(camera, below) for camera in cameras]
+    cloud = city_points(local, options.random_points, BUILDING_HEIGHT * scale, generator)
+    if any(below):
+        cloud = grey_points(cloud.positions + torch.tensor(below, dtype=torch.float64))
     return cloud, f"Starts from {len(cloud)} random points on rays of the cameras, up to {BUILDING_HEIGHT:g} m high."
 
 

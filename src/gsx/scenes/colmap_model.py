@@ -24,6 +24,7 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.files import refuse_lfs_pointer
 from gsx.core.shapes import Bool, Float
+from gsx.formats.origin import in_single_where_resolved
 from gsx.scenes.colmap_folders import model_files
 from gsx.scenes.colmap_poses import pose_conflict, text_conflict, unmatched
 from gsx.scenes.colmap_records import U64, check_binary, contradiction
@@ -106,7 +107,7 @@ def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, lis
     dropped = int((~usable).sum())
     colours = torch.from_numpy(np.array([point.color for point in points]))
     notes = [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
-    cloud = PointCloud(positions[usable].float(), colours[usable])
+    cloud = PointCloud(in_single_where_resolved(positions[usable]), colours[usable])
     return cloud, dict(zip(numbers, positions, strict=True)), notes
 
 

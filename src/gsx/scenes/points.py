@@ -12,6 +12,7 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
 from gsx.formats.colours import colours_among, full_scale_of
+from gsx.formats.origin import in_single_where_resolved
 from gsx.formats.ply import read_ply
 
 logger = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ def random_points(
 
 def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
     """Points without a colour of their own."""
-    return PointCloud(positions.float(), torch.full((len(positions), 3), GREY, dtype=torch.uint8))
+    return PointCloud(in_single_where_resolved(positions), torch.full((len(positions), 3), GREY, dtype=torch.uint8))
 
 
 def read_points(path: Path) -> PointCloud:
@@ -50,13 +51,13 @@ def read_points(path: Path) -> PointCloud:
     columns = read_ply(path)
     if not {"x", "y", "z"} <= set(columns):
         raise InputError(f"'{path}' has no x, y, z but {', '.join(columns)}, give a point cloud.")
-    with np.errstate(over="ignore"):  # beyond float32 is infinite, which is left out
-        positions = torch.from_numpy(np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1))
-    finite = positions.isfinite().all(dim=1)
+    positions = torch.from_numpy(np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1))
+    finite = positions.float().isfinite().all(dim=1)  # beyond float32 is infinite, which is left out
     if not finite.any():
         raise InputError(f"'{path}' holds no point with finite coordinates, give another or scene.points=random.")
     colours = colours_in(columns)
-    return grey_points(positions[finite]) if colours is None else PointCloud(positions[finite], colours[finite])
+    positions = in_single_where_resolved(positions[finite])
+    return grey_points(positions) if colours is None else PointCloud(positions, colours[finite])
 
 
 def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None:

@@ -103,7 +103,7 @@ class PointCloud:
     """Points that initialise a backbone."""
 
     positions: Float[Tensor, "P 3"]
-    """World coordinates, float32."""
+    """World coordinates, float32; of loaders, float64 where they lie far from (0, 0, 0) (`gsx.scenes.origin`)."""
     colours: UInt8[Tensor, "P 3"]
     """Display RGB."""
 
@@ -127,6 +127,8 @@ class Scene:
     """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
     notes: Sequence[str] = ()
     """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
 

@@ -7,6 +7,7 @@ read, or of another gsx, is not damaged, and nobody goes on from an older one.
 
 import hashlib
 import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,7 @@ def write(run: Run, folder: Path) -> Path:
         "sampler": run.sampler.order,
         "orders": run.sampler.begun,
         "views": names_of(run),
+        "origin": run.scene.origin,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     write_json(path.with_suffix(".json"), sidecar)
@@ -97,6 +99,18 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
 def sidecars(folder: Path) -> list[Path]:
     """Sidecars of a checkpoint folder, oldest first."""
     return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdecimal())
+
+
+def origin_in(folder: Path) -> tuple[float, float, float] | None:
+    """Return the origin of the positions in a run's checkpoints, (0, 0, 0) for those of gsx before origins.
+
+    None: there is no checkpoint that can be read; `restore` says why.
+    """
+    for sidecar in reversed(sidecars(folder / "checkpoints")):
+        with suppress(OSError, ValueError, AttributeError, TypeError):
+            x, y, z = map(float, read_json(sidecar).get("origin", (0, 0, 0)))
+            return x, y, z
+    return None
 
 
 def step_of(sidecar: Path) -> int:

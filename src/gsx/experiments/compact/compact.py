@@ -38,7 +38,7 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings, write_config
-from gsx.experiments.runs.start_file import composition_of, start_doubts, starting_splats
+from gsx.experiments.runs.start_file import composition_of, in_scene, start_doubts, starting_splats
 from gsx.experiments.runs.verified import verified
 from gsx.formats.splat_files import read_gaussians
 from gsx.formats.suffixes import STANDARD
@@ -133,6 +133,7 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
     settings = compose([*words, f"iterations={FILE_STEPS}"], plugins)
     scene, start = verified(load_scene(settings)), starting_splats(settings)
+    start = start and in_scene(start, scene)
     start_doubts(settings, scene, start)
     run = build(settings, scene, Path(), training=True, start=start)
     run.step = run.iterations
@@ -203,7 +204,8 @@ def written(run: Run, shrinking: Shrinking, folder: Path, suffixes: Sequence[str
         try:
             with without_bands(run, degree):
                 export(run, path)
-            read = figures(run, shrinking.judging, [float(zoom) for zoom in own], read_gaussians(path))
+            again = read_gaussians(path, origin=run.scene.origin)
+            read = figures(run, shrinking.judging, [float(zoom) for zoom in own], again)
             out[suffix] = File(path.stat().st_size, max(own[zoom] - read[zoom] for zoom in own))
         except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds
             path.unlink(missing_ok=True)

@@ -55,6 +55,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
             "test_views": len(run.scene.test),
             "points": len(run.scene.points),
             "extent": run.scene.extent,
+            "origin": list(run.scene.origin),
             "notes": list(run.scene.notes),
         },
     }

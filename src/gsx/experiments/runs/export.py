@@ -11,7 +11,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import View
-from gsx.core.errors import GsxError
+from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
@@ -24,10 +24,12 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
+from gsx.experiments.runs.coordinates import COMMENTED, log_coordinates, placement, refuse_too_far
 from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.arrays import arrays_of, gaussians_from
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from gsx.formats.origin import NO_ORIGIN
 from gsx.formats.ply import write_whole
 from gsx.formats.splat_files import read_gaussians, write_columns, write_gaussians
 from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
@@ -50,30 +52,37 @@ class Exported:
 
 
 @yielding_cores()
-def export(run: Run, path: Path, camera: Camera | None = None, axes: str = "rub", zoom: float = 0) -> Exported | None:
+def export(
+    run: Run, path: Path, camera: Camera | None = None, axes: str = "rub", zoom: float = 0, local: bool = False
+) -> Exported | None:
     """Write the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
 
     camera: what is drawn for it alone. Without one a model that has no standard form is baked where the file is to hold
     one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. axes: of SPZ.
+    local: positions relative to the scene's origin.
 
     Raises:
         InputError: the format cannot hold the splats, or the model cannot be baked.
     """
     columns = own_columns(run) if camera is None else None
+    origin, stated = placement(run.scene.origin, local or is_page(path))
     if columns is not None and suffix_of(path) == STANDARD and not zoom:
-        write_columns(path, columns, notes(run))
+        write_columns(path, columns, [*notes(run), *stated], origin)
+        log_coordinates(path, run.scene.origin, local)
         return None
     explicit = None if columns is not None or zoom > 0 else explicit_of(run, camera)
     baked = explicit is None
     gaussians = bake(run, zoom or 1.0) if explicit is None else explicit
     gaussians = Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
-    comments = [*notes(run), f"SplatRenderMode: {render_mode(run.raster)}"]
+    comments = [*notes(run), *stated, f"SplatRenderMode: {render_mode(run.raster)}"]
     if baked:
         comments.append(f"splats as training cameras see them on average, at {zoom or 1:g} times their resolution")
     if is_page(path):
         write_whole(path, page_of(run, gaussians, comments).encode())
     else:
-        write_gaussians(path, gaussians, comments, run.raster.compensate, axes)
+        refuse_too_far(path, gaussians, origin)
+        write_gaussians(path, gaussians, comments, run.raster.compensate, axes, origin)
+    log_coordinates(path, run.scene.origin, local or is_page(path), gaussians)
     return Exported(gaussians=gaussians, baked=baked)
 
 
@@ -155,11 +164,19 @@ def render_mode(raster: RasterSettings) -> str:
 
 @yielding_cores()
 def losses(
-    run: Run, settings: Settings, path: Path, views: Sequence[View], written: Exported, axes: str = "rub"
+    run: Run,
+    settings: Settings,
+    path: Path,
+    views: Sequence[View],
+    written: Exported,
+    axes: str = "rub",
+    local: bool = False,
 ) -> list[str]:
     """What a standard file, read again, and baking have lost, in PSNR of renders of some views; in words."""
     views, inside = views[:LOOKED_AT], written.gaussians
-    again = as_in_page(inside) if is_page(path) else read_gaussians(path, axes)
+    stated = local and suffix_of(path) in COMMENTED
+    origin = NO_ORIGIN if local and not stated else run.scene.origin
+    again = as_in_page(inside) if is_page(path) else read_gaussians(path, axes, origin)
 
     def pictures(gaussians: Gaussians) -> list[Float[Tensor, "3 H W"]]:
         pixels = settings.evaluation.tile_pixels

@@ -19,6 +19,7 @@ from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
 from gsx.experiments.runs.scene_extent import in_one_place, measured
 from gsx.experiments.runs.settings import typed
+from gsx.scenes.origin import around_origin, origin_of
 
 logger = logging.getLogger(__name__)
 
@@ -120,7 +121,8 @@ def scene_lines(
     overrides = its.overrides(path)
     found.command = training_command(loader, path, overrides)
     if its.quick or patient:
-        scene = measured(loader.factory(options_for(loader, path, overrides, plugins)))
+        loaded = loader.factory(options_for(loader, path, overrides, plugins))
+        scene = measured(around_origin(loaded, origin_of(loaded)))
         yield from loaded_lines(scene)
         found.ask(lambda: capture_lines(scene))
     else:

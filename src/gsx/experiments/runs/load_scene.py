@@ -16,13 +16,15 @@ from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
+from gsx.formats.origin import Origin
+from gsx.scenes.origin import around_origin, origin_of
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 """If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""
 
 
-def load_scene(settings: Settings) -> Scene:
-    """The scene, with views to evaluate on.
+def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
+    """Return the scene, with views to evaluate on. origin: of the model that is at hand; None: the scene's own.
 
     Raises:
         InputError: it cannot be loaded, its loader made no scene of it, the split leaves no test views, or cameras and
@@ -31,7 +33,8 @@ def load_scene(settings: Settings) -> Scene:
     options = settings.scene.options
     loaded = checked(settings.scene.component.factory(options), settings.scene.component.name)
     loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
-    scene = warned_of_units(measured(in_units(loaded, options.unit if isinstance(options, InUnits) else 1.0)))
+    unit = options.unit if isinstance(options, InUnits) else 1.0
+    scene = warned_of_units(measured(placed(loaded, checked_unit(unit), origin)))
     if not scene.test:
         raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
     if not scene.extent > 0:
@@ -96,14 +99,31 @@ def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
     return filled(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
 
 
-def in_units(scene: Scene, unit: float) -> Scene:
-    """The scene with positions of cameras and points multiplied by `unit`.
+def checked_unit(unit: float) -> float:
+    """Return the unit.
 
     Raises:
-        ConfigError: `unit` is not a positive number.
+        ConfigError: it is not a positive number.
     """
     if not 0 < unit < math.inf:
         raise ConfigError(f"scene.unit is {unit}; give a positive number")
+    return unit
+
+
+def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:
+    """Return the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
+    origin = scaled(origin_of(scene), unit) if origin is None else origin
+    return replace(in_units(around_origin(scene, scaled(origin, 1 / unit)), unit), origin=origin)
+
+
+def scaled(origin: Origin, factor: float) -> Origin:
+    """Return an origin in other units."""
+    x, y, z = (value * factor for value in origin)
+    return x, y, z
+
+
+def in_units(scene: Scene, unit: float) -> Scene:
+    """The scene with positions of cameras and points multiplied by `unit`."""
     if unit == 1:
         return scene
     return replace(

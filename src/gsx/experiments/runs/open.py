@@ -38,7 +38,7 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import help_at_once
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
-from gsx.experiments.runs.start_file import start_doubts, starting_splats
+from gsx.experiments.runs.start_file import in_scene, start_doubts, starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
 
@@ -103,6 +103,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         require("viewer=true", ("viser",), "gsx[viewer]")
     start = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
+    start = start and in_scene(start, scene)
     doubts = start_doubts(settings, scene, start)
     run = build(settings, scene, Path(), training=True, start=start)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims, doubts))
@@ -175,7 +176,9 @@ def open_run(
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
-    loaded = ranks_here().rank0_first(lambda: verified(load_scene(settings)) if training else load_scene(settings))
+    origin = checkpoint.origin_in(folder)
+    checked = verified if training else (lambda scene: scene)
+    loaded = ranks_here().rank0_first(lambda: checked(load_scene(settings, origin)))
     run = build(settings, loaded, folder, training, begins=False)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")

@@ -21,7 +21,8 @@ from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
-from gsx.formats.splat_files import read_gaussians
+from gsx.formats.splat_files import read_around
+from gsx.scenes.origin import moved
 
 logger = logging.getLogger(__name__)
 
@@ -65,18 +66,19 @@ Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
 
 
 def run_pictures(run: Run, settings: Settings) -> Draw:
-    """The model of a run, for any camera."""
-    return lambda camera: render(run, camera, settings.evaluation.tile_pixels).image
+    """The model of a run, for any camera in the coordinates of the scene's files."""
+    pixels, origin = settings.evaluation.tile_pixels, run.scene.origin
+    return lambda camera: render(run, moved(camera, origin), pixels).image
 
 
 def file_pictures(path: Path) -> Draw:
-    """The splats of a file over black, for any camera.
+    """The splats of a file over black, for any camera in its coordinates.
 
     Raises:
         InputError: it cannot be read.
     """
-    gaussians, raster = read_gaussians(path), rules_of(path)
-    return lambda camera: render_gaussians(gaussians, camera, raster, torch.zeros(3))
+    (gaussians, origin), raster = read_around(path), rules_of(path)
+    return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
 
 
 @yielding_cores()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, Scene
@@ -13,12 +14,14 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import doubts_about
-from gsx.formats.splat_files import compensated, read_gaussians
+from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words, rounding_at, stored_in_single
+from gsx.formats.splat_files import compensated, read_in_double
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +32,7 @@ MIP_KERNEL = 0.1
 
 
 def starting_splats(settings: Settings) -> Gaussians | None:
-    """The Gaussians that a run begins with; None: it begins with points.
+    """Return the Gaussians that a run begins with, means in float64 as the file has them; None: it begins with points.
 
     Raises:
         InputError: the file cannot be read, or holds nothing.
@@ -37,11 +40,36 @@ def starting_splats(settings: Settings) -> Gaussians | None:
     path = splat_file(settings.general.init)
     if path is None:
         return None
-    gaussians = read_gaussians(path)
+    gaussians = read_in_double(path)
     if not len(gaussians.means):
         raise InputError(f"init: {path} holds no splats: choose another file")
     logger.info("beginning with the %d splats of %s", len(gaussians.means), path)
     return gaussians
+
+
+def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
+    """Return Gaussians of a file relative to the scene's origin.
+
+    A file that lies around (0, 0, 0), as other programs leave it, is taken as written around that origin.
+    """
+    if not any(scene.origin):
+        return around(gaussians, scene.origin)
+    if lies_around_zero(gaussians.means, scene.origin):
+        logger.warning(
+            "init: the splats lie around (0, 0, 0), and the scene around %s: taken for coordinates relative to that",
+            in_words(scene.origin),
+        )
+        return around(gaussians, NO_ORIGIN)
+    if stored_in_single(gaussians.means):
+        step = rounding_at(gaussians.means)
+        logger.warning("init: positions are stored in single precision, in steps of %.2g scene units there", step)
+    return around(gaussians, scene.origin)
+
+
+def lies_around_zero(positions: Float[Tensor, "P 3"], origin: Origin) -> bool:
+    """Return whether most positions are nearer to (0, 0, 0) than to an origin."""
+    offsets = positions - torch.tensor(origin, dtype=torch.float64)
+    return float((positions.norm(dim=1) < offsets.norm(dim=1)).double().mean()) > 0.5
 
 
 def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> list[str]:

@@ -18,7 +18,7 @@ from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.pictures import FileModel, RunModel
 from gsx.experiments.viewer.server import Viewer
 from gsx.experiments.viewer.training import told_of
-from gsx.formats.splat_files import read_gaussians
+from gsx.formats.splat_files import read_around
 
 EVERY = 2.0
 """Seconds between looks at a run's folder."""
@@ -78,11 +78,11 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
 @yielding_cores()
 def view_file(path: Path, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Show a splat file until Ctrl-C; errors as `view_run`."""
-    gaussians = read_gaussians(path)
+    gaussians, origin = read_around(path)
     if not len(gaussians.means):
         raise InputError(f"{path} holds no splats: choose another file")
     raster = rules_of(path)
-    viewer = Viewer(FileModel(gaussians, raster), path.name, host, port)
+    viewer = Viewer(FileModel(gaussians, raster, origin), path.name, host, port)
     viewer.tell(f"{len(gaussians.means):,} splats{', opacities compensated' if raster.compensate else ''}")
     announce(viewer.address)
     try:

@@ -1,9 +1,10 @@
 """Camera paths: keyframes in time, gsx's own JSON and nerfstudio's.
 
 Own files: {"gsx_camera_path": 1, "size": [width, height], "fps": 24, "keyframes": [{"time": 0.0, "position": [x, y, z],
-"wxyz": [w, x, y, z], "fov": degrees}, ...]}. Positions are in the world of the model; rotations take camera axes (x
-right, y down, z ahead) to the world; fov is vertical. nerfstudio's (`ns-render camera-path`): `camera_path` with
-`camera_to_world` (y up, z back) and `fov`, a frame each, taken to be in the same world.
+"wxyz": [w, x, y, z], "fov": degrees}, ...]}. Positions are in the coordinates of the scene's files, times scene.unit;
+rotations take camera axes (x right, y down, z ahead) to the world; fov is vertical. nerfstudio's (`ns-render
+camera-path`): `camera_path` with `camera_to_world` (y up, z back) and `fov`, a frame each, taken to be in the same
+world.
 """
 
 import math

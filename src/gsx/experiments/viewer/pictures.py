@@ -17,6 +17,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.viewer.camera_path import posed
+from gsx.formats.origin import NO_ORIGIN, Origin
 
 BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
 """What the right part of the picture may show: the photograph of the view one has jumped to, how far the render is
@@ -69,6 +70,11 @@ class RunModel:
 
     run: Run
 
+    @property
+    def origin(self) -> Origin:
+        """Return what is added to positions for the coordinates of the scene's files."""
+        return self.run.scene.origin
+
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
         """The model alone."""
         splats = splats_for(self.run, camera.zoom(2.0**look.finer_levels))
@@ -103,6 +109,8 @@ class FileModel:
 
     gaussians: Gaussians
     raster: RasterSettings
+    origin: Origin = NO_ORIGIN
+    """What is added to positions for the coordinates of the file."""
     height: int = 480
     """Of photographs that nobody knows."""
     focal: float = 0.5

@@ -27,6 +27,7 @@ from gsx.core.shapes import Float
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
 from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
+from gsx.formats.origin import Origin
 
 logger = logging.getLogger(__name__)
 
@@ -179,7 +180,14 @@ class Panel:
     def tell(self) -> None:
         """How the model stands, and how fast pictures come."""
         rate = f", {self.screen.rate:.1f} pictures/s while moving" if self.screen.rate else ""
-        self.state.content = f"**{self.viewer.title}**  \n{self.viewer.told}{rate}"
+        self.state.content = f"**{self.viewer.title}**  \n{self.viewer.told}{rate}{self.place()}"
+
+    def place(self) -> str:
+        """Return where the browser looks from, in the coordinates of the files, where these have another origin."""
+        origin, pose = self.viewer.frames.model.origin, self.screen.pose
+        if pose is None or not any(origin):
+            return ""
+        return f"  \nat {', '.join(f'{value:.3f}' for value in in_file(pose.position, origin))}"
 
     def begin(self) -> None:
         """Look from the first test view, or from before the splats."""
@@ -256,7 +264,8 @@ class Panel:
         frames, pose = self.viewer.keyframes, self.screen.pose
         at = frames[-1].time + KEYFRAME_SECONDS if frames else 0.0
         fov = 2 * math.atan(math.tan(pose.fov / 2) / self.screen.look.zoom)
-        frames.append(Keyframe(time=at, position=pose.position, wxyz=pose.wxyz, fov=fov))
+        position = in_file(pose.position, self.viewer.frames.model.origin)
+        frames.append(Keyframe(time=at, position=position, wxyz=pose.wxyz, fov=fov))
         self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
 
     def saving(self, save: Callable[[], None]) -> None:
@@ -317,6 +326,12 @@ def pose_of(view: View, width: int) -> Pose:
     fov = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
     height = max(1, round(width * camera.height / camera.width))
     return Pose(tuple(camera.centre.tolist()), tuple(wxyz.tolist()), fov, width, height)
+
+
+def in_file(position: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
+    """Return a position of the browser in the coordinates of the files that the model comes from."""
+    x, y, z = (value + by for value, by in zip(position, origin, strict=True))
+    return x, y, z
 
 
 def free(folder: Path, stem: str, suffix: str) -> Path:

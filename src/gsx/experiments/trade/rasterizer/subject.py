@@ -23,7 +23,7 @@ from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
-from gsx.formats.splat_files import read_gaussians
+from gsx.formats.splat_files import read_around
 from gsx.formats.suffixes import READABLE, suffix_of
 
 FILE_SIZE = (640, 480)
@@ -170,7 +170,7 @@ def subject_of_file(path: Path, overrides: Sequence[str], views: int, plugins: P
         if override.partition("=")[0].lstrip("+~").split(".")[0] not in FILE_KEYS:
             raise ConfigError(f"'{override}' means nothing to a splat file: override only {', '.join(FILE_KEYS)}")
     device = choose_device(settings.general.device)
-    gaussians = read_gaussians(path)
+    gaussians, _ = read_around(path)
     cameras, note = framing_cameras(gaussians.means, views, path)
     shots = [
         Shot(name=f"around {i}", camera=camera, splats=on(splats_of(gaussians, camera.centre), device))
