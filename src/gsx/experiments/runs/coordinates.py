@@ -18,7 +18,7 @@ COMMENTED = (STANDARD, ".compressed.ply", ".glb", "")
 
 
 def placement(origin: Origin, local: bool) -> tuple[Origin, list[str]]:
-    """Return (what is added to positions of a file, comments): the origin, or where the file is `local` its statement."""
+    """Return (what is added to positions of a file, comments): the origin, or its statement in a `local` file."""
     if not any(origin):
         return NO_ORIGIN, []
     return (NO_ORIGIN, [comment_of(origin)]) if local else (origin, [])

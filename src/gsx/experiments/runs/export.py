@@ -11,7 +11,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import View
-from gsx.core.errors import GsxError, InputError
+from gsx.core.errors import GsxError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
