@@ -16,12 +16,15 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
 from gsx.cli import folder as folders
+from gsx.cli.arguments import is_override
 from gsx.cli.dispatch import main
+from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
 from gsx.experiments.runs import video
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.orbit import write_animation
 from gsx.experiments.runs.video import photos_of, sharpest, sharpness
+from gsx.scenes.photos import find_photos
 
 
 @pytest.fixture
@@ -46,6 +49,43 @@ def test_a_colmap_folder_and_photos_are_told_apart(
     assert photos.scene.component.name == "photos"
     told = [shlex.split(line) for line in capsys.readouterr().err.splitlines() if line.startswith("gsx scene=")]
     assert told == [["gsx", *words] for words in trained], "it can be pasted"
+
+
+def test_pictures_of_a_sog_are_no_photos(
+    tmp_path: Path, trained: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("means_l", "means_u", "quats", "scales", "sh0"):
+        write_image(tmp_path / f"{name}.png", torch.rand(3, 8, 8))
+        (tmp_path / f"{name}.png").rename(tmp_path / f"{name}.webp")
+    assert main([str(tmp_path)]) == 2
+    assert "pictures of a SOG (means_l.webp) and no meta.json" in capsys.readouterr().err
+    (tmp_path / "meta.json").write_text('{"version": 2, "means": {}, "scales": {}, "quats": {}, "sh0": {}}')
+    assert main([str(tmp_path)]) == 2
+    assert (
+        f"{tmp_path} is an unbundled SOG, whose pictures hold splats (meta.json): gsx view" in capsys.readouterr().err
+    )
+    assert main(["scenes", str(tmp_path)]) == 2
+    assert "is an unbundled SOG" in capsys.readouterr().out
+    with pytest.raises(InputError, match="is an unbundled SOG"):
+        find_photos(tmp_path)
+    assert not trained
+
+
+def test_a_path_that_exists_is_no_override(
+    tmp_path: Path, trained: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(synthesize(), tmp_path / "in" / "a=b")
+    write_scene(synthesize(), tmp_path / "c=d, e (1)")
+    monkeypatch.chdir(tmp_path)
+    assert is_override("in/a=c")
+    for name in ("in/a=b", "c=d, e (1)"):
+        assert not is_override(name)
+        assert main([name, "iterations=3"]) == 0
+        for words in (trained[-1], ["scene=colmap", f"scene.path={name}"]):
+            assert Path(compose(words, plugins()).scene.options.path).resolve() == tmp_path / name
+        assert main(["scenes", name]) == 0
+    assert main(["--cfg", "job", "scene=colmap", "scene.path=in/a=b"]) == 0
+    assert "path: in/a=b" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

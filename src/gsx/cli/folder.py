@@ -1,17 +1,15 @@
 """gsx FOLDER: find out what it is, say what is done with it, and do it."""
 
 import logging
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.train import verb_train
 from gsx.core.collector import loading
-from gsx.core.errors import ConfigError, InputError, command
+from gsx.core.errors import ConfigError, command
 from gsx.core.files import at_home
 from gsx.core.plugins import Plugins
-from gsx.formats.suffixes import suffix_of
 
 logger = logging.getLogger("gsx.cli")
 
@@ -39,18 +37,14 @@ def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[s
     """Words of the command line for the scene that a folder or a video is.
 
     Raises:
-        InputError: it is none; a splat file gets told what can be done with it.
+        InputError: it is none; of a splat file the message says what can be done with it.
     """
     from gsx.experiments.runs.compose import word_of
-    from gsx.experiments.runs.inspect import readable, refuse_run, unknown
+    from gsx.experiments.runs.inspect import readable, refuse_run, refuse_splats, unknown
     from gsx.experiments.runs.video import is_video, photos_of
 
     refuse_run(path)
-    if path.is_file() and suffix_of(path):
-        raise InputError(
-            f"{path} is a splat file: {command('view', path)}, {command('eval', path)} scene=... scene.path=FOLDER, "
-            f"or train on with {shlex.quote(word_of('init', str(path)))} scene=... scene.path=FOLDER"
-        )
+    refuse_splats(path)
     if is_video(path):
         output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")
         return ["scene=photos", word_of("scene.path", str(photos_of(path, Path(output))))]

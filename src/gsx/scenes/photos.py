@@ -15,6 +15,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import at_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
+from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
 from gsx.scenes.colmap_model import Model, error_told, read_model
 from gsx.scenes.kept_models import intact, kept_model
@@ -101,6 +102,8 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     """
     if not path.is_dir():
         raise InputError(f"scene.path '{path}' is no folder: name the folder that holds the photos.")
+    if is_sog_folder(path):
+        raise InputError(f"{path} is an unbundled SOG, whose pictures hold splats: open it by gsx view or gsx eval.")
     folder = path / IMAGES if not photos_in(path, "*") and (path / IMAGES).is_dir() else path
     names = photos_in(folder, "*") or photos_in(folder, "**/*")
     if len(names) < MIN_PHOTOS:

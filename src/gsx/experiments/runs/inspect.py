@@ -1,6 +1,7 @@
 """What is in this folder? Answers `gsx scenes PATH`, also for folders that cannot be trained from."""
 
 import logging
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,10 +20,13 @@ from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
 from gsx.experiments.runs.scene_extent import in_one_place, measured
 from gsx.experiments.runs.settings import typed
+from gsx.formats.suffixes import META, splat_file_at, suffix_of
 from gsx.scenes.origin import around_origin, origin_of
 
 logger = logging.getLogger(__name__)
 
+SOG_PICTURE = "means_l.webp"
+"""In the folder of each unbundled SOG."""
 Readable = list[tuple[Component, SceneFormat]]
 """Loaders that can read a folder, the most telling first."""
 
@@ -55,6 +59,7 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
 
     def formats() -> Iterator[str]:
         refuse_run(path)
+        refuse_splats(path)
         loaders.extend(readable(path, plugins))
         yield from format_lines(path, loaders, plugins)
 
@@ -86,6 +91,19 @@ def refuse_run(path: Path) -> None:
     if others and (path / "config.yaml").is_file():
         looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
         raise InputError(f"{path} is a run: {looks}")
+
+
+def refuse_splats(path: Path) -> None:
+    """Raise InputError for a splat file or the folder of a SOG, whose pictures are no photos."""
+    file = splat_file_at(path)
+    if file.is_file() and suffix_of(file):
+        kind = "a splat file" if path.is_file() else f"an unbundled SOG, whose pictures hold splats ({file.name})"
+        raise InputError(
+            f"{path} is {kind}: {command('view', path)}, {command('eval', path)} scene=... scene.path=FOLDER, "
+            f"or train on with {shlex.quote(word_of('init', str(path)))} scene=... scene.path=FOLDER"
+        )
+    if (path / SOG_PICTURE).is_file():
+        raise InputError(f"{path} holds pictures of a SOG ({SOG_PICTURE}) and no {META} that says so: copy it as well.")
 
 
 def format_lines(path: Path, loaders: Readable, plugins: Plugins) -> Iterator[str]:
