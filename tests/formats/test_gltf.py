@@ -231,24 +231,25 @@ def test_bytes_strides_and_sparse_values_by_hand(tmp_path: Path) -> None:
     torch.testing.assert_close(found.quats.abs(), torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0]]))
 
 
+@pytest.mark.parametrize("name", ["a.gltf", "a.glb"])
 @pytest.mark.parametrize("kind", ["data", "file"])
-def test_text_with_its_buffers(tmp_path: Path, kind: str) -> None:
+def test_text_with_its_buffers(tmp_path: Path, kind: str, name: str) -> None:
     builder, written = Builder(), many(4, 1)
     document = builder.document([[builder.splats(written)]], [{"mesh": 0, "rotation": [0, 0, 1, 0]}])
     uri = "data:application/octet-stream;base64," + base64.b64encode(builder.body).decode()
     document["buffers"][0]["uri"] = uri if kind == "data" else "my%20splats.bin"
     (tmp_path / "my splats.bin").write_bytes(builder.body)
-    (tmp_path / "a.glb").write_text(json.dumps(document))
-    assert torch.equal(read_gaussians(tmp_path / "a.glb").means, written.means)
+    (tmp_path / name).write_text(json.dumps(document))
+    assert torch.equal(read_gaussians(tmp_path / name).means, written.means)
     (tmp_path / "my splats.bin").unlink()
     if kind == "file":
         with pytest.raises(InputError, match=r"buffer 'my splats.bin' cannot be read"):
-            read_gaussians(tmp_path / "a.glb")
+            read_gaussians(tmp_path / name)
     for outside in ("../b.bin", "/b.bin", "https://example.org/b.bin"):
         document["buffers"][0]["uri"] = outside
-        (tmp_path / "a.glb").write_text(json.dumps(document))
+        (tmp_path / name).write_text(json.dumps(document))
         with pytest.raises(InputError, match="is no file next to it: export it as GLB"):
-            read_gaussians(tmp_path / "a.glb")
+            read_gaussians(tmp_path / name)
 
 
 @pytest.mark.parametrize("place", ["outer", "inner"])
@@ -334,7 +335,8 @@ def rules_of(primitive: dict[str, Any]) -> dict[str, Any]:
         (lambda d, p: rules_of(p).update(kernel="disc"), "kernel is 'disc', gsx draws 'ellipse' alone"),
         (lambda d, p: rules_of(p).update(projection="orthographic"), "projection is 'orthographic'"),
         (lambda d, p: rules_of(p).update(extensions={"EXT_disc": {}}), "need 'EXT_disc', which is not read"),
-        (lambda d, p: p.pop("extensions"), "holds no splats .KHR_gaussian_splatting., but 1 other primitives"),
+        (lambda d, p: p.pop("extensions"), "holds no splats .*, but 1 other primitives, though their attributes"),
+        (lambda d, p: p.update(extensions={}, attributes={"POSITION": 0}), "but 1 other primitives. Choose another"),
         (lambda d, p: p["attributes"].pop(f"{PREFIX}:SCALE"), "lack attribute KHR_gaussian_splatting:SCALE:"),
         (lambda d, p: p.update(attributes={"POSITION": 0, "_SCALE": 1}), "as drafts of the extension did"),
         (lambda d, p: p["attributes"].pop(f"{PREFIX}:SH_DEGREE_1_COEF_1"), "harmonics lack coefficients, it has 2"),

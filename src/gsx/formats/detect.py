@@ -17,4 +17,6 @@ def format_of(head: bytes, path: Path) -> str:
     """Return which of SUFFIXES a file is, by its first bytes, or by its name where these show none."""
     if head.startswith(b"ply"):
         return ".compressed.ply" if PACKED_PROPERTY in head[: header_length(head)] else STANDARD
-    return next((kind for first, kind in FIRST_BYTES.items() if head.startswith(first)), suffix_of(path) or STANDARD)
+    named = suffix_of(path) or STANDARD
+    named = ".glb" if named == ".gltf" else named  # one reader for both forms of glTF
+    return next((kind for first, kind in FIRST_BYTES.items() if head.startswith(first)), named)

@@ -148,15 +148,18 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
         InputError: it is damaged, holds no splats, or some that are drawn otherwise than by this extension.
     """
     asset = asset_of(content, folder)
-    parts, others = [], 0
+    parts, others, dropped = [], 0, False
     for mesh, world in placed_meshes(asset.document):
         for primitive in list_in(entry_at(asset.document, "meshes", mesh), "primitives"):
             if not holds_splats(primitive):
                 others += 1
+                dropped |= any(key.startswith(EXTENSION) for key in part_of(primitive, "attributes"))
                 continue
             parts.append(moved(splats_of_primitive(asset, primitive, name), TRAINING_FROM_GLTF @ world))
     if not parts:
-        raise InputError(f"its scene holds no splats ({EXTENSION}), but {others} other primitives: choose another file")
+        why = ", though their attributes are there: a program has dropped the extension" if dropped else ""
+        raise InputError(f"its scene holds no splats ({EXTENSION}), but {others} other primitives{why}. "
+                         "Choose another file, or export it anew")  # fmt: skip
     if others:
         logger.info("%s: %d primitives of its scene are no splats, and are left out", name, others)
     arrays = together(parts)

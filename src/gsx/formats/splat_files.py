@@ -130,7 +130,7 @@ def read_in_double(path: Path, axes: str = "rub") -> Gaussians:
     try:
         content = path.read_bytes()
         kind = format_of(content[:MOST_HEADER], path)
-        if kind != suffix_of(path):
+        if kind != format_of(b"", path):
             logger.info("%s is read as %s, which its first bytes show", path, kind)
         return away(decode(content, kind, axes, str(path)), stated_in(content[:MOST_HEADER]))
     except (OSError, InputError) as problem:

@@ -8,7 +8,7 @@ from gsx.core.errors import InputError
 
 WRITTEN = (".compressed.ply", ".ply", ".spz", ".sog", ".glb")
 """Ends of the names of files that gsx writes; the longer of two that fit first."""
-SUFFIXES = (*WRITTEN, ".splat", ".ksplat")
+SUFFIXES = (*WRITTEN, ".gltf", ".splat", ".ksplat")
 """Ends of the names of files that gsx reads."""
 META = "meta.json"
 """Describes an unbundled SOG: its pictures lie in the same folder."""
