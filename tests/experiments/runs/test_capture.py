@@ -13,7 +13,7 @@ from gsx.core.data.camera import look_at
 from gsx.core.data.images import write_image
 from gsx.core.data.resize import display_from_linear, linear_from_display, to_uint8
 from gsx.core.data.scene import PointCloud, View
-from gsx.core.quality.sharpness import blurred, sharpness_line
+from gsx.core.quality.sharpness import blurred, sharpness, sharpness_line
 from gsx.experiments.runs.capture import (
     coverage_line,
     exposure_line,
@@ -54,7 +54,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_blurred_photographs_are_named_whichever_way_they_moved(walk):
-    found = blurred(walk)
+    found = blurred(sharpness(walk))
     assert [path.name for path, _ in found] == ["09.png", "04.png"], "worst first"
     assert all(ratio < 0.6 for _, ratio in found)
     assert "2 of 12 photographs are blurred" in sharpness_line(walk)
@@ -66,7 +66,11 @@ def test_photographs_without_contrast_are_not_blamed(walk, tmp_path):
     write_image(flat, torch.full((3, 160, 200), 0.5))
     small = tmp_path / "03c.png"
     write_image(small, torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0)))
-    assert {path.name for path, _ in blurred([*walk[:4], flat, small])} == set()
+    photos = [*walk[:4], flat, small]
+    assert {path.name for path, _ in blurred(sharpness(photos))} == set()
+    unknown = "2 have too few pixels or too little contrast to compare"
+    assert sharpness_line(photos) == f"sharpness none of 4 photographs is blurred against its neighbours; {unknown}"
+    assert sharpness_line([flat, small]) == f"sharpness not known; {unknown}"
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +78,20 @@ def demo_scene():
     """The built-in scene, small."""
     small = {"width": 96, "height": 72, "train_views": 24, "test_views": 4, "samples": 1}
     return load(typed(DemoOptions, shipped("demo") | small, "scene"))
+
+
+def test_a_photograph_that_shows_no_point_has_no_exposure(demo_scene):
+    """It looks away from all points, and neither moves the others nor is named for its own."""
+    away = replace(
+        demo_scene.train[0], name="away", camera=look_at([9, 9, 9], [99, 99, 99], fov_x=0.5, width=96, height=72)
+    )
+    away = replace(away, source=Grey())
+    views = [*demo_scene.train[:8], away]
+    gains = exposures(views, demo_scene.points)
+    assert gains is not None
+    assert gains.isfinite().tolist() == [True] * 8 + [False]
+    torch.testing.assert_close(gains[:8], exposures(views[:8], demo_scene.points))
+    assert exposure_line(views, gains).endswith("; 1 show too few of them")
 
 
 @dataclass(frozen=True)

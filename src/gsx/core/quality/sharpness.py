@@ -7,7 +7,7 @@ neighbours, a photograph that moved by three pixels has half of it or less (docs
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -66,30 +66,29 @@ def sharpness(photos: Sequence[Path]) -> dict[Path, float]:
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         values = list(pool.map(lambda path: fineness(read_image(path)), photos))
     found = against_neighbours(torch.stack(values)).tolist()
-    return {path: ratio for path, ratio in zip(photos, found, strict=True) if not math.isnan(ratio)}
+    return {path: ratio for path, ratio in zip(photos, found, strict=True) if math.isfinite(ratio)}
 
 
-def blurred(photos: Sequence[Path]) -> list[tuple[Path, float]]:
-    """(photograph, what it has of its neighbours' fineness) of those that are blurred, worst first.
-
-    Raises:
-        InputError: one cannot be read.
-    """
-    found = sharpness(photos).items()
-    return sorted(((path, ratio) for path, ratio in found if ratio < BLURRED), key=lambda pair: pair[1])
+def blurred(ratios: Mapping[Path, float]) -> list[tuple[Path, float]]:
+    """Return (photograph, ratio) of those that are blurred, worst first; ratios: as of `sharpness`."""
+    return sorted(((path, ratio) for path, ratio in ratios.items() if ratio < BLURRED), key=lambda pair: pair[1])
 
 
 def sharpness_line(photos: Sequence[Path]) -> str:
-    """What to photograph again, for `gsx scenes`.
+    """Return what to photograph again, for `gsx scenes`.
 
     Raises:
         InputError: a photograph cannot be read.
     """
-    found = blurred(sorted(photos))
+    known = sharpness(sorted(photos))
+    found, rest = blurred(known), len(photos) - len(known)
+    unknown = f"; {rest} have too few pixels or too little contrast to compare" if rest else ""
+    if not known:
+        return f"sharpness not known{unknown}"
     if not found:
-        return f"sharpness none of {len(photos)} photographs is blurred against its neighbours"
+        return f"sharpness none of {len(known)} photographs is blurred against its neighbours{unknown}"
     worst = ", ".join(f"{path.name} ({ratio:.2f})" for path, ratio in found[:5]) + (", ..." if found[5:] else "")
     return (
-        f"sharpness {len(found)} of {len(photos)} photographs are blurred against their neighbours, 1 being as sharp: "
-        f"{worst}; take them again, or leave them out"
+        f"sharpness {len(found)} of {len(known)} photographs are blurred against their neighbours, 1 being as sharp: "
+        f"{worst}; take them again, or leave them out{unknown}"
     )

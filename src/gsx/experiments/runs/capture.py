@@ -82,7 +82,7 @@ def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P
     """(stops by which points are brighter in a view than in the cloud, share of those in view that it shows).
 
     A median over points of the right colour and about the right light, found around itself again and again, so that
-    what stands before a point does not enter.
+    what stands before a point does not enter; NaN where there is none.
     """
     light = seen_colours(view, points)
     stops, own = light.log2(), colours.clamp(min=1e-3).log2()
@@ -93,27 +93,29 @@ def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P
     near = alike
     for _ in range(ROUNDS):
         if not near.any():
-            return 0.0, 0.0
+            return math.nan, 0.0
         gain = differences[near].median()
         near = alike & ((differences - gain).abs() < SAME_POINT)
     return float(gain), float(near.sum() / known.sum())
 
 
 def exposures(views: Sequence[View], cloud: PointCloud) -> Float[Tensor, "V"] | None:
-    """Stops by which each view is brighter than the middle one, told from the same points; None where their colours
-    are not the scene's."""
+    """Stops by which each view is brighter than the middle one, told from the same points; NaN for a view that shows
+    none of them, None where their colours are not the scene's."""
     step = max(1, len(cloud) // POINTS)
     points, colours = cloud.positions[::step], linear_from_display(cloud.colours[::step].float() / 255)
     found = [exposure(view, points, colours) for view in views]
     gains = torch.tensor([gain for gain, _ in found])
-    return gains - gains.median() if median(share for _, share in found) > TRUSTED else None
+    return gains - gains.nanmedian() if median(share for _, share in found) > TRUSTED else None
 
 
 def exposure_line(views: Sequence[View], gains: Float[Tensor, "V"]) -> str:
     """How alike photographs are exposed, and which are not."""
-    spread = float(gains.max() - gains.min())
+    known = gains[gains.isfinite()]
+    spread, rest = float(known.max() - known.min()), len(gains) - len(known)
     odd = sorted((i for i in range(len(views)) if abs(float(gains[i])) > UNEVEN), key=lambda i: -abs(float(gains[i])))
     line = f"exposure  the same points are up to {spread:.2f} stops brighter in one photograph than in another"
+    line += f"; {rest} show too few of them" if rest else ""
     if not odd:
         return line
     worst = ", ".join(f"{views[i].name} ({float(gains[i]):+.2f})" for i in odd[:5]) + (", ..." if odd[5:] else "")
