@@ -14,13 +14,15 @@ import pycolmap
 import pytest
 import torch
 from synthetic_colmap import shipped
+from torch import Tensor
 
 from gsx.core.cache import enlist
-from gsx.core.data.images import image_size, write_image
+from gsx.core.data.images import image_size, read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.experiments.runs.settings import typed
 from gsx.scenes import photos, sfm
+from gsx.scenes.orientation import AFTER_MIRROR, oriented, oriented_camera
 from gsx.scenes.photos import PhotosOptions, find_photos, load, reconstruct
 
 CAPTURES = Path(__file__).parents[3] / "shared" / "scenes"  # real ones, where a developer has them
@@ -107,21 +109,40 @@ def test_reconstruction_is_found_again(
         load(options(capture[0], max_features=4095))
 
 
-def test_same_seed_gives_the_same_bytes_from_lossless_webp_too(
+SHOTS = ("webp", 6, 8, 3, 5)
+"""How the photos of the capture are stored anew: as lossless WebP, or as PNG with an EXIF orientation, 5 mirrored."""
+
+
+def store(picture: Tensor, path: Path, kind: str | int) -> None:
+    """Write a picture of a sensor as WebP, or as PNG of an orientation, mirrored where that says so."""
+    mirrored = isinstance(kind, int) and kind in AFTER_MIRROR
+    buffer = oiio.ImageBuf(np.ascontiguousarray((picture.flip(-1) if mirrored else picture).permute(1, 2, 0).numpy()))
+    buffer.specmod().attribute(*(("Compression", "lossless") if kind == "webp" else ("Orientation", kind)))
+    assert buffer.write(str(path))
+
+
+def test_photos_held_and_stored_in_any_way_give_one_camera_and_upright_views(
     reconstructed: tuple[Scene, Path], capture: tuple[Path, Any], tmp_path: Path, cache: Path
 ) -> None:
-    """COLMAP's wheel decodes no WebP: what it gets in its place has the same pixels."""
-    for photo in (capture[0] / "images").iterdir():
-        buffer = oiio.ImageBuf(str(photo))
-        buffer.specmod().attribute("Compression", "lossless")
-        assert buffer.write(str(tmp_path / f"{photo.stem}.webp"))
-    sizes = {name: image_size(tmp_path / name) for name in find_photos(tmp_path)[1]}
-    model = reconstruct(tmp_path, sizes, options(tmp_path, num_threads=2))
-    (first,) = (reconstructed[1] / "sfm").iterdir()
-    assert {file.name for file in model.iterdir()} == {file.name for file in first.iterdir()}
+    """Of the same seed the same bytes: COLMAP gets the sensor's pictures, whatever file they come in."""
+    folder, (expected, kept) = capture[0] / "images", reconstructed
+    kinds = dict(zip(sorted(capture[1]), SHOTS, strict=True)) | {STRANGER: 1}
+    for name, kind in kinds.items():
+        store(read_image(folder / name), tmp_path / (f"{Path(name).stem}.webp" if kind == "webp" else name), kind)
+    scene = load(options(tmp_path, num_threads=2))
+    ((model,), (first,)) = ((place / "sfm").iterdir() for place in (cache, kept))  # neither copies nor links stay
+    assert len(pycolmap.Reconstruction(model).cameras) == 1
     for file in model.glob("*.bin"):
         assert file.read_bytes().replace(b".webp\0", b".png\0") == (first / file.name).read_bytes(), file.name
-    assert list((cache / "sfm").iterdir()) == [model]  # neither copies nor links stay
+    assert "EXIF turns 4 of 5 photos upright (scene.orientation)." in scene.notes
+    assert scene.provenance["turned"] == 4
+    before = {view.name: view for view in (*expected.train, *expected.test)}
+    for view in (*scene.train, *scene.test):
+        name = view.name.replace(".webp", ".png")
+        turn = {"webp": 1, 5: AFTER_MIRROR[5]}.get(kinds[name], kinds[name])
+        assert view.camera.draws_as(oriented_camera(before[name].camera, turn))
+        difference = (view.image().int() - oriented(before[name].image(), turn).int()).abs()
+        assert difference.max() <= 1  # the lens of all is one: undistorted on the sensor's raster, then turned
 
 
 def test_photos_without_texture_are_refused_with_the_remedy(tmp_path: Path, cache: Path) -> None:

@@ -21,6 +21,7 @@ from gsx.formats.ply import write_ply
 from gsx.scenes.blender import BlenderOptions
 from gsx.scenes.blender import load as load_blender
 from gsx.scenes.frame_names import plain_name
+from gsx.scenes.orientation import oriented, oriented_camera
 from gsx.scenes.transforms import TransformsOptions, load
 
 WIDTH, HEIGHT = 120, 90
@@ -716,3 +717,18 @@ def outcome(folder: Path) -> None:
         text.encode("utf-8", "strict")
     else:
         assert all(math.isfinite(view.camera.fx) for view in (*scene.train, *scene.test))
+
+
+def test_photos_are_turned_upright_with_their_cameras(tmp_path: Path) -> None:
+    picture = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    write(tmp_path, image=picture)
+    before = views(load(options(tmp_path)))
+    for number, orientation in enumerate((6, 8, 3)):
+        write_image(tmp_path / "images" / f"{number}.png", picture, {"Orientation": orientation})
+    scene = load(options(tmp_path))
+    for view, stored, orientation in zip(views(scene), before, (6, 8, 3), strict=True):
+        assert view.camera.draws_as(oriented_camera(stored.camera, orientation))
+        assert torch.equal(view.image(), oriented(stored.image(), orientation))
+    assert "EXIF turns 3 of 3 photos upright (scene.orientation)." in scene.notes
+    kept = views(load(options(tmp_path, orientation="stored")))
+    assert all(view.camera.draws_as(stored.camera) for view, stored in zip(kept, before, strict=True))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.images import checked_size
+from gsx.core.data.images import image_size, is_reduction
 from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
@@ -34,7 +34,8 @@ from gsx.scenes.colmap_model import Model, ModelImage, error_told, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints
-from gsx.scenes.options import SceneOptions, refuse_other
+from gsx.scenes.options import SceneOptions, refuse_other, refuse_unknown
+from gsx.scenes.orientation import RULES, TurnsOf, of_model, oriented_size
 from gsx.scenes.posed import (
     MIN_IMAGES,
     Shot,
@@ -45,6 +46,7 @@ from gsx.scenes.posed import (
     refuse_partial,
     refuse_too_few,
     shot_through,
+    turn_notes,
     views_of,
 )
 from gsx.scenes.similar_photos import similar_photo
@@ -84,15 +86,21 @@ def load(options: ColmapOptions) -> Scene:
     return build(model, path / images, replace(options, images=images), [*notes, *adjustment])
 
 
-def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str]) -> Scene:
+def build(
+    model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str], turns_of: TurnsOf | None = None
+) -> Scene:
     """The scene of a model whose images are in the folder `photos`; `notes` come first among the scene's.
+
+    `turns_of` finds the turns of a photo; None: as `options.orientation` says.
 
     Raises:
         InputError: as `load`.
     """
     path = at_home(options.path)
     present = present_images(model, photos, options.missing)
-    shots = [shot_of(model, image, photos) for image in present]
+    refuse_unknown(options)
+    turns_of = turns_of or RULES[options.orientation]
+    shots = [shot_of(model, image, photos, turns_of) for image in present]
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
     train, test = split_names([view.name for view in views], options.split, path, photos_of(views))
@@ -112,6 +120,7 @@ def build(model: Model, photos: Path, options: ColmapOptions, notes: Sequence[st
             *model.notes,
             *_missing_note(model, present),
             *lens_notes(shots),
+            *turn_notes(shots),
             *mask_notes(views, options),
             fit,
         ],
@@ -144,14 +153,14 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     return present
 
 
-def shot_of(model: Model, image: ModelImage, photos: Path) -> Shot:
+def shot_of(model: Model, image: ModelImage, photos: Path, turns_of: TurnsOf) -> Shot:
     """An image of the model as the pinhole photo that gsx uses.
 
     Raises:
         InputError: the photo's size is no uniform reduction of its camera's, or that has no pinhole equivalent.
     """
     intrinsics = model.cameras[image.camera_id]
-    return shot_through(intrinsics, image.name, photos / image.name, image.rotation, image.translation)
+    return shot_through(intrinsics, image.name, photos / image.name, image.rotation, image.translation, turns_of)
 
 
 def check_cameras(
@@ -163,7 +172,8 @@ def check_cameras(
         InputError: the median error exceeds `limit` pixels of the model, or (no observations) few points are in view.
     """
     # views without their centring, if any: that is an approximation asked for, not a mistake to be found
-    cameras = [shot.whole.resize(*view.camera.size) for shot, view in zip(shots, views, strict=True)]
+    sizes = [oriented_size(view.camera.size, shot.turns.last) for shot, view in zip(shots, views, strict=True)]
+    cameras = [shot.whole.resize(*size) for shot, size in zip(shots, sizes, strict=True)]
     lenses = [model.cameras[image.camera_id] for image in images]
     errors = [reprojection_errors(*fit) for fit in zip(images, lenses, cameras, strict=True)]
     rest = counted([image.name for image in images], [~one.isnan() for one in errors], [one.isinf() for one in errors])
@@ -286,10 +296,10 @@ def image_folder(path: Path, model: Model) -> str:
 def _fits(folder: Path, model: Model) -> bool:
     """Compare the size of the first photo with its camera's."""
     image = next(image for image in model.images if is_file(folder / image.name))
-    camera = model.cameras[image.camera_id]
+    camera, photo = model.cameras[image.camera_id], folder / image.name
+    raster = camera.width, camera.height
     with suppress(InputError):
-        checked_size(folder / image.name, (camera.width, camera.height))
-        return True
+        return is_reduction(oriented_size(image_size(photo), of_model(photo, raster).first), raster)
     return False
 
 

@@ -1,19 +1,20 @@
 """Masks of photographs: where loaders look for them, and which photographs have one."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from gsx.core.data.images import checked_size, has_alpha
-from gsx.core.data.masks import Mask
+from gsx.core.data.images import has_alpha, image_size, is_reduction, refuse_other_size
+from gsx.core.data.masks import INTERPOLATED, Mask
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
 from gsx.scenes.options import SceneOptions
+from gsx.scenes.orientation import INVERSES, Turns, oriented_size
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
@@ -23,9 +24,15 @@ FOLDER = "masks"
 
 
 def mask_of(
-    photo: Path, name: str, given: Path | None, remap: Callable | None, expected: Size | None, options: SceneOptions
+    photo: Path,
+    name: str,
+    given: Path | None,
+    remap: StoredUndistortion | None,
+    expected: Size,
+    options: SceneOptions,
+    turns: Turns,
 ) -> Mask | None:
-    """The mask of a photograph of that name; None: it has none. `expected`: (width, height) of the whole photograph.
+    """The mask of a photograph of that name; None: it has none. `expected`: (width, height) of its camera's raster.
 
     Raises:
         InputError: a mask that the scene names is not there, or has another shape than its photograph.
@@ -33,17 +40,41 @@ def mask_of(
     if options.masks == "none":
         return None
     if options.masks == "alpha":
-        return Mask(path=photo, alpha=True, remap=remap) if has_alpha(photo) else None
+        return masking(photo, remap, turns, alpha=True) if has_alpha(photo) else None
     if given is not None and not is_file(given):
         raise InputError(f"The mask '{given}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
     found = (
         path for path in candidates(folder_of(options), name) if is_file(path) and path.resolve() != photo.resolve()
     )
     path = given or next(found, None)
-    if path is not None and expected is not None:
-        checked_size(path, expected)
-    bent = replace(remap, photo=path) if path is not None and isinstance(remap, StoredUndistortion) else None
-    return None if path is None else Mask(path=path, remap=bent)
+    if path is None:
+        return None
+    bent = None if remap is None else replace(remap, photo=path)
+    return masking(path, bent, turns, before=to_stored(path, turns, expected))
+
+
+def masking(
+    path: Path, remap: StoredUndistortion | None, turns: Turns, before: tuple[int, ...] = (), alpha: bool = False
+) -> Mask:
+    """Return the mask in a file as the photograph is turned and undistorted."""
+    reach = 0 if remap is None else INTERPOLATED
+    return Mask(path=path, alpha=alpha, remap=turns.around(remap, before), reach=reach)
+
+
+def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
+    """Return the orientations that bring a mask to the raster that its photograph's file stores.
+
+    A mask has no orientation of its own: its shape says whether it was made for the stored photograph, as COLMAP's are,
+    or for the upright one, as a viewer shows it; where it fits both it is the former.
+
+    Raises:
+        InputError: it has neither shape.
+    """
+    size, stored = image_size(mask), turns.stored_size(raster)
+    if not is_reduction(size, stored) and is_reduction(size, oriented_size(stored, turns.exif)):
+        return (INVERSES.get(turns.exif, turns.exif),)
+    refuse_other_size(mask, size, stored)
+    return ()
 
 
 def folder_of(options: SceneOptions) -> Path:

@@ -1,14 +1,23 @@
-"""Pictures, sizes and cameras turned as EXIF's orientations say."""
+"""Pictures, sizes and cameras turned as EXIF's orientations say, and which turns a photo needs.
 
-from dataclasses import replace
+Programs state cameras for the raster that a file stores, as COLMAP does: photos of one lens have one camera, however
+it was held. Here a photo is undistorted on that raster, and then turned upright together with its camera.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.images import image_size, is_reduction
 from gsx.core.data.resize import Size
 from gsx.core.shapes import UInt8
+from gsx.scenes.exif import orientation_of
 
+Remap = Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]]
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
     1: (False, ()),
     2: (False, (-1,)),
@@ -69,3 +78,78 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
         width=width,
         height=height,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turns:
+    """How a stored photo comes to the raster of its camera, and from there upright."""
+
+    exif: int = 1
+    """Orientation that the file states, where it is heeded."""
+    first: int = 1
+    """Orientation to apply to the stored photo: the result is what its camera sees."""
+    last: int = 1
+    """Turn of that, one of `TURNS`, which brings it upright."""
+
+    def stored_size(self, size: Size) -> Size:
+        """Return (width, height) of the stored photo of a camera with a raster of `size`."""
+        return oriented_size(size, self.first)
+
+    def around(self, remap: Remap | None, before: tuple[int, ...] = ()) -> Remap | None:
+        """Return what turns a stored picture, applies `remap` on its camera's raster, and turns the result upright.
+
+        `before`: orientations to apply to a picture beforehand.
+        """
+        first = tuple(one for one in (*before, self.first) if one != 1)
+        return Turned(first, remap, self.last) if first or self.last != 1 else remap
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Turn a picture, apply `remap`, turn the result."""
+
+    first: tuple[int, ...]
+    remap: Remap | None
+    last: int
+
+    def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
+        for orientation in self.first:
+            image = oriented(image, orientation)
+        return oriented(image if self.remap is None else self.remap(image), self.last)
+
+
+TurnsOf = Callable[[Path, Size], Turns]
+"""The turns of a photo by its file and the (width, height) of its camera."""
+
+
+def as_stored(photo: Path, raster: Size) -> Turns:
+    """Return no turns: EXIF is not heeded."""
+    return Turns()
+
+
+def of_model(photo: Path, raster: Size) -> Turns:
+    """Return the turns of a photo whose camera another program states for a raster of this (width, height).
+
+    It is the stored one, unless only the turned one has its shape: some programs turn photos before they use them.
+    Mirrored photos stay mirrored where the camera saw them so.
+    """
+    exif = orientation_of(photo)
+    if not is_reduction(image_size(photo), raster) and is_reduction(oriented_size(image_size(photo), exif), raster):
+        return Turns(exif=exif, first=exif)
+    return Turns(exif=exif, last=WITHOUT_MIRROR.get(exif, exif))
+
+
+def of_turned_model(photo: Path, raster: Size) -> Turns:
+    """Return the turns of a photo whose camera is stated for the photo upright, of whatever shape."""
+    exif = orientation_of(photo)
+    return Turns(exif=exif, first=exif)
+
+
+def of_own_model(photo: Path, raster: Size) -> Turns:
+    """Return the turns of a photo for structure from motion by gsx, which undoes mirrors first."""
+    exif = orientation_of(photo)
+    return Turns(exif=exif, first=MIRROR if exif in AFTER_MIRROR else 1, last=AFTER_MIRROR.get(exif, exif))
+
+
+RULES: dict[str, TurnsOf] = {"auto": of_model, "stored": as_stored, "turned": of_turned_model}
+"""Turns of a photo by its file and the raster of its camera, by the values of `scene.orientation`."""

@@ -18,9 +18,11 @@ from gsx.core.ranges import Range
 from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
 from gsx.scenes.colmap_model import Model, error_told, read_model
+from gsx.scenes.exif import orientation_of
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
+from gsx.scenes.orientation import as_stored, of_own_model
 from gsx.scenes.passed_models import refuse_passed_over
 from gsx.scenes.posed import named, refuse_partial
 from gsx.scenes.readable import readable_size
@@ -51,6 +53,8 @@ MATCHERS = ("auto", "exhaustive", "sequential")
 CAMERA_MODES = ("auto", "single", "per_image")
 MIN_PHOTOS = 2
 METHOD = "sfm/2"  # part of the cache key: raise the number when the reconstruction changes
+RULES = {"auto": of_own_model, "stored": as_stored}
+"""Turns of a photo by the values of `scene.orientation`."""
 COPIES = "copies/1"  # likewise, where photos are converted for COLMAP
 
 
@@ -71,15 +75,16 @@ def load(options: PhotosOptions) -> Scene:
             cannot be reconstructed.
     """
     refuse_unknown(options)
+    refuse_other("orientation", options.orientation, tuple(RULES))
     path = at_home(options.path)
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
     notes += passed_over(path, folder)
     broken = sorted({*photos} - sizes.keys())
     refuse_partial(broken, len(photos), folder, options.missing, "cannot be read", remedy_of(folder, broken))
-    model = read_model(reconstruct(folder, sizes, options))
+    model = read_model(reconstruct(folder, sizes, options, options.orientation))
     notes += report(model, list(sizes))
-    scene = colmap.build(model, folder, _colmap_options(options, folder), notes)
+    scene = colmap.build(model, folder, _colmap_options(options, folder), notes, RULES[options.orientation])
     name = folder.resolve().parent.name if folder.name == IMAGES else folder.resolve().name
     return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
 
@@ -177,13 +182,16 @@ def remedy_of(folder: Path, broken: Sequence[str]) -> str:
     return "export them again"
 
 
-def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions) -> Path:
+def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orientation: str = "auto") -> Path:
     """The folder with the model of these photos: computed once, then found in the cache.
+
+    `orientation`: one of `RULES`.
 
     Raises:
         InputError: no two photos can be placed.
     """
-    doubtful = sfm_copies.candidates(folder, dict.fromkeys(sizes, 1))
+    first = {name: RULES[orientation](folder / name, size).first for name, size in sizes.items()}
+    doubtful = sfm_copies.candidates(folder, first)
     final = cache_folder("sfm", _key(folder, sizes, options, doubtful))
     if intact(final):
         logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
@@ -249,6 +257,8 @@ def facts(path: Path) -> Iterator[str]:
     sizes, notes = readable_sizes(folder, names)
     for (width, height), count in sorted(Counter(sizes.values()).items()):
         yield f"images    {count} of {width}x{height} in {folder}"
+    turned = sum(orientation_of(folder / name) != 1 for name in sizes)
+    yield from [f"turned    {turned} of {len(sizes)} upright by EXIF (scene.orientation)"] if turned else []
     yield sharpness_line([folder / name for name in sizes])
     yield from (f"note      {note}" for note in notes)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, centred
-from gsx.core.data.images import ImageCache, checked_size
+from gsx.core.data.images import ImageCache, image_size, refuse_other_size
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
@@ -24,6 +24,7 @@ from gsx.scenes.duplicates import refuse_file_twice
 from gsx.scenes.frame_names import find_photo, lies_there, plain_name
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions, refuse_unknown
+from gsx.scenes.orientation import AFTER_MIRROR, Turned, Turns, TurnsOf, of_model, oriented_camera, oriented_size
 from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined
@@ -51,6 +52,8 @@ class Shot:
     remap: StoredUndistortion | None = None
     mask: Path | None = None
     """Its mask, where the poses file names one."""
+    turns: Turns = Turns()
+    """From the stored photo to the raster of `whole`, and from there upright."""
 
     def __post_init__(self) -> None:
         if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):
@@ -67,9 +70,16 @@ class Shot:
 
 
 def shot_through(
-    intrinsics: Any, name: str, photo: Path, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+    intrinsics: Any,
+    name: str,
+    photo: Path,
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    turns_of: TurnsOf = of_model,
 ) -> Shot:
     """A photo taken through `intrinsics`, a pycolmap camera, as the pinhole photo that gsx uses.
+
+    `turns_of` finds its turns by the file and the raster of `intrinsics` (`gsx.scenes.orientation.RULES`).
 
     Raises:
         InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
@@ -78,13 +88,17 @@ def shot_through(
         pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
     except InputError as problem:
         raise InputError(f"'{photo}' cannot be undistorted: {problem}") from None
-    size = undistorted_size(intrinsics, pinhole, checked_size(photo, expected))
+    turns = turns_of(photo, expected)
+    size = oriented_size(image_size(photo), turns.first)
+    refuse_other_size(photo, size, expected)
+    size = undistorted_size(intrinsics, pinhole, size)
     return Shot(
         name=name,
         photo=photo,
         whole=camera_of(pinhole, rotation, translation).resize(*size),
         expected_size=expected,
-        remap=None if pinhole is intrinsics else StoredUndistortion(photo, intrinsics, pinhole, size),
+        remap=None if pinhole is intrinsics else StoredUndistortion(photo, intrinsics, pinhole, size, turns.first),
+        turns=turns,
     )
 
 
@@ -99,6 +113,15 @@ def lens_notes(shots: Sequence[Shot]) -> list[str]:
         f"Photos of {name} cameras of {width}x{height} are undistorted to {new_width}x{new_height}{cut}."
         for name, (width, height), (new_width, new_height), cut in sorted(kinds)
     ]
+
+
+def turn_notes(shots: Sequence[Shot]) -> list[str]:
+    """Return notes on photos that are turned upright, and on mirrored ones whose cameras saw them mirrored."""
+    turned = [shot for shot in shots if shot.turns.first != 1 or shot.turns.last != 1]
+    mirrored = [shot.name for shot in shots if shot.turns.exif in AFTER_MIRROR and shot.turns.first == 1]
+    notes = [f"EXIF turns {len(turned)} of {len(shots)} photos upright (scene.orientation)."] if turned else []
+    mirrors = f"EXIF mirrors {len(mirrored)} photos, but the cameras are stated for them as stored: they stay mirrored"
+    return [*notes, *([f"{mirrors} ({named(mirrored)})."] if mirrored else [])]
 
 
 def cut_note(intrinsics: Any) -> str:
@@ -300,17 +323,18 @@ def rgb(background: Sequence[float]) -> tuple[float, float, float]:
 
 def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache) -> View:
     whole = centred(shot.whole) if options.principal_point == "centred" else shot.whole
-    size = training_size(*whole.size, options.downscale, options.max_width)
+    size = training_size(*whole.size, options.downscale, options.max_width)  # of one lens alike, however it was held
+    turns = shot.turns
     source = PhotoSource(
         path=shot.photo,
         rule=rule,
         cache=cache,
-        whole=whole,
-        expected_size=shot.expected_size,
-        remap=shot.remap,
-        mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, shot.expected_size, options),
+        whole=oriented_camera(whole, turns.last),
+        expected_size=turns.stored_size(shot.expected_size),
+        remap=turns.around(shot.remap),
+        mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, shot.expected_size, options, turns),
     )
-    return View(shot.name, whole.resize(*size), source)
+    return View(shot.name, oriented_camera(whole.resize(*size), turns.last), source)
 
 
 def refuse_too_few(train: Sequence[View], place: Path) -> None:
@@ -335,8 +359,16 @@ def provenance(options: SceneOptions, views: Sequence[View], **details: Any) -> 
         "background": list(options.background),
         "number_of_images": len(views),
         **masks_named(views),
+        **turned_named(views),
         **details,
     }
+
+
+def turned_named(views: Sequence[View]) -> dict[str, int]:
+    """Return the number of turned photos for the provenance; nothing without any, so that protocols keep their hash."""
+    sources = [view.source for view in views if isinstance(view.source, PhotoSource)]
+    turned = sum(isinstance(source.remap, Turned) for source in sources)
+    return {"turned": turned} if turned else {}
 
 
 def named(names: Sequence[str]) -> str:

@@ -23,7 +23,8 @@ from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, fram
 from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import completed, lens_of
 from gsx.scenes.masked import mask_notes
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_unknown
+from gsx.scenes.orientation import RULES, TurnsOf
 from gsx.scenes.points import random_points, read_points
 from gsx.scenes.posed import (
     SAME_PLACE,
@@ -36,6 +37,7 @@ from gsx.scenes.posed import (
     reduction_of,
     refuse_too_few,
     shot_through,
+    turn_notes,
     views_of,
 )
 from gsx.scenes.splits import Split, split_names
@@ -71,13 +73,14 @@ def load(options: TransformsOptions) -> Scene:
     """
     parts = frame_files(at_home(options.path))
     file, content = parts[0].file, parts[0].content
+    refuse_unknown(options)
     shots, notes = _shots(parts, options)
     views = views_of([shot for part in shots for shot in part], options)
     (train, test), split_notes = _split(parts, list(map(len, shots)), views, options.split)
     refuse_too_few(train, file)
     refuse_shared(train, test, file)
     points, points_note = _points(content, views, options, file)
-    lenses = lens_notes([shot for part in shots for shot in part])
+    lenses, turned = (notes_of([shot for part in shots for shot in part]) for notes_of in (lens_notes, turn_notes))
     return Scene(
         name=file.parent.resolve().name,
         train=train,
@@ -86,7 +89,7 @@ def load(options: TransformsOptions) -> Scene:
         background=torch.tensor(list(options.background), dtype=torch.float32),
         reduction=reduction_of(options),
         extent=extent_of([view.camera for view in train]),
-        notes=[*notes, *lenses, *mask_notes(views, options), *split_notes, *_ignored(parts), points_note],
+        notes=[*notes, *lenses, *turned, *mask_notes(views, options), *split_notes, *_ignored(parts), points_note],
         provenance=_provenance(options, views, parts, METHOD if lenses else None),
     )
 
@@ -104,7 +107,8 @@ def _shots(parts: Sequence[FrameFile], options: TransformsOptions) -> tuple[list
     shots, notes = list[list[Shot]](), list[str]()
     for part in parts:
         present, told = present_frames(part.file.parent, part.frames, part.file, options.missing)
-        shots.append([_shot(completed(part.content, frame), photo, part.file) for frame, photo in present])
+        rule = RULES[options.orientation]
+        shots.append([_shot(completed(part.content, frame), photo, part.file, rule) for frame, photo in present])
         notes += told
     return shots, notes
 
@@ -121,12 +125,12 @@ def has_value(value: Any) -> bool:
     return any(map(has_value, value)) if isinstance(value, list) else bool(value)
 
 
-def _shot(entry: Mapping[str, Any], photo: Path, file: Path) -> Shot:
+def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) -> Shot:
     """A shot from a frame completed by the file's common values."""
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
-    shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation)
+    shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation, turns_of)
     mask = entry.get("mask_path")
     return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
 

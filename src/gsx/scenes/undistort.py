@@ -228,6 +228,8 @@ class StoredUndistortion:
     pinhole: Any
     size: tuple[int, int]
     """(width, height) of the result."""
+    turned: int = 1
+    """EXIF orientation that was applied to the stored photo beforehand."""
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
         stored = self.stored()
@@ -242,7 +244,8 @@ class StoredUndistortion:
     def stored(self) -> Path:
         """Where the result is kept; another photo, camera or method has another place."""
         key = content_key(METHOD, "premultiplied", _numbers(self.intrinsics), _numbers(self.pinhole), self.size)
-        name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo))
+        turned = [self.turned] if self.turned != 1 else []
+        name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo), *turned)
         return cache_folder("undistorted", key) / f"{self.photo.stem}_{name}.png"
 
 

@@ -263,7 +263,8 @@ def refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
     """Raise InputError unless `is_reduction`."""
     (width, height), (model_width, model_height) = size, expected
     if not is_reduction(size, expected):
+        turned = ", which are not turned" if is_reduction((height, width), expected) else ""
         raise InputError(
             f"Image '{path}' is {width} x {height} and the camera model says {model_width} x {model_height}: use the"
-            " images the cameras were computed from."
+            f" images the cameras were computed from{turned}."
         )

@@ -33,6 +33,8 @@ class Mask:
     alpha: bool = False
     remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]] | None = None
     """What is done to the photograph, undistortion for example."""
+    reach: int = INTERPOLATED
+    """Pixels that `remap` takes from on each side; 0 where it only turns pictures."""
 
     def masked(self) -> Bool[Tensor, "1 H W"]:
         """Which pixels do not count, on the mask's own raster, undistorted; with all that interpolation took from them.
@@ -44,11 +46,11 @@ class Mask:
         if self.alpha:
             picture = picture if self.remap is None else self.remap(picture)
             out = picture[3:] < OPAQUE if len(picture) == 4 else torch.zeros_like(picture[:1], dtype=torch.bool)
-            return out if self.remap is None else grown(out, INTERPOLATED)
+            return out if self.remap is None else grown(out, self.reach)
         out = picture[:1] < WHITE
         if self.remap is None:
             return out
-        return grown(self.remap((out * 255).to(torch.uint8).repeat(3, 1, 1))[:1] > 0, INTERPOLATED)
+        return grown(self.remap((out * 255).to(torch.uint8).repeat(3, 1, 1))[:1] > 0, self.reach)
 
     def reduced(self, width: int, height: int, filter: str, whole: tuple[int, int]) -> Bool[Tensor, "1 height width"]:
         """Which pixels count of a photograph of the size `whole` resized by a filter (`resize.FILTERS`)."""
