@@ -169,6 +169,14 @@ def test_what_is_no_whole_ksplat_is_refused(tmp_path: Path, case: str) -> None:
     assert "\n" not in str(raised.value)
 
 
+def test_counts_of_ksplat_that_a_writer_left_at_0(tmp_path: Path) -> None:
+    """gaussforge states no most number of splats."""
+    body = section(1) + row(0, (1, 2, 3))
+    for name, start in (("most", header(1, 1, 0, most=0)), ("loaded", header(1, 0, 0, most=1))):
+        (tmp_path / f"{name}.ksplat").write_bytes(start + body)
+        assert read_gaussians(tmp_path / f"{name}.ksplat").means.tolist() == [[1, 2, 3]]
+
+
 def test_rows_of_ksplat_that_are_not_finite_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = header(1, 2, 0) + section(2) + row(0, (1, 2, 3)) + row(0, (math.inf, 2, 3))
     (tmp_path / "a.ksplat").write_bytes(content)

@@ -124,11 +124,11 @@ def header_of(content: bytes) -> Header:
         raise InputError(f"it is no .ksplat, or of version {major}.{minor}; gsx reads 0.1: save it anew as that")
     if level >= len(LEVELS):
         raise InputError(f"it has compression level {level}; gsx reads 0, 1 and 2: save it anew with one of them")
-    if splats != most:
+    if splats and most and splats != most:
         raise InputError(f"it holds {splats:,} of {most:,} splats: it was saved half loaded, save it anew")
     return Header(
         sections=sections,
-        splats=most,
+        splats=most or splats,  # some writers leave one of them at 0
         level=level,
         least=least or -COEFFICIENT_RANGE,
         most=greatest or COEFFICIENT_RANGE,
@@ -142,7 +142,8 @@ def section_of(content: bytes, number: int, level: int) -> Section:
         InputError: its degree is none, or its buckets are not those of its splats.
     """
     values = SECTION.unpack_from(content, HEADER_BYTES + number * SECTION_BYTES)
-    _, splats, bucket_size, buckets, block, bucket_bytes, half_range, _, full, partial, degree = values
+    loaded, most, bucket_size, buckets, block, bucket_bytes, half_range, _, full, partial, degree = values
+    splats = most or loaded
     section = Section(
         splats=splats,
         bucket_size=bucket_size,
