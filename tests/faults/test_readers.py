@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from foreign_splats import files_of, header, row, section, splat, unpacked, version_1, version_2, whole, zipped
 from synthetic_colmap import synthesize, write_photos, write_scene
 from tiny import tiny_run
 
@@ -32,7 +33,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe
 from gsx.experiments.runs.open import open_run
 from gsx.formats.ply import read_ply, write_ply
-from gsx.formats.splat_files import read_gaussians, write_gaussians
+from gsx.formats.splat_files import compensated, read_gaussians, write_gaussians
 
 pytestmark = pytest.mark.faults
 
@@ -200,6 +201,8 @@ def read_splats(folder: Path) -> None:
 
 
 COMPACT = ("a.compressed.ply", "a.spz", "a.sog", "a.glb")
+FOREIGN = ("a.splat", "a.ksplat", "floats.ksplat", "sog/meta.json", "sog/means_l.webp", "sog/quats.webp", "one.sog")
+"""Splat files that gsx reads alone."""
 
 
 def compact(folder: Path) -> list[Path]:
@@ -216,6 +219,23 @@ def read_compact(folder: Path) -> None:
         read = read_gaussians(folder / name)
         assert len({len(column) for column in vars(read).values()}) == 1
         assert all(bool(torch.isfinite(column).all()) for column in vars(read).values()), name
+
+
+def foreign(folder: Path) -> list[Path]:
+    (folder / "a.splat").write_bytes(splat() * 3)
+    (folder / "a.ksplat").write_bytes(whole())
+    (folder / "floats.ksplat").write_bytes(header(1, 1, 0) + section(1, 1) + row(0, (1, 2, 3), range(9)))
+    unpacked(folder / "sog", files_of(version_2()))
+    zipped(folder / "one.sog", files_of(version_1()))
+    return [folder / name for name in FOREIGN]
+
+
+def read_foreign(folder: Path) -> None:
+    for name in ("a.splat", "a.ksplat", "floats.ksplat", "sog", "one.sog"):
+        read = read_gaussians(folder / name)
+        assert len({len(column) for column in vars(read).values()}) == 1
+        assert all(bool(torch.isfinite(column).all()) for column in vars(read).values()), name
+        compensated(folder / name)
 
 
 def images(folder: Path) -> list[Path]:
@@ -238,6 +258,7 @@ READERS = {
     "PLY": Reader(cloud, read_clouds, PURE),
     "splat file": Reader(splats, read_splats, PURE),
     "compact splat file": Reader(compact, read_compact, PURE // 10),
+    "splat file of a viewer": Reader(foreign, read_foreign, PURE // 10),
     "transforms.json": Reader(scene_files("transforms"), load("transforms"), PURE),
     "transforms.json of fisheyes": Reader(scene_files("lenses"), load("transforms"), NATIVE * 5),
     "transforms to train and test on": Reader(scene_files("pair"), load("transforms"), NATIVE * 5),

@@ -3,12 +3,11 @@
 import logging
 import math
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from foreign_splats import LEVELS, header, row, section, splat, whole
 
 from gsx.core.errors import InputError
 from gsx.formats.splat_files import compensated, read_gaussians
@@ -29,10 +28,6 @@ def test_splat_by_hand(tmp_path: Path) -> None:
     assert read.quats[0].tolist() == pytest.approx([102 / length, 0, 76 / length, 0])
     assert read.sh_rest.shape == (1, 0, 3)
     assert not compensated(tmp_path / "a.splat")
-
-
-def splat(mean: float = 0.0, scale: float = 0.1, quat: Sequence[int] = (255, 128, 128, 128)) -> bytes:
-    return struct.pack("<6f8B", mean, 0, 0, scale, 0.1, 0.1, 10, 20, 30, 40, *quat)
 
 
 def test_rows_of_splat_that_cannot_be_drawn_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -66,29 +61,6 @@ def test_what_is_no_splat_is_refused(tmp_path: Path, content: bytes, words: str)
 
 
 # -- .ksplat -------------------------------------------------------------------------------------------------------
-
-LEVELS = {0: "<f4", 1: "<f2", 2: "<f2"}
-"""Types of scales and quaternions by level."""
-
-
-def header(sections: int, splats: int, level: int, most: int | None = None, version: tuple[int, int] = (0, 1)) -> bytes:
-    most = splats if most is None else most
-    return struct.pack("<BBxxIIIIHxx3f2f", *version, sections, sections, most, splats, level, 0, 0, 0, -2, 3).ljust(
-        4096, b"\0"
-    )
-
-
-def section(splats: int, degree: int = 0, size: int = 0, full: int = 0, partial: int = 0, block: float = 0.0) -> bytes:
-    buckets, bucket_bytes, reach = full + partial, 12 * bool(full + partial), 32767 * bool(full + partial)
-    values = splats, splats, size, buckets, block, bucket_bytes, reach, 0, full, partial, degree
-    return struct.pack("<IIIIfHxxIIIIH", *values).ljust(1024, b"\0")
-
-
-def row(level: int, mean: Sequence[float], rest: Sequence[float] = ()) -> bytes:
-    """A splat; mean: in level 0 numbers, else steps; rest: in level 2 bytes."""
-    means = np.array(mean, "<f4" if level == 0 else "<u2").tobytes()
-    shape = np.array([0.25, 0.5, 1, 0.6, 0, -0.8, 0], LEVELS[level]).tobytes()
-    return means + shape + bytes([255, 0, 51, 204]) + np.array(rest, ("<f4", "<f2", "u1")[level]).tobytes()
 
 
 def check_shape(read) -> None:  # type: ignore[no-untyped-def]
@@ -135,11 +107,6 @@ def test_bands_of_ksplat_by_hand(tmp_path: Path, level: int) -> None:
     expected = torch.tensor([[values[i] for i in one] for one in (red, green, blue)]).T
     torch.testing.assert_close(read.sh_rest[0], expected, atol=1e-5, rtol=0)
     assert not read.sh_rest[1].any()  # a section of a lower degree
-
-
-def whole(level: int = 1) -> bytearray:
-    content = header(1, 2, level) + section(2, size=2, full=1, block=5) + struct.pack("<3f", 0, 0, 0)
-    return bytearray(content + 2 * row(level, (32767,) * 3))
 
 
 UNFIT: dict[str, tuple[bytes, str]] = {

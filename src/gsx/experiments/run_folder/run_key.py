@@ -11,6 +11,7 @@ from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.stamps import tree_stamp
+from gsx.formats.suffixes import META
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
 """Keys that say where and how a run is carried out."""
@@ -18,6 +19,8 @@ NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 """Keys that name what other keys hold."""
 EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
+PICTURES = (".webp", ".png")
+"""Those of an unbundled SOG."""
 NEWER = {"supersample": 0, "colours": "rendered", "poses": "given", "flight": True}
 """Keys of `eval` that older gsx did not have, as it looked at models."""
 
@@ -55,7 +58,13 @@ def scene_stamp(config: dict[str, Any]) -> str:
     option of the scene names them.
     """
     of_folder, file = folder_stamp(config), splat_file(config.get("init"))
-    return content_key(of_folder, file_stamp(file)) if file is not None and file.is_file() else of_folder
+    return content_key(of_folder, splat_stamp(file)) if file is not None and file.is_file() else of_folder
+
+
+def splat_stamp(file: Path) -> tuple[Any, ...]:
+    """Return the stamp of a splat file; of an unbundled SOG, those of its pictures as well."""
+    others = sorted(file.parent.iterdir()) if file.name.lower() == META else []
+    return *file_stamp(file), *(file_stamp(other) for other in others if other.suffix.lower() in PICTURES)
 
 
 def folder_stamp(config: dict[str, Any]) -> str:
