@@ -18,7 +18,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.formats.arrays import arrays_of
-from gsx.formats.splat_files import read_gaussians
+from gsx.formats.splat_files import is_linear, read_gaussians
 from gsx.formats.spz import encode_spz
 
 C0 = 0.28209479177387814
@@ -311,6 +311,21 @@ def test_a_file_is_told_apart_by_its_colours(tmp_path: Path) -> None:
         InputError, match="colours are of 'acescg', gsx reads srgb_rec709_display and lin_rec709_display"
     ):
         with_space(tmp_path, many(2, 0), "acescg")
+
+
+def test_linear_colours_are_known_by_their_file(tmp_path: Path) -> None:
+    for space, linear in (("lin_rec709_display", True), ("srgb_rec709_display", False)):
+        with_space(tmp_path, many(2, 0), space)
+        assert is_linear(tmp_path / "a.glb") is linear
+
+
+def test_splats_that_name_no_rules_are_read_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    builder = Builder()
+    primitive = builder.splats(many(2, 0))
+    primitive["extensions"][PREFIX] = {}
+    read(tmp_path, builder.document([[primitive]], [{"mesh": 0}]), builder.body)
+    assert "splats name no kernel, 'ellipse' is taken" in caplog.text
+    assert "splats name no colorSpace, 'srgb_rec709_display' is taken" in caplog.text
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ def rendered(given: argparse.Namespace) -> Path:
         if way is None:
             raise InputError(f"gsx render {given.target}: a splat file has no views; give cameras with --path JSON")
         to = given.movie or given.to or file.parent / "path"
-        return render_path(way, file_pictures(file), to, bool(given.movie), given.zoom)
+        return render_path(way, file_pictures(file, way.cameras(given.zoom)), to, bool(given.movie), given.zoom)
     run, settings = open_run(given.target, plugins())
     remove_partial(given.target / "renders")
     if way is not None:

@@ -167,6 +167,11 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
     return arrays
 
 
+def names_linear(content: bytes) -> bool:
+    """Return whether a GLB or glTF names colours of linear light."""
+    return f'"{LINEAR}"'.encode() in content
+
+
 def holds_splats(primitive: Any) -> bool:
     """Return whether a primitive is of splats."""
     if not isinstance(primitive, dict):
@@ -190,6 +195,9 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
         attributes = part_of(primitive, "attributes")
         found = {key: values_of(asset, attributes[key]) for key in wanted(attributes)}
         arrays = arrays_of_attributes(finite_rows(found, name))
+    for key, usual in {"kernel": RULES["kernel"], "colorSpace": SRGB}.items():
+        if key not in options:
+            logger.warning("%s: splats name no %s, '%s' is taken", name, key, usual)
     space = options.get("colorSpace", SRGB)
     if space not in (SRGB, LINEAR):
         raise InputError(f"its colours are of '{str(space)[:40]}', gsx reads {SRGB} and {LINEAR}: export one of them")

@@ -16,7 +16,7 @@ from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.formats.detect import MOST_HEADER, format_of
-from gsx.formats.glb import decode_glb, encode_glb
+from gsx.formats.glb import decode_glb, encode_glb, names_linear
 from gsx.formats.ksplat import decode_ksplat
 from gsx.formats.origin import NO_ORIGIN, Origin, around, away, origin_of_positions, stated_in
 from gsx.formats.ply import HEADER_END, write_ply, write_whole
@@ -191,3 +191,9 @@ def compensated(path: Path) -> bool:
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
     told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
     return bool(told) and told[-1]
+
+
+def is_linear(path: Path) -> bool:
+    """Return whether a splat file that can be read has colours of linear light, which became sRGB."""
+    content = splat_file_at(path).read_bytes()
+    return format_of(content[:MOST_HEADER], path) == ".glb" and names_linear(content)

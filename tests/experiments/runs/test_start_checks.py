@@ -18,6 +18,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.runs.open import start
+from gsx.experiments.runs.render import file_pictures
 from gsx.experiments.runs.start_checks import distance_doubts, in_view_doubts, refuse_nothing_in_view
 from gsx.formats.activated import activated_words
 from gsx.formats.splat_files import read_gaussians, write_gaussians
@@ -57,7 +58,9 @@ def test_splats_that_are_in_view_are_accepted() -> None:
 
 def test_no_splat_in_view_is_refused() -> None:
     moved = replace(ball(), means=ball().means + torch.tensor([500_000.0, 5_400_000, 300]))
-    words = r"a.ply: no splat is in view of any test view \(3\). Splats lie around \(500000, 5.4e\+06, 300.*\), cameras"
+    words = (
+        r"a.ply: no splat is in view of any test view \(3\). Splats lie around \(499999.*, 5400000, 300.*\), cameras"
+    )
     for splats, cameras in ((moved, around()), (ball(), outward())):
         with pytest.raises(InputError, match=words if splats is moved else "no splat is in view of any test view"):
             refuse_nothing_in_view(splats, cameras, "test view", Path("a.ply"))
@@ -128,6 +131,22 @@ def test_reading_a_file_of_activated_values_warns(tmp_path: Path, caplog: pytest
     write_gaussians(tmp_path / "a.ply", written := raw(200, "activated", "activated"))
     assert torch.equal(read_gaussians(tmp_path / "a.ply").log_scales, written.log_scales)  # never read otherwise
     assert "a.ply: these look like activated values" in caplog.text
+
+
+def test_coordinates_in_words_count_from_zero() -> None:
+    """The scene's own origin is subtracted where files are read."""
+    moved = replace(ball(), means=ball().means + torch.tensor([0.0, 0, 1e6]))
+    with pytest.raises(
+        InputError, match=r"Splats lie around \([-\d.]+, 200.*, 1000000\), cameras around \([-\d.]+, 200"
+    ):
+        refuse_nothing_in_view(moved, around(), "test view", Path("a.ply"), (0.0, 200.0, 0.0))
+
+
+def test_a_path_on_which_no_splat_is_in_view_is_refused(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", ball())
+    assert float(file_pictures(tmp_path / "a.ply", around())(around()[0]).max()) > 0
+    with pytest.raises(InputError, match=r"no splat is in view of any camera of the path \(3\)"):
+        file_pictures(tmp_path / "a.ply", outward())
 
 
 # -- through a run -----------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.start_checks import refuse_nothing_in_view
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
 from gsx.formats.splat_files import read_around
@@ -71,13 +72,17 @@ def run_pictures(run: Run, settings: Settings) -> Draw:
     return lambda camera: render(run, moved(camera, origin), pixels).image
 
 
-def file_pictures(path: Path) -> Draw:
-    """The splats of a file over black, for any camera in its coordinates.
+def file_pictures(path: Path, cameras: Sequence[Camera] = ()) -> Draw:
+    """Return what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: it cannot be read, or no splat is in view of any of the cameras.
     """
     (gaussians, origin), raster = read_around(path), rules_of(path)
+    if cameras:
+        refuse_nothing_in_view(
+            gaussians, [moved(camera, origin) for camera in cameras], "camera of the path", path, origin
+        )
     return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
 
 

@@ -13,6 +13,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Bool, Float
 from gsx.formats.activated import activated_words
+from gsx.formats.origin import NO_ORIGIN, Origin
 
 logger = logging.getLogger(__name__)
 
@@ -40,21 +41,24 @@ def doubts_about(gaussians: Gaussians, scene: Scene, path: Path, trains: bool) -
     if trains or not views:
         views, kind = [*scene.train, *scene.test], "training or test view" if scene.test else "training view"
     cameras = [view.camera for view in views]
-    refuse_nothing_in_view(gaussians, cameras, kind, path)
+    refuse_nothing_in_view(gaussians, cameras, kind, path, scene.origin)
     doubts = [*in_view_doubts(gaussians, cameras, kind), *distance_doubts(gaussians, scene.points)]
     for doubt in doubts:
         logger.warning("%s: %s", path, doubt)
     return [f"{path.name}: {doubt}" for doubt in [*doubts, *activated_words(gaussians)]]
 
 
-def refuse_nothing_in_view(gaussians: Gaussians, cameras: Sequence[Camera], kind: str, path: Path) -> None:
-    """Raise InputError if no splat reaches the picture of any camera. kind: of the cameras, in words."""
+def refuse_nothing_in_view(
+    gaussians: Gaussians, cameras: Sequence[Camera], kind: str, path: Path, origin: Origin = NO_ORIGIN
+) -> None:
+    """Raise InputError if no splat reaches the picture of any camera. kind: of the cameras, in words; origin: added to
+    coordinates in words."""
     if any(bool(reaching(gaussians, camera, SIGMAS).any()) for camera in cameras):
         return
     centres = torch.stack([camera.centre.double() for camera in cameras])
     raise InputError(
-        f"{path}: no splat is in view of any {kind} ({len(cameras)}). Splats lie around {middle(gaussians.means)}, "
-        f"cameras around {middle(centres)}: export the file in the coordinates of the cameras"
+        f"{path}: no splat is in view of any {kind} ({len(cameras)}). Splats lie around "
+        f"{middle(gaussians.means, origin)}, cameras around {middle(centres, origin)}: export the file in the coordinates of the cameras"
     )
 
 
@@ -96,9 +100,10 @@ def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
         )
 
 
-def middle(places: Float[Tensor, "N 3"]) -> str:
-    """Return the median of places, in words."""
-    return "({:.6g}, {:.6g}, {:.6g})".format(*places.double().median(0).values.tolist())
+def middle(places: Float[Tensor, "N 3"], origin: Origin) -> str:
+    """Return the median of places that count from an origin, in words."""
+    values = [value + by for value, by in zip(places.double().median(0).values.tolist(), origin, strict=True)]
+    return "({:.8g}, {:.8g}, {:.8g})".format(*values)
 
 
 def spread(rows: Float[Tensor, "N ..."], most: int) -> Float[Tensor, "n ..."]:

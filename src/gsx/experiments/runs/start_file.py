@@ -21,12 +21,17 @@ from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import doubts_about
 from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words, rounding_at, stored_in_single
-from gsx.formats.splat_files import compensated, read_in_double
+from gsx.formats.splat_files import compensated, is_linear, read_in_double
 
 logger = logging.getLogger(__name__)
 
 OWN_KEYS = ("backbone", "augmenter", "init", "iterations", "variant", "preset", "budget", "experiment")
 """What `gsx eval FILE` sets, or what trains: nothing of it can be overridden."""
+BLENDS = (
+    "its colours are of linear light and were made sRGB, in which splats are blended here: figures differ from those "
+    "of programs that blend in linear light"
+)
+"""What evaluations say of such files."""
 MIP_KERNEL = 0.1
 """px^2 by which models of Mip-Splatting are dilated, with opacities compensated (Yu et al. 2024)."""
 
@@ -81,7 +86,8 @@ def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> l
     path = splat_file(settings.general.init)
     if start is None or path is None:
         return []
-    return doubts_about(start, scene, path, trains=settings.general.iterations > 0)
+    doubts = doubts_about(start, scene, path, trains=settings.general.iterations > 0)
+    return [*doubts, f"{path.name}: {BLENDS}"] if is_linear(path) else doubts
 
 
 def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
