@@ -58,7 +58,8 @@ def refuse_nothing_in_view(
     centres = torch.stack([camera.centre.double() for camera in cameras])
     raise InputError(
         f"{path}: no splat is in view of any {kind} ({len(cameras)}). Splats lie around "
-        f"{middle(gaussians.means, origin)}, cameras around {middle(centres, origin)}: export the file in the coordinates of the cameras"
+        f"{middle(gaussians.means, origin)}, cameras around {middle(centres, origin)}: "
+        "export the file in the coordinates of the cameras"
     )
 
 
