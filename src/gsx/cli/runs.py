@@ -10,7 +10,7 @@ from gsx.builtin import plugins
 from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.collector import loading
-from gsx.core.errors import InputError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Range
 from gsx.experiments.runs.job import train
 from gsx.formats.suffixes import READABLE, WRITTEN, splat_file_at, suffix_of
@@ -47,7 +47,10 @@ def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
         from gsx.experiments.runs.start_file import composition_of
 
     folders: list[Path] = []
-    code = train(compose(composition_of(path, overrides), loaded := plugins()), loaded, folders)
+    settings = compose(composition_of(path, overrides), loaded := plugins())
+    if getattr(settings.scene.options, "split", "") == "none":
+        raise ConfigError(f"gsx eval {path} compares with test views: choose another split than scene.split=none")
+    code = train(settings, loaded, folders)
     return tell_report(code, *folders)
 
 
@@ -189,7 +192,7 @@ def verb_export(arguments: list[str]) -> int:
     with loading():
         from gsx.core.files import remove_partial
         from gsx.experiments.reports.report import write_report
-        from gsx.experiments.runs.export import export, is_page, losses, refuse_export
+        from gsx.experiments.runs.export import export, is_page, losses, refuse_export, shown_views
         from gsx.experiments.runs.open import open_run
         from gsx.experiments.runs.render import view_named
 
@@ -214,7 +217,7 @@ def verb_export(arguments: list[str]) -> int:
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
     written = export(run, path, view.camera if view else None, given.axes, given.bake, given.local)
     if written:
-        views = [view] if view else run.scene.test
+        views = [view] if view else shown_views(run.scene)
         for line in losses(run, settings, path, views, written, given.axes, given.local):
             logger.info("read back and rendered again: %s", line)
     if is_page(path) and path.parent.resolve() == given.run.resolve():

@@ -64,7 +64,8 @@ class SceneOptions:
     cameras are stated for: the stored one, or the turned one where only that has their shape; stored: not at all;
     turned: as auto, but the cameras are stated for turned photos of any shape (gsx.scenes.orientation)."""
     split: str = "every:8"
-    """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST (gsx.scenes.splits)."""
+    """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: all are trained on, and nothing is
+    measured (gsx.scenes.splits)."""
 
 
 def refuse_unknown(options: SceneOptions) -> None:

@@ -28,6 +28,7 @@ from gsx.experiments.compact.shrink import (
     told,
     without_bands,
 )
+from gsx.experiments.evaluation.remarks import measures_nothing
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
@@ -244,8 +245,10 @@ def tell(target: Path, evaluation: dict[str, Any], found: dict[str, Any]) -> Non
         logger.info(
             "%s: %.2f MB, %.2f dB lost in views that judge%s", suffix, facts["bytes"] / 1e6, facts["drop"], note
         )
-    if (target / "evaluation.json").is_file():
-        was = read_json(target / "evaluation.json")
+    was = read_json(target / "evaluation.json") if (target / "evaluation.json").is_file() else {}
+    if measures_nothing(evaluation):
+        logger.info("promised %.3g dB, %.2f lost in training views that judge", found["max_drop_db"], chosen["drop"])
+    elif was.get("psnr") is not None:
         logger.info(
             "test views: %.2f dB, before %.2f: %.2f lost; promised %.3g, %.2f in views that judge",
             *(evaluation["psnr"], was["psnr"], was["psnr"] - evaluation["psnr"], found["max_drop_db"], chosen["drop"]),

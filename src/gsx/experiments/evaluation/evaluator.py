@@ -34,7 +34,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.detail import Details, details_of, explained
 from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
-from gsx.experiments.evaluation.remarks import gathered
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
@@ -100,7 +100,7 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
         "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
         "test_views": [view.name for view in run.scene.test],
         "train_views": len(run.scene.train),
-        "size": list(run.scene.test[0].camera.size),
+        "size": list((*run.scene.test, *run.scene.train)[0].camera.size),
         "background": run.scene.background.tolist(),
         "quantised_to_8_bit": options.quantise,
         "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
@@ -335,6 +335,8 @@ class Evaluator:
         self, views: Sequence[dict[str, Any]], drawing: Drawing | None = None, advance: Advance = silent
     ) -> dict[str, dict[str, Any]]:
         """Mean figures at each zoom, from those of `views` and of zoomed views; all of them are drawn on the way."""
+        if not views:
+            return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
         found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
         details: dict[float, list[Details]] = {factor: [] for factor in self.options.zoom}
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
@@ -353,8 +355,13 @@ class Evaluator:
                     advance(factor**2, f"{view.name} x{factor:g}")
         return {f"{factor:g}": zoom_entry(factor, figures, details[factor]) for factor, figures in found.items()}
 
+    def frames_per_second(self) -> float | None:
+        """Return renders per second at the training resolution, without the first, which warms up; None: none was."""
+        times = self.times[1:11] or self.times
+        return 1 / statistics.median(times) if times else None
+
     def evaluate(self, drawing: Drawing | None = None, advance: Advance = silent) -> dict[str, Any]:
-        """The content of evaluation.json.
+        """Return the content of evaluation.json; figures of quality are None where no view is held out.
 
         Raises:
             InputError: of a view nothing is judged; before any is drawn.
@@ -374,11 +381,11 @@ class Evaluator:
             "step": run.step,
             **{key: mean([v[key] for v in views]) for key in figures},
             "primitives": primitives,
-            "visible_primitives": statistics.fmean(v["visible"] for v in views),
-            "left_out": statistics.fmean(v["left_out"] for v in views),
+            "visible_primitives": mean([v["visible"] for v in views]),
+            "left_out": mean([v["left_out"] for v in views]),
             **gathered(run.curves),
             "megabytes": size / 1e6,
-            "render_fps": 1 / statistics.median(self.times[1:11] or self.times),  # after the first, which warms up
+            "render_fps": self.frames_per_second(),
             "render_path": path_of(run.raster, run.device),
             "train_seconds": run.seconds,
             "peak_memory_mb": highest([peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.curves)]),

@@ -10,6 +10,8 @@ from gsx.core.training.run import Run, Step
 
 logger = logging.getLogger(__name__)
 
+NOT_MEASURED = "no view is held out (scene.split=none), so quality is not measured"
+"""What figures are replaced by in words."""
 CHECKS = {
     "colour": "changed their mean colour",
     "agreement": "disagree with their input",
@@ -132,8 +134,19 @@ def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, flo
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
     of_photographs = exposure_remarks, pose_remarks, distractor_remarks, blur_remarks
-    kinds = (start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, *of_photographs)
+    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, *of_photographs)
     return [remark for kind in kinds for remark in kind(evaluation)]
+
+
+def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Yield that nothing is held out."""
+    if measures_nothing(evaluation):
+        yield NOT_MEASURED
+
+
+def measures_nothing(evaluation: Mapping[str, Any]) -> bool:
+    """Return whether an evaluation is that of a run without test views."""
+    return bool(evaluation) and evaluation.get("views") == []
 
 
 def start_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from gsx.experiments.evaluation.remarks import measures_nothing
 from gsx.experiments.reports.charts import STYLES, Dot, Series, line_chart, pareto_front, scatter, style
 from gsx.experiments.reports.page import duration, fixed, time_unit
 from gsx.experiments.run_folder.files import RunFiles, is_number, part
@@ -82,6 +83,7 @@ def compared_runs(group: Group) -> dict[str, Any]:
         "protocol": group.protocol,
         "legend": [legend_row(entry, styles) for entry in group.entries],
         "curves": curves_of(group, styles),
+        "unmeasured": any(measures_nothing(entry.run.evaluation) for entry in group.entries),
         "plots": plots,
     }
 

@@ -12,6 +12,7 @@ from typing import Any
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import csv_text, remove_partial, replace_text
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import address, template
@@ -130,11 +131,12 @@ def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
     zoom = {factor: entry for factor, entry in part(e, "zoom").items() if factor != "1"}
     gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
     report = run.folder / "report.html"
+    unmeasured = NOT_MEASURED if measures_nothing(e) else ""
     return {
         "run": place(run.folder, folder),
         "link": address(place(report, folder)) if report.is_file() else "",
         "state": state,
-        "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values()) if word)),
+        "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values(), unmeasured) if word)),
         "scene": run.scene,
         "backbone": run.backbone,
         "variant": run.variant,

@@ -67,6 +67,8 @@ class Pictures:
         """Best and worst are among the views drawn; pictures of an earlier evaluation are removed."""
         self.folder.mkdir(parents=True, exist_ok=True)
         forget(self.folder)
+        if not figures:
+            return
         best, worst = extremes([figure["psnr"] for figure in figures])
         roles = {worst: "worst", best: "best"} if best != worst else {}
         numbers = spread(len(figures), SHOWN, {best, worst})

@@ -14,7 +14,7 @@ from typing import Any
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import is_file, remove_partial, replace_text
-from gsx.experiments.evaluation.remarks import remarks_of
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
 from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
 from gsx.experiments.reports.page import NONE, duration, fixed, template, time_unit
@@ -90,6 +90,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "reason": reason,
         "notes": part(environment, "scene").get("notes", []),
         "remarks": remarks_of(evaluation),
+        "unmeasured": f"{NOT_MEASURED[0].upper()}{NOT_MEASURED[1:]}." if measures_nothing(evaluation) else "",
         "facts": facts(run),
         "headline": headline(evaluation),
         "zoom": zoom_rows(evaluation),
@@ -143,7 +144,7 @@ def facts(run: RunFiles) -> list[tuple[str, str]]:
 
 
 def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
-    """The figures on top: label, value, unit and a remark."""
+    """Return the figures on top: label, value, unit and a remark; without test views those that are known."""
     e, protocol = evaluation, part(evaluation, "protocol")
     if not e:
         return []
@@ -155,7 +156,7 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
     def card(label: str, value: str, unit: str = "", remark: str = "") -> dict[str, str]:
         return {"label": label, "value": value, "unit": unit, "remark": remark}
 
-    return [
+    cards = [
         card("PSNR", fixed(e.get("psnr")), "dB", f"{views} held-out views" if views else ""),
         card("SSIM", fixed(e.get("ssim"), 4), "", str(protocol.get("ssim", ""))),
         card("LPIPS", lpips, "", "no weights" if lpips == NONE else str(protocol.get("lpips", ""))),
@@ -166,6 +167,7 @@ def headline(evaluation: dict[str, Any]) -> list[dict[str, str]]:
         card("Evaluation", duration(e.get("evaluate_seconds")), "", "all zooms and pictures"),
         card("Peak memory", fixed(e.get("peak_memory_mb"), 0), "MB", ""),
     ]
+    return [one for one in cards if one["value"] != NONE] if measures_nothing(e) else cards
 
 
 # -- zoom ----------------------------------------------------------------------------------------------------------
@@ -256,8 +258,9 @@ def curves(run: RunFiles) -> list[dict[str, Any]]:
             lambda line: line["seconds"] / seconds if is_number(line.get("seconds")) else None,
         ),
     }
+    held_out = (("test", "held-out"),) if any("test_psnr" in line for line in lines) else ()
     charts = [
-        ("PSNR, dB", "psnr", False, (("main", "training view, smoothed"), ("test", "held-out"))),
+        ("PSNR, dB", "psnr", False, (("main", "training view, smoothed"), *held_out)),
         ("Loss", "loss", True, (("main", "smoothed"),)),
         ("Primitives", "primitives", False, (("main", "primitives"),)),
         ("Time per step, ms", "step_ms", False, (("main", "smoothed"),)),

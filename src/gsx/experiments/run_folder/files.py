@@ -201,7 +201,7 @@ def is_size(value: Any) -> bool:
 
 def sound_incidents(content: dict[str, Any]) -> bool:
     """Whether what an evaluation tells of caps, lost pictures and splats left out has the form that gsx gives it."""
-    cap, pseudo, left_out = content.get("withheld", {}), content.get("pseudo", {}), content.get("left_out", 0)
+    cap, pseudo, left_out = content.get("withheld", {}), content.get("pseudo", {}), content.get("left_out") or 0
     if not (isinstance(cap, dict) and isinstance(pseudo, dict) and rows(list(pseudo.values())) and is_number(left_out)):
         return False
     if not all(isinstance(facts.get("warned", {}), dict) for facts in pseudo.values()):

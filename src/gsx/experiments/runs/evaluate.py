@@ -9,7 +9,7 @@ from gsx.core.files import write_json
 from gsx.core.threads import yielding_cores
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
-from gsx.experiments.evaluation.remarks import remarks_of
+from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run
 from gsx.experiments.run_folder.run_key import evaluation_settings
@@ -25,10 +25,12 @@ logger = logging.getLogger(__name__)
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run."""
     options, begun = settings.evaluation, time.perf_counter()
-    logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
+    if run.scene.test:
+        logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
-    embellish(run, pictures, options)
+    if run.scene.test:
+        embellish(run, pictures, options)
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
@@ -59,7 +61,7 @@ def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
 def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Say so if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
     path = before.get("render_path")
-    if path and path != now["render_path"]:
+    if path and path != now["render_path"] and before.get("render_fps"):
         logger.warning(
             "renders/s are now by the %s path; the evaluation before had %.1f by the %s path, which are not comparable",
             now["render_path"], before["render_fps"], path,
@@ -67,17 +69,25 @@ def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
 
 
 def summary(evaluation: dict[str, Any]) -> list[str]:
-    """The result in a few lines."""
-    e, path = evaluation, evaluation["render_path"]
-    lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    """Return the result in a few lines."""
+    e = evaluation
     memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
-    lines = [
-        f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}",
-        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {e['render_fps']:.1f} renders/s ({path}), "
+    speed = "" if e["render_fps"] is None else f"{e['render_fps']:.1f} renders/s ({e['render_path']}), "
+    cost = (
+        f"{e['primitives']:,} primitives, {e['megabytes']:.1f} MB, {speed}"
         f"{e['train_seconds']:.0f} s of training, {e['evaluate_seconds']:.0f} s of evaluation, "
-        f"peak memory {memory}",
-    ]
-    return lines + [zoom_line(factor, result) for factor, result in e["zoom"].items()] + remarks_of(e)
+        f"peak memory {memory}"
+    )
+    if measures_nothing(e):
+        return [cost, *remarks_of(e)]
+    return [quality(e), cost, *(zoom_line(factor, result) for factor, result in e["zoom"].items()), *remarks_of(e)]
+
+
+def quality(evaluation: dict[str, Any]) -> str:
+    """Return the mean figures of test views in words."""
+    e = evaluation
+    lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
+    return f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
 
 
 def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:

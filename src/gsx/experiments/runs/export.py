@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsx import __version__
 from gsx.core.data.camera import Camera, upright
-from gsx.core.data.scene import View
+from gsx.core.data.scene import Scene, View
 from gsx.core.errors import GsxError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
@@ -117,10 +117,15 @@ def refuse_export(path: Path) -> None:
 
 
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
-    """A page that starts at the first test view."""
+    """Return a page that starts at the first test view, or training view where none is held out."""
     up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
-    views, background = run.scene.test[:PAGE_VIEWS], run.scene.background.tolist()
+    views, background = shown_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
     return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
+
+
+def shown_views(scene: Scene) -> Sequence[View]:
+    """Return the test views of a scene, or its training views where none is held out."""
+    return scene.test or scene.train
 
 
 def notes(run: Run) -> list[str]:

@@ -14,6 +14,7 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
@@ -24,7 +25,9 @@ HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 
 
 def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
-    """Return the scene, with views to evaluate on. origin: of the model that is at hand; None: the scene's own.
+    """Return the scene, with views to evaluate on unless scene.split=none trains on all.
+
+    origin: of the model that is at hand; None: the scene's own.
 
     Raises:
         InputError: it cannot be loaded, its loader made no scene of it, the split leaves no test views, or cameras and
@@ -36,7 +39,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     unit = options.unit if isinstance(options, InUnits) else 1.0
     scene = warned_of_units(measured(placed(loaded, checked_unit(unit), origin)))
     if not scene.test:
-        raise InputError(f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split")
+        scene = held_out_none(scene, getattr(options, "split", ""))
     if not scene.extent > 0:
         raise InputError(
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
@@ -45,6 +48,20 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     if isinstance(options, Fillable):
         scene = with_more_points(scene, options.fill, settings.general.seed)
     return disturbed(scene, options.disturb) if isinstance(options, Disturbable) else scene
+
+
+def held_out_none(scene: Scene, rule: str) -> Scene:
+    """Return a scene without test views, with a note that says so.
+
+    Raises:
+        InputError: its split is another than `none`.
+    """
+    if rule != "none":
+        raise InputError(
+            f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split, or none to train on "
+            "all views without figures"
+        )
+    return replace(scene, notes=[*scene.notes, f"all {len(scene.train)} views are trained on: {NOT_MEASURED}"])
 
 
 def checked(scene: Any, loader: str) -> Scene:

@@ -43,7 +43,16 @@ def view_named(run: Run, name: str) -> View:
 
 @yielding_cores()
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
-    """Write every test view at `zoom` times the training resolution as PNG."""
+    """Write every test view at `zoom` times the training resolution as PNG.
+
+    Raises:
+        InputError: no view is held out.
+    """
+    if not run.scene.test:
+        raise InputError(
+            f"{run.folder} has no test views, all are trained on (scene.split=none): give --orbit FILE, or "
+            "cameras with --path JSON"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     remove_partial(folder, below=False)
     names = [f"{name}.png" for name in file_names([view.name for view in run.scene.test])]

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.cache import source_revision
 from gsx.core.files import read_json
-from gsx.experiments.evaluation.remarks import remarks_of
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
 from gsx.experiments.reports.baselines import spread
 from gsx.experiments.run_folder.files import (
     RunFiles,
@@ -273,6 +273,8 @@ def problem_of(
             return "not run yet"
         if not has_figures(files[cell.folder]):
             return f"{state}: {why}"
+        if measures_nothing(files[cell.folder].evaluation):
+            return NOT_MEASURED
     remedy = ": give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE" if metric == "LPIPS" else ""
     return f"{metric} is not measured{remedy}" if cells else "not run"
 

@@ -38,7 +38,8 @@ SAME = 1e-6  # intrinsics that agree to this many pixels are the same
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(SceneOptions):
-    """The built-in scene; `path`, `split` (which must be readable) and what concerns photographs do not apply to it."""
+    """The built-in scene; `path` and what concerns photographs do not apply to it. `split` must be readable: `none`
+    trains on test views as well, and all others mean the test views between training views."""
 
     width: Annotated[int, Range(1, 16384)]
     """Width of the pictures before `downscale`, pixels."""
@@ -212,10 +213,13 @@ def photographed(
         folder = cache_folder(name, content_key(version, options.samples, *who))
         return DemoSource(life=seen, own=camera, samples=options.samples, cache=cache, folder=folder)
 
+    train_views = make_views("train", train, partial(source, somebody=options.passer_by))
+    test_views = make_views("test", test, partial(source, somebody=False))
+    every = options.split == "none"
     return Scene(
         name=options.name,
-        train=make_views("train", train, partial(source, somebody=options.passer_by)),
-        test=make_views("test", test, partial(source, somebody=False)),
+        train=[*train_views, *test_views] if every else train_views,
+        test=[] if every else test_views,
         points=points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
         background=torch.tensor(options.background),
         extent=extent_of(train),
@@ -233,5 +237,6 @@ def provenance(options: DemoOptions, size: tuple[int, int], name: str, version: 
         "size": list(size),
         "samples": options.samples,
         "light": "display",
-        "split": f"{options.train_views} on {path}, {options.test_views} between them",
+        "split": f"{options.train_views} on {path}, {options.test_views} between them"
+        + (", all trained on" if options.split == "none" else ""),
     }

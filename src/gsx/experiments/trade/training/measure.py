@@ -2,15 +2,16 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from gsx.core.errors import ConfigError, TrainingError, first_line
+from gsx.core.errors import ConfigError, InputError, TrainingError, first_line
 from gsx.core.files import read_json
 from gsx.core.plugins import Plugins
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing
 from gsx.experiments.reports.page import duration
 from gsx.experiments.runs.compose import compose, quoted
 from gsx.experiments.trade.training.settings import GIVEN, Setting, together
@@ -75,9 +76,16 @@ class Row:
         return max(losses, default=0.0)
 
 
+def refuse_unmeasured(evaluation: Mapping[str, Any]) -> None:
+    """Raise InputError for a run without test views, which nothing can be compared by."""
+    if measures_nothing(evaluation):
+        raise InputError(f"{NOT_MEASURED}: gsx trade compares held-out figures, choose another scene.split")
+
+
 def outcome_of(folder: Path, beside: Path) -> Outcome:
     """Of a finished run; beside: the page's folder."""
     found = read_json(folder / "evaluation.json")
+    refuse_unmeasured(found)
     zooms = {zoom: entry["psnr"] for zoom, entry in found["zoom"].items() if entry.get("psnr") is not None}
     return Outcome(
         folder=Path(os.path.relpath(folder, beside)).as_posix(),
@@ -135,7 +143,10 @@ class Trial:
 
 def measured(trial: Trial, listed: Sequence[Setting], most_together: int) -> list[Row]:
     """The composition as given, each setting alone, and what is best in several trades together."""
-    iterations = trial.composed([], trial.seeds[0]).general.iterations
+    settings = trial.composed([], trial.seeds[0])
+    if getattr(settings.scene.options, "split", "") == "none":  # before anything is trained
+        refuse_unmeasured({"views": []})
+    iterations = settings.general.iterations
     given = trial.tried(GIVEN, iterations)
     logger.info("%d settings, %d seed(s): about %s", len(listed), len(trial.seeds), duration(expected(given, listed)))
     rows = [given, *(trial.tried(setting, iterations) for setting in listed)]
