@@ -146,7 +146,7 @@ def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
 
 def measures_nothing(evaluation: Mapping[str, Any]) -> bool:
     """Return whether an evaluation is that of a run without test views."""
-    return bool(evaluation) and evaluation.get("views") == []
+    return evaluation.get("views") == [] and evaluation.get("psnr") is None
 
 
 def start_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
