@@ -121,8 +121,8 @@ def _ignored(parts: Sequence[FrameFile]) -> list[str]:
 
 
 def has_value(value: Any) -> bool:
-    """Return whether a value of a file is none of 0, false, empty, and lists of zeros."""
-    return any(map(has_value, value)) if isinstance(value, list) else bool(value)
+    """Return whether a value of a file is none of 0, false, empty, and a list of zeros."""
+    return any(value) if isinstance(value, list) else bool(value)
 
 
 def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) -> Shot:
