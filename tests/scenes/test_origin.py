@@ -16,6 +16,7 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 from gsx.builtin import plugins
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import Scene
+from gsx.core.errors import InputError
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.formats.origin import NO_ORIGIN, chosen_origin, comment_of, origin_of_positions, stated_in
@@ -180,3 +181,25 @@ def test_the_point_that_cameras_look_at() -> None:
     eyes = [[goal[0] + x, goal[1] + y, goal[2] + 1] for x, y in ((3, 0), (0, 4), (-3, 1))]
     cameras = [look_at(eye, goal, fov_x=0.9, width=24, height=16) for eye in eyes]
     torch.testing.assert_close(point_looked_at(cameras), torch.tensor(goal, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def rounded_poses(file: Path) -> None:
+    """Write quaternions and translations of a text model with six decimals, as some exporters do."""
+    lines = []
+    for line in file.read_text().splitlines():
+        words = line.split()
+        pose = not line.startswith("#") and len(words) == 10 and "." in words[9]
+        lines.append(" ".join([words[0], *(f"{float(w):.6f}" for w in words[1:8]), *words[8:]]) if pose else line)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_adjustment_finds_cameras_whose_turns_text_has_rounded(tmp_path: Path) -> None:
+    """COLMAP states translations from world to camera: a turn by 1e-6 moves a camera of UTM coordinates by 5 units."""
+    words, model = colmap(tmp_path, UTM, text=True), tmp_path / "sparse" / "0"
+    exact = positions(loaded(tmp_path, words))[0]
+    for name in ("frames.txt", "rigs.txt"):
+        (model / name).unlink(missing_ok=True)
+    rounded_poses(model / "images.txt")
+    with pytest.raises(InputError, match=r"scene\.adjust=auto finds them anew"):
+        loaded(tmp_path, words)
+    torch.testing.assert_close(positions(loaded(tmp_path, words, "scene.adjust=auto"))[0], exact, atol=0.01, rtol=0)

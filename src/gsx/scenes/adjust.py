@@ -23,6 +23,7 @@ from torch import Tensor
 from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
+from gsx.formats.origin import Origin, chosen_origin
 from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model, reconstruction_of
 from gsx.scenes.kept_models import kept_model
 from gsx.scenes.observations import known, straight_keypoints, unmeasured
@@ -32,7 +33,7 @@ from gsx.scenes.undistort import pinhole_of
 logger = logging.getLogger(__name__)
 
 WHEN = ("never", "auto", "always")
-METHOD = "adjusted/1"
+METHOD = "adjusted/2"
 """Part of the cache key: raise the number when the adjustment changes."""
 LEAST = 32
 """Observations of an image that tell its movement."""
@@ -162,6 +163,62 @@ def bundle_adjusted(folder: Path) -> Any:
     if not found.num_points3D():
         raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
     logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
+    x, y, z = origin = model_origin(found)
+    local = shifted(found, (-x, -y, -z))
+    if any(origin):
+        place_cameras(local)
+    return shifted(bent_where_needed(local, folder), origin)
+
+
+def model_origin(reconstruction: Any) -> Origin:
+    """Return the origin around which a model is adjusted: far from it, turning a camera moves everything it sees."""
+    images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
+    centres = torch.from_numpy(np.array([image.projection_center() for image in images]))
+    middle = centres.median(0).values
+    return chosen_origin(middle, float((centres - middle).norm(dim=1).mean()))
+
+
+def shifted(reconstruction: Any, by: Origin) -> Any:
+    """Return a model whose cameras and points are moved in place."""
+    import pycolmap
+
+    if any(by):
+        reconstruction.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(by)))
+    return reconstruction
+
+
+def place_cameras(reconstruction: Any) -> None:
+    """Put each camera where its observations say, as it is turned.
+
+    A model far from (0, 0, 0) states its cameras by rotation and translation: a rotation that text has rounded to six
+    digits puts a camera of UTM coordinates metres away.
+    """
+    for number in reconstruction.reg_image_ids():
+        image = reconstruction.image(number)
+        observed = [image.point2D(index) for index in image.get_observation_point2D_idxs()]
+        rays = image.camera.cam_from_img(np.array([point.xy for point in observed]).reshape(-1, 2))
+        points = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed]).reshape(-1, 3)
+        measured = np.isfinite(rays).all(1)
+        pose = image.cam_from_world()
+        translation = translation_from(rays[measured], points[measured] @ pose.rotation.matrix().T)
+        if translation is not None:
+            pose.translation = translation
+            image.frame.set_cam_from_world(image.camera_id, pose)
+
+
+def translation_from(rays: Float[np.ndarray, "K 2"], turned: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3"] | None:
+    """Return the translation by which turned points lie on their rays best; None: too few rays."""
+    if len(rays) < LEAST:
+        return None
+    rows = np.zeros((len(rays), 2, 3))
+    rows[:, 0, 0], rows[:, 1, 1], rows[:, :, 2] = 1, 1, -rays
+    right = rays * turned[:, 2:] - turned[:, :2]
+    found: np.ndarray = np.linalg.lstsq(rows.reshape(-1, 3), right.ravel(), rcond=None)[0]
+    return found
+
+
+def bent_where_needed(found: Any, folder: Path) -> Any:
+    """Return an adjusted model, in which cameras without distortion have some where that moves what they observed."""
     adjust(found, folder)
     straight = [number for number, camera in found.cameras.items() if camera.model_name in BENT]
     if not straight:
