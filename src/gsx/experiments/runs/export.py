@@ -29,7 +29,7 @@ from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.arrays import arrays_of, gaussians_from
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from gsx.formats.origin import NO_ORIGIN
+from gsx.formats.origin import NO_ORIGIN, in_words
 from gsx.formats.ply import write_whole
 from gsx.formats.splat_files import read_gaussians, write_columns, write_gaussians
 from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
@@ -134,6 +134,7 @@ def notes(run: Run) -> list[str]:
     return [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
+        *([f"trained around {in_words(run.scene.origin)}"] if any(run.scene.origin) else []),
         *zoomed_note(run.raster),
         *supersampling_note(run),
         *(own.file_notes() if own else ()),
