@@ -87,6 +87,8 @@ def test_points_far_from_all_splats_are_doubted() -> None:
     assert not list(distance_doubts(ball(), cloud))
     (doubt,) = distance_doubts(replace(ball(), means=10 * ball().means), cloud)
     assert "it holds a part of the scene, or is in other coordinates" in doubt
+    few = PointCloud(cloud.positions[:9], cloud.colours[:9])
+    assert not list(distance_doubts(replace(ball(), means=10 * ball().means), few))
     grey = PointCloud(cloud.positions, torch.full((150, 3), 127, dtype=torch.uint8))  # random ones: no evidence
     assert not list(distance_doubts(replace(ball(), means=10 * ball().means), grey))
 

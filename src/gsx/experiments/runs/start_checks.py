@@ -14,6 +14,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Bool, Float
 from gsx.formats.activated import activated_words
 from gsx.formats.origin import NO_ORIGIN, Origin
+from gsx.scenes.points import GREY
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +23,8 @@ MOST_SPLATS, MOST_POINTS, MOST_VIEWS = 50_000, 1000, 50
 LEAST_IN_VIEW = 0.05
 """Share of splats in view of some camera below which they are doubted: splats of a scene have most of theirs (fox: 97 %
 in two test views), in other axes 0.2 % were left."""
+LEAST_POINTS = 10
+"""Points of a scene that say something about where it is."""
 FAR = 0.25
 """Median distance of points from the nearest splat, in sizes of the point cloud, above which splats are doubted: splats
 of a scene have 0.01 (fox), a tenth off its scale 0.11, in other axes or scales 0.7 and more."""
@@ -88,10 +91,11 @@ def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -
 
 def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
     """Yield a sentence if the scene's points are far from all splats; random points, which are grey, say nothing."""
-    if len(points) < 2 or len(points.colours.unique(dim=0)) < 2:
+    measured = points.positions[(points.colours != GREY).any(1)]
+    if len(measured) < LEAST_POINTS:
         return
-    means, places = spread(gaussians.means, MOST_SPLATS).double(), spread(points.positions, MOST_POINTS)
-    places = places.to(means)
+    means = spread(gaussians.means, MOST_SPLATS).double()
+    places = spread(measured, MOST_POINTS).to(means)
     size = float((places - places.median(0).values).norm(dim=1).median())
     distance = float(torch.cat([torch.cdist(part, means).amin(1) for part in places.split(100)]).median())
     if size > 0 and distance > FAR * size:
