@@ -166,6 +166,24 @@ def test_lists_of_images_that_differ_are_explained(tmp_path: Path) -> None:
         read_model(model)
 
 
+def test_points_that_were_removed_from_their_file_alone_are_left_out(tmp_path: Path) -> None:
+    """As by a script that crops points3D.bin: images go on observing all 50."""
+    model = write_scene(synthesize(), tmp_path)
+    data, rows, at = (model / "points3D.bin").read_bytes(), [], 8
+    for _ in range(50):
+        end = at + 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+        rows.append(data[at:end])
+        at = end
+    write_records(model / "points3D.bin", rows[:40])
+    scene = load(colmap_options(tmp_path))
+    assert len(scene.points) == 40
+    assert "Images observe points that points3D.bin lacks, as where points" in scene.notes[0]
+    assert scene.notes[-1].startswith("Reprojection error 0.00 px (median of 200 observations")
+    adjusted = load(colmap_options(tmp_path, adjust="always")).notes
+    assert adjusted[0] == scene.notes[0]
+    assert "then pictures lie 0.00 px" in adjusted[1]
+
+
 def test_gsx_scenes_says_it(tmp_path: Path) -> None:
     model = write_scene(synthesize(), tmp_path)
     changed_images(model, lambda row: moved(row, (0.3, 0.0, 0.0)))

@@ -60,7 +60,7 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
     key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
     after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [
-        *([model.conflict] if model.conflict else []),
+        *(note for note in model.notes if note not in after.notes),
         f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_told(before)}, then "
         f"{fit_told(shift_of(after))}{unmeasured(after)}{lenses_told(model, after)}.",
     ]
@@ -162,6 +162,7 @@ def bundle_adjusted(folder: Path) -> Any:
     found, *_ = reconstruction_of(folder)
     if not found.num_points3D():
         raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
+    forget_removed_points(found)
     logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
     x, y, z = origin = model_origin(found)
     local = shifted(found, (-x, -y, -z))
@@ -228,6 +229,14 @@ def bent_where_needed(found: Any, folder: Path) -> Any:
     return bent if bend_of(bent, straight) > SHIFT else found
 
 
+def forget_removed_points(reconstruction: Any) -> None:
+    """Remove observations of points that the reconstruction lacks, which a bundle adjustment does not take."""
+    for image in reconstruction.images.values():
+        for index in image.get_observation_point2D_idxs():
+            if not reconstruction.exists_point3D(image.point2D(index).point3D_id):
+                image.reset_point3D_for_point2D(index)
+
+
 def adjust(reconstruction: Any, folder: Path) -> None:
     """Move cameras, focal lengths, distortion and points; on one thread, so that the bits are the same each time.
 
@@ -243,8 +252,14 @@ def adjust(reconstruction: Any, folder: Path) -> None:
     for number in reconstruction.reg_image_ids():
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    with quiet():
-        summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    try:
+        with quiet():
+            summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    except (ValueError, RuntimeError) as problem:
+        raise InputError(
+            f"COLMAP refuses a bundle adjustment of {folder} ({str(problem).strip()}): set scene.adjust=never, or "
+            "reconstruct the photos with scene=photos."
+        ) from None
     if not summary.is_solution_usable():
         raise InputError(
             f"The bundle adjustment of {folder} came to nothing ({summary.brief_report()}): set scene.adjust=never, or "

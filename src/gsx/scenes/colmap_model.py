@@ -30,6 +30,7 @@ from gsx.scenes.colmap_poses import pose_conflict, text_conflict, unmatched
 from gsx.scenes.colmap_records import U64, check_binary, contradiction
 from gsx.scenes.colmap_text import write_as_binary
 from gsx.scenes.points import read_points
+from gsx.scenes.posed import named
 
 OBSERVATIONS_PER_IMAGE = 1000  # read of each image: the reprojection check is a median over all images
 QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
@@ -50,6 +51,8 @@ class ModelImage:
     """Observed positions in pixels of the model's camera, pixel centres at +0.5, float64; evenly drawn from all."""
     observed: Float[Tensor, "K 3"]
     """The world points seen there, float64."""
+    lost: int = 0
+    """Observations that are left out because their point has been removed from the model."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,15 +81,23 @@ def read_model(folder: Path) -> Model:
     read = _points_of_ply if file.suffix.lower() == ".ply" else _points
     points, positions, point_notes = read(reconstruction, file)
     mean_error, error_notes = stated_error(reconstruction)
+    images = _images(reconstruction, positions, file)
     return Model(
         folder=folder,
         cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
-        images=_images(reconstruction, positions, file),
+        images=images,
         points=points,
         mean_error=mean_error,
-        notes=[*notes, *([conflict] if conflict else []), *point_notes, *error_notes],
+        notes=[*notes, *([conflict] if conflict else []), *point_notes, *lost_note(images, file), *error_notes],
         conflict=conflict,
     )
+
+
+def lost_note(images: Sequence[ModelImage], file: Path) -> list[str]:
+    """Return a note on points that images observe and the file of points lacks, as where a script has removed some."""
+    names = [image.name for image in images if image.lost]
+    lost = f"Images observe points that {file.name} lacks, as where points were removed from it alone"
+    return [f"{lost}: these observations are left out ({len(names)} images: {named(names)})."] if names else []
 
 
 Positions = Mapping[int, Float[Tensor, "3"]]
@@ -210,15 +221,20 @@ def _images(reconstruction: Any, positions: Positions | None, file: Path) -> lis
 
 
 def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
-    """An image with its observations, None: without; `file` is named if it lacks one of the points in `positions`."""
+    """An image with its observations, None: without.
+
+    Raises:
+        InputError: `file` is text and lacks a point that the image observes.
+    """
     indices = [] if positions is None else image.get_observation_point2D_idxs()
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
     seen = [image.point2D(index) for index in indices[::step]]
     positions = positions or {}
-    lost = next((point.point3D_id for point in seen if point.point3D_id not in positions), None)
+    lost = [point.point3D_id for point in seen if point.point3D_id not in positions]
     name = _name(image, file)
-    if lost is not None:
-        raise InputError(f"{file} is truncated: {name} observes its point {lost}; copy or make the model again.")
+    if lost and file.suffix.lower() == ".txt":  # a binary file states how many points it has
+        raise InputError(f"{file} is truncated: {name} observes its point {lost[0]}; copy or make the model again.")
+    seen = [point for point in seen if point.point3D_id in positions]
     observed = _stack([positions[point.point3D_id] for point in seen], 3)
     usable, pose = _usable(observed), image.cam_from_world()
     length = pose.rotation.norm()
@@ -234,6 +250,7 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
         translation=torch.from_numpy(pose.translation.copy()),
         keypoints=_stack([point.xy for point in seen], 2)[usable],
         observed=observed[usable],
+        lost=len(lost),
     )
 
 
