@@ -96,3 +96,11 @@ def test_colours_may_be_of_several_kinds(given: np.ndarray, found: list[int], mo
     columns = dict.fromkeys("xyz", np.zeros(3, np.float32)) | dict.fromkeys(("red", "green", "blue"), given)
     monkeypatch.setattr("gsx.scenes.points.read_ply", lambda path: columns)
     assert read_points(Path("a.ply")).colours.tolist() == [[value] * 3 for value in found]
+
+
+def test_splats_given_as_points_keep_their_colours(tmp_path: Path) -> None:
+    """0.5 + 0.28209479 f_dc, within what is displayed."""
+    columns = {axis: np.arange(2, dtype=np.float32) for axis in "xyz"}
+    bands = {f"f_dc_{i}": np.array(pair, np.float32) for i, pair in enumerate([(1, 5), (0, -5), (-1, 0)])}
+    write_ply(tmp_path / "a.ply", columns | bands)
+    assert read_points(tmp_path / "a.ply").colours.tolist() == [[199, 128, 56], [255, 0, 128]]

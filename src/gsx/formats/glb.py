@@ -251,7 +251,7 @@ def finite_rows(found: dict[str, Float[np.ndarray, "N k"]], name: str) -> dict[s
         if values.shape != (len(found[POSITION]), width):
             raise InputError(f"its attribute {key} has {values.shape[0]:,} x {values.shape[1]} values, "
                              f"not {len(found[POSITION]):,} x {width}: export it anew")  # fmt: skip
-    finite = np.isfinite(np.concatenate(list(found.values()), 1)).all(1)
+    finite = np.all([np.isfinite(values).all(1) for values in found.values()], 0)
     if finite.all():
         return found
     logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
+from gsx.core.gaussians.bands import BAND_0
 from gsx.core.shapes import Float, UInt8
 from gsx.formats.colours import colours_among, full_scale_of
 from gsx.formats.origin import in_single_where_resolved
@@ -17,6 +18,8 @@ from gsx.formats.ply import read_ply
 
 logger = logging.getLogger(__name__)
 
+CONSTANT_BAND = ("f_dc_0", "f_dc_1", "f_dc_2")
+"""Properties of splats that hold their colour from all sides."""
 GREY = 127  # colour of points without one: the published random clouds store this byte
 
 
@@ -66,6 +69,8 @@ def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None
     Points whose colour is not finite are grey.
     """
     values = colours_among(columns)
+    if values is None and set(CONSTANT_BAND) <= columns.keys():  # a splat file
+        values = (0.5 + BAND_0 * np.stack([columns[name] for name in CONSTANT_BAND], 1)).clip(0, 1)
     full = None if values is None else full_scale_of(values)
     if values is None or full is None:
         if values is not None:
