@@ -2,6 +2,7 @@
 
 import logging
 import shlex
+import struct
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -154,6 +155,16 @@ def test_who_asks_for_the_frames_of_a_video_meanwhile_waits_for_them(
     assert (found, len(chosen)) == ([12, 12], 1)
 
 
+def turned_film(film: Path, turned: Path) -> Path:
+    """The film as of a phone held upright: its track's matrix (ISO 14496-12) turns it by 90 degrees clockwise."""
+    content = bytearray(film.read_bytes())
+    start = content.index(b"tkhd") + 44
+    one, width = 1 << 16, 64 << 16
+    content[start : start + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, width, 0, 1 << 30)
+    turned.write_bytes(content)
+    return turned
+
+
 @pytest.mark.skipif(find_spec("av") is None, reason="PyAV is not installed")
 def test_of_each_stretch_of_a_video_the_sharpest_frame_is_taken(
     tmp_path: Path, trained: list[list[str]], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -183,6 +194,11 @@ def test_of_each_stretch_of_a_video_the_sharpest_frame_is_taken(
     caplog.set_level(logging.INFO, logger="gsx")
     assert photos_of(film, tmp_path / "outputs", 4) == first
     assert "chosen earlier" in caplog.text
+    side = turned_film(film, tmp_path / "turned.mp4")
+    ((_, pixels),) = sharpest(side, 40, 1)
+    assert pixels.shape == (96, 64, 3)
+    assert np.array_equal(pixels, np.rot90(next(sharpest(film, 40, 1))[1], -1))
+    assert photos_of(side, tmp_path / "outputs", 4) != first
     (tmp_path / "broken.mp4").write_bytes(b"no video at all" * 50)
     with pytest.raises(InputError, match="cannot be read as a video"):
         photos_of(tmp_path / "broken.mp4", tmp_path / "outputs")

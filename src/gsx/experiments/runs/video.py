@@ -40,7 +40,8 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
         InputError: the video cannot be read, or is too short.
     """
     require(f"frames of {path}", ("av",), "gsx[video]")
-    made_of = [*map(str, file_stamp(path)), count]
+    turns = next(map(quarter_turns, frames_in(path)), 0)
+    made_of = [*map(str, file_stamp(path)), count, *([turns] if turns else [])]
     folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
     if not chosen(folder, made_of):
         with made_by_one(folder / INDEX, wait=True):
@@ -97,13 +98,23 @@ def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt
     best: tuple[float, int, Any] | None = None
     for number, frame in enumerate(frames_in(path)):
         if best is not None and number * stretches // total > best[1] * stretches // total:
-            yield best[1], best[2].to_ndarray(format="rgb24")
+            yield best[1], upright_pixels(best[2])
             best = None
         score = sharpness(frame.to_ndarray(format="gray").astype(np.float32))
         if best is None or score > best[0]:
             best = score, number, frame
     if best is not None:
-        yield best[1], best[2].to_ndarray(format="rgb24")
+        yield best[1], upright_pixels(best[2])
+
+
+def quarter_turns(frame: Any) -> int:
+    """Return the quarter turns, counterclockwise, that bring a frame upright: phones film as the sensor lies."""
+    return round(getattr(frame, "rotation", 0) / 90)
+
+
+def upright_pixels(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+    """Return a frame as players show it."""
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarter_turns(frame)))
 
 
 def sharpness(grey: Float[np.ndarray, "H W"]) -> float:
