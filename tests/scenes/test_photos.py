@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 import pycolmap
 import pytest
 import torch
+from photo_files import write_pixels, write_webp_with_exif
 from synthetic_colmap import shipped
 from torch import Tensor
 
@@ -109,16 +110,20 @@ def test_reconstruction_is_found_again(
         load(options(capture[0], max_features=4095))
 
 
-SHOTS = ("webp", 6, 8, 3, 5)
-"""How the photos of the capture are stored anew: as lossless WebP, or as PNG with an EXIF orientation, 5 mirrored."""
+LENS = {"Make": "Maker", "Model": "Phone"}
+SHOTS = ("webp", 6, "turned", 3, 5)
+"""How the photos of the capture are stored anew: as lossless WebP, as PNG with an EXIF orientation, 5 mirrored, or as a
+portrait that a tool has turned."""
 
 
 def store(picture: Tensor, path: Path, kind: str | int) -> None:
-    """Write a picture of a sensor as WebP, or as PNG of an orientation, mirrored where that says so."""
-    mirrored = isinstance(kind, int) and kind in AFTER_MIRROR
-    buffer = oiio.ImageBuf(np.ascontiguousarray((picture.flip(-1) if mirrored else picture).permute(1, 2, 0).numpy()))
-    buffer.specmod().attribute(*(("Compression", "lossless") if kind == "webp" else ("Orientation", kind)))
-    assert buffer.write(str(path))
+    """Write the picture of a sensor."""
+    if kind in AFTER_MIRROR:
+        picture = picture.flip(-1)
+    picture = oriented(picture, 6) if kind == "turned" else picture
+    orientation = {"Orientation": kind} if isinstance(kind, int) else {}
+    write = write_webp_with_exif if kind == "webp" else write_pixels
+    write(path, picture.permute(1, 2, 0).numpy(), LENS | orientation)
 
 
 def test_photos_held_and_stored_in_any_way_give_one_camera_and_upright_views(
@@ -134,12 +139,13 @@ def test_photos_held_and_stored_in_any_way_give_one_camera_and_upright_views(
     assert len(pycolmap.Reconstruction(model).cameras) == 1
     for file in model.glob("*.bin"):
         assert file.read_bytes().replace(b".webp\0", b".png\0") == (first / file.name).read_bytes(), file.name
-    assert "EXIF turns 4 of 5 photos upright (scene.orientation)." in scene.notes
+    assert "EXIF turns 3 of 5 photos upright (scene.orientation)." in scene.notes
+    assert "1 photos that a tool has turned share the camera of those of their lens that are not." in scene.notes
     assert scene.provenance["turned"] == 4
     before = {view.name: view for view in (*expected.train, *expected.test)}
     for view in (*scene.train, *scene.test):
         name = view.name.replace(".webp", ".png")
-        turn = {"webp": 1, 5: AFTER_MIRROR[5]}.get(kinds[name], kinds[name])
+        turn = {"webp": 1, "turned": 6, 5: AFTER_MIRROR[5]}.get(kinds[name], kinds[name])
         assert view.camera.draws_as(oriented_camera(before[name].camera, turn))
         difference = (view.image().int() - oriented(before[name].image(), turn).int()).abs()
         assert difference.max() <= 1  # the lens of all is one: undistorted on the sensor's raster, then turned
@@ -413,6 +419,22 @@ def test_every_photo_can_have_its_camera(tmp_path: Path) -> None:
 def test_one_camera_for_photos_of_two_sizes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"30x40 \(b.png\), 40x30 \(a.png\).*camera_mode=auto"):
         camera_numbers(tmp_path, SIZES, "single")
+
+
+def test_portraits_that_a_tool_turned_join_the_landscapes_of_their_lens(tmp_path: Path) -> None:
+    """By their lens and focal length; the raster of a file whose EXIF states an orientation is the sensor's already."""
+    noted = {"wide": LENS, "tall": LENS, "other": LENS | {"Model": "Camera"}, "unknown": {}, "held": LENS}
+    for name, attributes in noted.items():
+        pixels = np.zeros((30, 40, 3) if name == "wide" else (40, 30, 3), np.uint8)
+        write_pixels(tmp_path / f"{name}.png", pixels, attributes | ({"Orientation": 6} if name == "held" else {}))
+    sizes = {f"{name}.png": image_size(tmp_path / f"{name}.png") for name in noted}
+    assert photos.turned_already(tmp_path, sizes, "auto") == {"tall.png": 8}
+    assert photos.turned_already(tmp_path, sizes, "single") == dict.fromkeys(
+        ("tall.png", "other.png", "unknown.png"), 8
+    )
+    assert photos.turned_already(tmp_path, sizes, "per_image") == {}
+    alone = {name: size for name, size in sizes.items() if name != "wide.png"}
+    assert photos.turned_already(tmp_path, alone, "auto") == {}
 
 
 @pytest.mark.parametrize(("count", "matcher"), [(2, "auto"), (9, "auto"), (3, "sequential"), (9, "sequential")])

@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 import pycolmap
 import pytest
 import torch
+from photo_files import lossless_webp, write_pixels, write_webp_with_exif
 
 from gsx.core.data.images import image_size, read_image, write_image
 from gsx.core.errors import InputError
@@ -29,14 +30,8 @@ LENS = {"Make": "Maker", "Model": "Phone", "Exif:FocalLengthIn35mmFilm": 28}
 def by_openimageio(pixels: np.ndarray, **attributes: int | str) -> Callable[[Path], None]:
     """Return what writes pixels to a file; `a__b=1` sets attribute a:b."""
 
-    def write(path: Path) -> None:
-        buffer = oiio.ImageBuf(np.ascontiguousarray(pixels))
-        for name, value in (attributes | LENS).items():
-            buffer.specmod().attribute(name.replace("__", ":"), value)
-        buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
-        assert buffer.write(str(path)), buffer.geterror()
-
-    return write
+    named = {name.replace("__", ":"): value for name, value in attributes.items()}
+    return lambda path: write_pixels(path, pixels, named | LENS)
 
 
 def palette_png(path: Path) -> None:
@@ -66,13 +61,6 @@ def tiff_of(compression: int, strip: Callable[[Path], bytes]) -> Callable[[Path]
         path.write_bytes(head + struct.pack("<H", len(entries)) + directory + bytes(4) + struct.pack("<3H", 8, 8, 8))
 
     return write
-
-
-def webp_strip(path: Path) -> bytes:
-    by_openimageio(PICTURE, Compression="lossless")(path.with_suffix(".strip.webp"))
-    content = path.with_suffix(".strip.webp").read_bytes()
-    path.with_suffix(".strip.webp").unlink()
-    return content
 
 
 def renamed(path: Path, suffix: str, write: Callable[[Path], None]) -> None:
@@ -109,7 +97,7 @@ CONVERTED = {
     "alpha.webp": by_openimageio(ALPHA, Compression="lossless"),
     "webp_inside.jpg": lambda path: renamed(path, ".webp", by_openimageio(PICTURE)),
     "light.tif": by_openimageio((PICTURE / 255).astype(np.float32)),
-    "webp_strip.tif": tiff_of(50001, webp_strip),
+    "webp_strip.tif": tiff_of(50001, lambda path: lossless_webp(PICTURE, path.parent)),
 }
 """Files that COLMAP's wheel does not decode, or decodes to other values."""
 
@@ -150,24 +138,9 @@ def test_photos_that_both_read_are_used_in_place(every_format: Path, tmp_path: P
     assert not (tmp_path / "work").exists()
 
 
-def webp_with_exif(path: Path, **attributes: int) -> None:
-    """WebP in its extended form, with the EXIF of a JPEG, as cameras and converters write it."""
-    by_openimageio(PICTURE, **attributes)(path.with_suffix(".exif.jpg"))
-    jpeg = path.with_suffix(".exif.jpg").read_bytes()
-    path.with_suffix(".exif.jpg").unlink()
-    start = jpeg.index(b"Exif\0\0")
-    (length,) = struct.unpack(">H", jpeg[start - 2 : start])
-    exif = jpeg[start + 6 : start + length - 2]
-    head = struct.pack("<I", 8) + (WIDTH - 1).to_bytes(3, "little") + (HEIGHT - 1).to_bytes(3, "little")
-    padded = exif + b"\0" * (len(exif) % 2)
-    body = b"WEBPVP8X" + struct.pack("<I", 10) + head + webp_strip(path)[12:]
-    body += b"EXIF" + struct.pack("<I", len(exif)) + padded
-    path.write_bytes(b"RIFF" + struct.pack("<I", len(body)) + body)
-
-
 def test_copies_keep_what_the_lens_is_known_by(tmp_path: Path) -> None:
     """COLMAP begins at the focal length that a WebP photo states as at that of a JPEG photo."""
-    webp_with_exif(tmp_path / "a.webp", Orientation=6)
+    write_webp_with_exif(tmp_path / "a.webp", PICTURE, LENS | {"Orientation": 6})
     by_openimageio(PICTURE, Orientation=6)(tmp_path / "b.jpg")
     folder, _ = prepared(tmp_path, tmp_path / "work")
     assert lens_of(tmp_path / "a.webp") == lens_of(folder / "a.webp") == lens_of(tmp_path / "b.jpg")

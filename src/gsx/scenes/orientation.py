@@ -33,6 +33,8 @@ INVERSES = {6: 8, 8: 6}
 """Orientations that undo others; those missing undo themselves."""
 MIRROR = 2
 """The orientation that exchanges left and right."""
+ON_SIDE = 8
+"""The orientation that lays upright pictures on their side."""
 AFTER_MIRROR = {2: 1, 4: 3, 5: 8, 7: 6}
 """Turn that brings a picture of these orientations upright once left and right are exchanged."""
 WITHOUT_MIRROR = {2: 1, 4: 3, 5: 6, 7: 8}
@@ -146,8 +148,13 @@ def of_turned_model(photo: Path, raster: Size) -> Turns:
 
 
 def of_own_model(photo: Path, raster: Size) -> Turns:
-    """Return the turns of a photo for structure from motion by gsx, which undoes mirrors first."""
-    exif = orientation_of(photo)
+    """Return the turns of a photo for structure from motion by gsx.
+
+    That undoes mirrors, and lays photos on their side that a tool has turned while others of their lens are not.
+    """
+    exif, size = orientation_of(photo), image_size(photo)
+    if exif == 1 and size != raster and size == oriented_size(raster, ON_SIDE):
+        return Turns(first=ON_SIDE, last=INVERSES[ON_SIDE])
     return Turns(exif=exif, first=MIRROR if exif in AFTER_MIRROR else 1, last=AFTER_MIRROR.get(exif, exif))
 
 

@@ -3,7 +3,6 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,11 +17,11 @@ from gsx.core.ranges import Range
 from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
 from gsx.scenes.colmap_model import Model, error_told, read_model
-from gsx.scenes.exif import orientation_of
+from gsx.scenes.exif import NO_LENS, lens_of, orientation_of
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
-from gsx.scenes.orientation import as_stored, of_own_model
+from gsx.scenes.orientation import ON_SIDE, as_stored, of_own_model, oriented_size
 from gsx.scenes.passed_models import refuse_passed_over
 from gsx.scenes.posed import named, refuse_partial
 from gsx.scenes.readable import readable_size
@@ -161,8 +160,10 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
     """
     sizes = {}
     for name in photos:
-        with suppress(InputError):
+        try:
             sizes[name] = readable_size(folder / name)
+        except InputError as problem:
+            logger.warning("%s", problem)
     broken = [name for name in photos if name not in sizes]
     if len(sizes) < MIN_PHOTOS:
         raise InputError(
@@ -191,6 +192,8 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orienta
         InputError: no two photos can be placed.
     """
     first = {name: RULES[orientation](folder / name, size).first for name, size in sizes.items()}
+    first |= turned_already(folder, sizes, options.camera_mode) if orientation == "auto" else {}
+    rasters = {name: oriented_size(size, first[name]) for name, size in sizes.items()}
     doubtful = sfm_copies.candidates(folder, first)
     final = cache_folder("sfm", _key(folder, sizes, options, doubtful))
     if intact(final):
@@ -198,11 +201,26 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orienta
         return final
 
     def make(work: Path) -> Any:
-        best = sfm.reconstruct(sfm_copies.prepared(folder, list(sizes), doubtful, work), sizes, options, work)
+        best = sfm.reconstruct(sfm_copies.prepared(folder, list(sizes), doubtful, work), rasters, options, work)
         _refuse_nothing(best, folder, sizes)
         return best
 
     return kept_model(final, make)
+
+
+def turned_already(folder: Path, sizes: sfm.Sizes, camera_mode: str) -> dict[str, int]:
+    """Return the orientation that lays those portraits on their side that share a camera with landscapes.
+
+    A tool has turned their pixels: they state no orientation, and a lens and focal length of which there are landscapes
+    of the same sides (camera_mode=auto), or all photos are to share one camera (single).
+    """
+    wide = {size for size in sizes.values() if size[0] > size[1]}
+    tall = [name for name, size in sizes.items() if size[::-1] in wide and orientation_of(folder / name) == 1]
+    if camera_mode == "auto" and tall:
+        lenses = {(lens_of(folder / name), size) for name, size in sizes.items() if size in wide}
+        stated = {name: lens_of(folder / name) for name in tall}
+        tall = [name for name in tall if stated[name] != NO_LENS and (stated[name], sizes[name][::-1]) in lenses]
+    return dict.fromkeys(tall, ON_SIDE) if camera_mode != "per_image" else {}
 
 
 def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, doubtful: Mapping[str, int]) -> str:

@@ -117,10 +117,13 @@ def lens_notes(shots: Sequence[Shot]) -> list[str]:
 
 def turn_notes(shots: Sequence[Shot]) -> list[str]:
     """Return notes on photos that are turned upright, and on mirrored ones whose cameras saw them mirrored."""
-    turned = [shot for shot in shots if shot.turns.first != 1 or shot.turns.last != 1]
+    turned = [shot for shot in shots if shot.turns.exif != 1]
+    laid = [shot for shot in shots if shot.turns.exif == 1 and shot.turns.first != 1]
     mirrored = [shot.name for shot in shots if shot.turns.exif in AFTER_MIRROR and shot.turns.first == 1]
     notes = [f"EXIF turns {len(turned)} of {len(shots)} photos upright (scene.orientation)."] if turned else []
     mirrors = f"EXIF mirrors {len(mirrored)} photos, but the cameras are stated for them as stored: they stay mirrored"
+    if laid:
+        notes.append(f"{len(laid)} photos that a tool has turned share the camera of those of their lens that are not.")
     return [*notes, *([f"{mirrors} ({named(mirrored)})."] if mirrored else [])]
 
 
