@@ -103,6 +103,7 @@ def binary_poses(file: Path) -> Iterator[tuple[int, np.ndarray, str]]:
         at = SKIPS["images"](data, at)
 
 
+@np.errstate(all="ignore")  # what is not finite is no equal pose
 def difference(pairs: Iterable[tuple[Any, np.ndarray]]) -> Difference | None:
     """Return how poses that are stated differ from those of pycolmap images; None: they do not."""
     images, poses = [], []

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from gsx.core.data.images import has_alpha, image_size, is_reduction, refuse_other_size
+from gsx.core.data.images import has_alpha, image_size, is_reduction
 from gsx.core.data.masks import INTERPOLATED, Mask
 from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import Size
@@ -73,7 +73,11 @@ def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
     size, stored = image_size(mask), turns.stored_size(raster)
     if not is_reduction(size, stored) and is_reduction(size, oriented_size(stored, turns.exif)):
         return (INVERSES.get(turns.exif, turns.exif),)
-    refuse_other_size(mask, size, stored)
+    if not is_reduction(size, stored):
+        raise InputError(
+            f"The mask '{mask}' is {size[0]} x {size[1]} and its photo {stored[0]} x {stored[1]}: give it the photo's "
+            "shape, or set scene.masks=none."
+        )
     return ()
 
 

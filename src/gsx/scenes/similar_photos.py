@@ -29,7 +29,7 @@ def _difference(name: str, file: str) -> str:
     if wanted.parent != present.parent and wanted.name == present.name:
         return "another folder: set scene.images to the folder to which names are relative"
     if wanted.stem == present.stem and wanted.suffix.lower() != present.suffix.lower():
-        return f"another suffix: convert the photos to {wanted.suffix or 'the format of the model'}, or rename them"
+        return f"another suffix: {f'convert the photos to {wanted.suffix}' if wanted.suffix else 'rename the photos'}"
     if name.casefold() == file.casefold():
         return "another case: rename the photos"
     return "another name: rename the photos"

@@ -29,6 +29,8 @@ OUTSIDE = 1.0
 STEPS = 9  # along each side of the picture, at which that is looked at
 SAME_PIXEL = 0.1
 """Px by which a keypoint may differ from the projection of its ray; more, and the ray is another pixel's."""
+LEAST_FOCAL, LARGEST_FOCAL = 1e-6, 1e12
+"""Px; beyond them is no lens, and numbers overflow."""
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
 
 
@@ -89,7 +91,8 @@ def _undistorted(model: str, width: int, height: int, params: tuple[float, ...])
         )
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     found = Undistorted(pinhole, None)
-    sensible = np.isfinite(params).all() and min(camera.focal_length_x, camera.focal_length_y) > 0
+    focal = camera.focal_length_x, camera.focal_length_y
+    sensible = np.isfinite(params).all() and min(focal) > LEAST_FOCAL and max(focal) < LARGEST_FOCAL
     if sensible and not shows_truly(camera, pinhole):
         found = Undistorted(*cut_where_folded(camera, pinhole))
     refuse_nonsense(camera, found.pinhole)
