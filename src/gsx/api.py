@@ -42,9 +42,10 @@ from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table
+from gsx.formats.axis_names import AUTO, SPECIFIED
 from gsx.formats.origin import NO_ORIGIN
-from gsx.formats.splat_files import read_around
-from gsx.formats.suffixes import splat_file_at
+from gsx.formats.splat_files import SpzForm, read_around
+from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at
 from gsx.scenes.origin import moved
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
@@ -107,15 +108,24 @@ class TrainedRun:
         words = [f"eval.{name}={json.dumps(plain(name, value))}" for name, value in options.items()]
         return evaluate_again(self.folder, plugins(), words)
 
-    def export(self, path: str | Path, seen: Camera | View | str | None = None, local: bool = False) -> Path:
+    def export(
+        self,
+        path: str | Path,
+        seen: Camera | View | str | None = None,
+        local: bool = False,
+        axes: str = SPECIFIED,
+        spz_version: int = SPZ_VERSIONS[0],
+    ) -> Path:
         """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view, or by
-        that camera; `local`: relative to `scene.origin`, which the file states where it can.
+        that camera; `local`: relative to `scene.origin`, which the file states where it can; axes (rub, rdf) and
+        spz_version (3, 4): of .spz.
 
         Raises:
-            InputError: the suffix is that of no format that is written, or there is no such view.
+            InputError: the suffix is that of no format that is written, or there is no such view, or form of .spz.
         """
         refuse_export(path := Path(path))
-        export(self.run, path, None if seen is None else camera_in(self.run, seen), local=local)
+        spz = SpzForm(version=spz_version, axes=axes)
+        export(self.run, path, None if seen is None else camera_in(self.run, seen), spz, local=local)
         return path
 
     def __repr__(self) -> str:
@@ -194,26 +204,32 @@ def train(*given: str, **values: Any) -> TrainedRun:
 
 
 def load(
-    path: str | Path, raster: RasterSettings | None = None, origin: tuple[float, float, float] = NO_ORIGIN
+    path: str | Path,
+    raster: RasterSettings | None = None,
+    origin: tuple[float, float, float] = NO_ORIGIN,
+    axes: str = AUTO,
 ) -> TrainedRun | SplatFile:
     """Open a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
 
     raster: the rules by which a splat file is drawn, in place of those that it states.
 
     origin: from where the coordinates of cameras count, `run.scene.origin` for the views of a georeferenced run.
+    axes: of the splat file: auto (what it states, else its format's), rub, rdf, or any three letters.
 
     Raises:
-        InputError: it is neither, or damaged; or `raster` is given for a run, which has its own.
+        InputError: it is neither, or damaged; or `raster` or `axes` are given for a run, which has its own.
         CheckpointError: the run has no usable checkpoint.
     """
     path = splat_file_at(at_home(path))
     if path.is_dir():
         if raster is not None:
             raise InputError(f"{path} is a run, drawn as it was trained: raster is for splat files")
+        if axes != AUTO:
+            raise InputError(f"{path} is a run, in the axes of its scene: axes is for splat files")
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
-    gaussians, own = read_around(path, base=origin)
+    gaussians, own = read_around(path, axes, origin)
     return SplatFile(path, gaussians, raster or rules_of(path), own)
 
 

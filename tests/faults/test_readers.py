@@ -33,7 +33,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe
 from gsx.experiments.runs.open import open_run
 from gsx.formats.ply import read_ply, write_ply
-from gsx.formats.splat_files import compensated, read_gaussians, write_gaussians
+from gsx.formats.splat_files import SpzForm, compensated, read_gaussians, write_gaussians
 
 pytestmark = pytest.mark.faults
 
@@ -200,7 +200,7 @@ def read_splats(folder: Path) -> None:
     read_gaussians(folder / "run" / "point_cloud.ply")
 
 
-COMPACT = ("a.compressed.ply", "a.spz", "a.sog", "a.glb")
+COMPACT = ("a.compressed.ply", "a.spz", "a.sog", "a.glb", "of_version_4.spz")
 FOREIGN = ("a.splat", "a.ksplat", "floats.ksplat", "sog/meta.json", "sog/means_l.webp", "sog/quats.webp", "one.sog")
 """Splat files that gsx reads alone."""
 
@@ -210,7 +210,7 @@ def compact(folder: Path) -> list[Path]:
     made = Gaussians(means=values, log_scales=values - 4, quats=values[:, [0, 1, 2, 0]], opacity_logits=values[:, 0],
                      sh_dc=values, sh_rest=values[:, None].repeat(1, 3, 1))  # fmt: skip
     for name in COMPACT:
-        write_gaussians(folder / name, made)
+        write_gaussians(folder / name, made, spz=SpzForm(version=4 if "4" in name else 3))
     return [folder / name for name in COMPACT]
 
 

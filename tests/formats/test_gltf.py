@@ -256,11 +256,7 @@ def test_text_with_its_buffers(tmp_path: Path, kind: str, name: str) -> None:
 def test_splats_kept_as_spz(tmp_path: Path, place: str) -> None:
     """Proposals of Cesium: the node turns what SPZ holds."""
     builder, written = Builder(), many(4, 1)
-    spz = {
-        "KHR_gaussian_splatting_compression_spz_2": {
-            "bufferView": builder.view(encode_spz(arrays_of(written), axes="rdf"))
-        }
-    }
+    spz = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": builder.view(encode_spz(arrays_of(written)))}}
     rules = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     extensions = {PREFIX: rules | {"extensions": spz}} if place == "inner" else {PREFIX: rules} | spz
     primitive = {"mode": 0, "attributes": {}, "extensions": extensions}

@@ -13,7 +13,8 @@ from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Range
 from gsx.experiments.runs.job import train
-from gsx.formats.suffixes import READABLE, WRITTEN, splat_file_at, suffix_of
+from gsx.formats.axis_names import AUTO, CHOICES, SPECIFIED, TRAINED
+from gsx.formats.suffixes import READABLE, SPZ_VERSIONS, WRITTEN, splat_file_at, suffix_of
 
 logger = logging.getLogger("gsx.cli")
 
@@ -77,6 +78,20 @@ def verb_photographs(arguments: list[str]) -> int:
     return 0
 
 
+def add_axes(parser: Parser, flag: str = "--axes") -> None:
+    """Add a flag for the axes of a splat file that is read."""
+    told = (
+        "of the FILE: rub (SPZ as specified), rdf (as trained), any three letters (auto: as it states, or its format)"
+    )
+    parser.add_argument(flag, choices=CHOICES, default=AUTO, metavar="AXES", help=told)
+
+
+def refuse_axes_of_run(verb: str, given: argparse.Namespace) -> None:
+    """Raise InputError for --axes of a run, whose axes are those of its scene."""
+    if given.axes != AUTO and splat_file_at(given.target).is_dir():
+        raise InputError(f"{verb}: --axes {given.axes} is for splat files, {given.target} is a run: leave it out")
+
+
 def verb_render(arguments: list[str]) -> int:
     """gsx render RUN|FILE [--orbit FILE | --path CAMERAS.json [--movie FILE]] ..."""
     parser = Parser(prog="gsx render", description="Render test views, an orbit as an animation, or a camera path.")
@@ -89,7 +104,9 @@ def verb_render(arguments: list[str]) -> int:
     parser.add_argument("--movie", type=Path, metavar="FILE", help="animate the path, at its own frames per second")
     parser.add_argument("--zoom", type=float, default=1, help="times the training resolution, or that of the path (1)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for pictures (RUN/renders/test, or path)")
+    add_axes(parser)
     given = parser.parse_args(arguments)
+    refuse_axes_of_run(parser.prog, given)
     refuse_beyond("gsx render --zoom", given.zoom, ZOOMS)
     refuse_beyond("gsx render --frames", given.frames, Range(1, MOST_FRAMES))
     refuse_beyond("gsx render --fps", given.fps, Range(0.1, 240))
@@ -123,7 +140,8 @@ def rendered(given: argparse.Namespace) -> Path:
         if way is None:
             raise InputError(f"gsx render {given.target}: a splat file has no views; give cameras with --path JSON")
         to = given.movie or given.to or file.parent / "path"
-        return render_path(way, file_pictures(file, way.cameras(given.zoom)), to, bool(given.movie), given.zoom)
+        draw = file_pictures(file, way.cameras(given.zoom), given.axes)
+        return render_path(way, draw, to, bool(given.movie), given.zoom)
     run, settings = open_run(given.target, plugins())
     remove_partial(given.target / "renders")
     if way is not None:
@@ -138,15 +156,17 @@ def rendered(given: argparse.Namespace) -> Path:
 
 
 def verb_view(arguments: list[str]) -> int:
-    """gsx view RUN|FILE [--host ADDRESS] [--port N]"""
+    """gsx view RUN|FILE [--host ADDRESS] [--port N] [--axes AXES]"""
     parser = Parser(prog="gsx view", description="Look around in a model with a browser, until Ctrl-C.")
     kinds = f"run folder, also of a run under way; splat file: {READABLE}"
     parser.add_argument("target", type=Path, metavar="RUN|FILE", help=kinds)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     parser.add_argument("--port", type=whole, default=8080, help="port (8080); 0: any that is free")
+    add_axes(parser)
     given = parser.parse_args(arguments)
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
+    refuse_axes_of_run(parser.prog, given)
     with loading():
         from gsx.experiments.runs.view import view_file, view_run
 
@@ -160,14 +180,40 @@ def verb_view(arguments: list[str]) -> int:
         if file.is_dir():
             view_run(file, plugins(), given.host, given.port, announce)
         else:
-            view_file(file, given.host, given.port, announce)
+            view_file(file, given.axes, given.host, given.port, announce)
     except KeyboardInterrupt:
         return 0
     return 0
 
 
+def add_spz_form(parser: Parser) -> None:
+    """Add the flags that say how .spz is written."""
+    parser.add_argument(
+        "--axes",
+        choices=(SPECIFIED, TRAINED),
+        default=SPECIFIED,
+        help="of .spz: the specification's (rub), or as trained, as SuperSplat and splat-transform have it (rdf)",
+    )
+    parser.add_argument(
+        "--spz-version",
+        type=int,
+        choices=SPZ_VERSIONS,
+        default=SPZ_VERSIONS[0],
+        help="of .spz: 3, which more programs read, or 4, which states its axes (gsx[spz])",
+    )
+
+
+def refuse_spz_form(given: argparse.Namespace) -> None:
+    """Raise InputError for `gsx export` flags that are about .spz where another file is written."""
+    flags = {"--axes": (given.axes, SPECIFIED), "--spz-version": (given.spz_version, SPZ_VERSIONS[0])}
+    for flag, (value, usual) in flags.items():
+        if value != usual and (given.file is None or given.file.suffix.lower() != ".spz"):
+            raise InputError(f"gsx export: {flag} {value} is of .spz files: give one, for example model.spz")
+
+
 def verb_export(arguments: list[str]) -> int:
-    """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--local]"""
+    """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--spz-version 3|4] [--from-axes AXES]
+    [--local]"""
     told = (
         f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
         "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
@@ -184,8 +230,8 @@ def verb_export(arguments: list[str]) -> int:
         help="one standard file for all views of a model that decodes splats for each, as cameras see it at ZOOM times "
         "their resolution",
     )
-    parser.add_argument("--axes", choices=("rub", "rdf"), default="rub", help="of .spz: the specification's (rub), "
-                        "or as trained, which Niantic's converter and SuperSplat have (rdf)")  # fmt: skip
+    add_spz_form(parser)
+    add_axes(parser, "--from-axes")
     parser.add_argument("--local", action="store_true", help="of a scene far from (0, 0, 0): positions relative to the "
                         "origin that it was trained around, which the file states where it can")  # fmt: skip
     given = parser.parse_args(arguments)
@@ -195,19 +241,23 @@ def verb_export(arguments: list[str]) -> int:
         from gsx.experiments.runs.export import export, is_page, losses, refuse_export, shown_views
         from gsx.experiments.runs.open import open_run
         from gsx.experiments.runs.render import view_named
+        from gsx.formats.splat_files import SpzForm
 
     if given.file:
         refuse_export(given.file)
     if given.bake:
         refuse_beyond("gsx export --bake", given.bake, ZOOMS)
-    if given.axes != "rub" and (given.file is None or given.file.suffix.lower() != ".spz"):
-        raise InputError(f"gsx export: --axes {given.axes} is of .spz files: give one, for example model.spz")
+    refuse_spz_form(given)
     if given.view and given.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
     source = splat_file_at(given.run)
     if suffix_of(source) and not source.is_dir():
         sys.stdout.write(f"{converted(source, given)}\n")
         return 0
+    if given.from_axes != AUTO:
+        raise InputError(
+            f"gsx export: --from-axes {given.from_axes} is for splat files, {given.run} is a run: leave it out"
+        )
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
@@ -215,10 +265,11 @@ def verb_export(arguments: list[str]) -> int:
     remove_partial(path.parent, below=False)
     if given.local and not any(run.scene.origin):
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
-    written = export(run, path, view.camera if view else None, given.axes, given.bake, given.local)
+    spz = SpzForm(version=given.spz_version, axes=given.axes)
+    written = export(run, path, view.camera if view else None, spz, given.bake, given.local)
     if written:
         views = [view] if view else shown_views(run.scene)
-        for line in losses(run, settings, path, views, written, given.axes, given.local):
+        for line in losses(run, settings, path, views, written, spz, given.local):
             logger.info("read back and rendered again: %s", line)
     if is_page(path) and path.parent.resolve() == given.run.resolve():
         write_report(given.run)  # it links to its pages
@@ -233,11 +284,13 @@ def converted(source: Path, given: argparse.Namespace) -> Path:
         InputError: it names no file to write, an option is for runs alone, or the file cannot be read or written.
     """
     from gsx.experiments.runs.convert import convert
+    from gsx.formats.splat_files import SpzForm
 
     if given.file is None:
         raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")
     if given.view or given.bake:
         raise InputError(f"gsx export: --view and --bake are for runs, and {source} is a splat file: leave them out")
-    convert(source, given.file, given.axes, given.local)
+    spz = SpzForm(version=given.spz_version, axes=given.axes)
+    convert(source, given.file, given.from_axes, spz, given.local)
     file: Path = given.file
     return file

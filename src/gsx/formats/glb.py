@@ -190,7 +190,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
     compressed = compression_of(primitive)
     if compressed:
         content, _ = view_of(asset, compressed.get("bufferView"))
-        arrays = decode_spz(content, axes="rdf")  # a node turns them, not their format
+        arrays, _ = decode_spz(content)  # a node turns them, not their format
     else:
         attributes = part_of(primitive, "attributes")
         found = {key: values_of(asset, attributes[key]) for key in wanted(attributes)}

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,8 @@ from gsx.core.files import refuse_lfs_pointer
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
+from gsx.formats.axes import to_training_axes
+from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES, SPECIFIED, TRAINED
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.formats.detect import MOST_HEADER, format_of
 from gsx.formats.glb import decode_glb, encode_glb, names_linear
@@ -25,7 +27,7 @@ from gsx.formats.sog_reading import decode_sog, sog_is_antialiased
 from gsx.formats.splat import decode_splat
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
 from gsx.formats.standard_ply import decode_standard_ply, finite_rows
-from gsx.formats.suffixes import STANDARD, splat_file_at, suffix_of
+from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, splat_file_at, suffix_of
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +36,9 @@ DECODERS = {".compressed.ply": decode_compressed_ply, ".splat": decode_splat, ".
 
 MODE_WORDS = ("splatrendermode:", "antialiased")
 """First words of the comments that say how a file is to be drawn."""
+
+REASONS = {"given": "given", "stated": "the file states"}
+"""Why a file's axes are out of doubt."""
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
@@ -50,16 +55,33 @@ def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
     return columns
 
 
+@dataclass(frozen=True, kw_only=True)
+class SpzForm:
+    """How .spz is written."""
+
+    version: int = 3
+    """4: streams of Zstandard, and the axes are stated; 3: what more programs read."""
+    axes: str = SPECIFIED
+    """The specification's, rub, or the training world's, rdf."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for what is not written."""
+        if self.version not in SPZ_VERSIONS:
+            raise InputError(f"the version of SPZ is {self.version!r}: choose {' or '.join(map(str, SPZ_VERSIONS))}")
+        if self.axes not in (SPECIFIED, TRAINED):
+            raise InputError(f"the axes of SPZ are {self.axes!r}: choose {SPECIFIED} or {TRAINED}")
+
+
 def write_gaussians(
     path: Path,
     gaussians: Gaussians,
     comments: Sequence[str] = (),
     compensated: bool = False,
-    axes: str = "rub",
+    spz: SpzForm = SpzForm(),
     origin: Origin = NO_ORIGIN,
 ) -> None:
-    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; axes: of SPZ;
-    origin: added to positions, in float64.
+    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; origin: added
+    to positions, in float64.
 
     Raises:
         InputError: a value is not finite; the property and the number of rows are named. Or the format cannot hold
@@ -70,20 +92,16 @@ def write_gaussians(
         write_columns(path, columns_of(gaussians), comments, origin)
     elif suffix == ".glb":
         write_whole(path, encode_glb(arrays_of(gaussians), comments, origin))
+    elif suffix == ".spz":
+        turned = to_training_axes(away(gaussians, origin), spz.axes)  # a turn by 180 degrees goes both ways
+        write_whole(path, encode_spz(arrays_of(turned), compensated, spz.version, spz.axes))
     else:
-        write_compact(path, suffix, arrays_of(away(gaussians, origin)), comments, compensated, axes)
+        write_compact(path, suffix, arrays_of(away(gaussians, origin)), comments, compensated)
 
 
-def write_compact(
-    path: Path, suffix: str, arrays: Arrays, comments: Sequence[str], compensated: bool, axes: str
-) -> None:
-    """Write a splat file that is no standard PLY; errors as `write_gaussians`."""
-    if suffix == ".spz":
-        content = encode_spz(arrays, compensated, axes)
-    elif suffix == ".sog":
-        content = encode_sog(arrays, compensated)
-    else:
-        content = encode_compressed_ply(arrays, comments)
+def write_compact(path: Path, suffix: str, arrays: Arrays, comments: Sequence[str], compensated: bool) -> None:
+    """Write a splat file that is neither a standard PLY nor SPZ; errors as `write_gaussians`."""
+    content = encode_sog(arrays, compensated) if suffix == ".sog" else encode_compressed_ply(arrays, comments)
     write_whole(path, content)
 
 
@@ -102,17 +120,31 @@ def write_columns(
     write_ply(path, columns, comments)
 
 
-def read_gaussians(path: Path, axes: str = "rub", origin: Origin = NO_ORIGIN) -> Gaussians:
-    """Read a splat file of any SH degree, of the format that its first bytes show. axes: of SPZ, which does not tell;
-    origin: subtracted from positions in float64.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SplatContent:
+    """What a splat file holds."""
+
+    path: Path
+    gaussians: Gaussians
+    """In the axes of training worlds, if the file is in `axes`; means in float64, with the origin that it states."""
+    axes: str
+    """Which the file's numbers are taken to be in: one of `axis_names.SYSTEMS`."""
+    by: str
+    """Why: given, stated, specified (the format's, which programs do not keep to), conventional (the format's)."""
+
+
+def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> Gaussians:
+    """Read a splat file of any SH degree, of the format that its first bytes show, and log axes that are in doubt.
+
+    axes: one of `axis_names.CHOICES`; origin: subtracted from positions in float64.
 
     Raises:
-        InputError: it is damaged, or lacks a property.
+        InputError: it is damaged, or lacks a property; or axes are given for a format that fixes them.
     """
     return around(read_in_double(path, axes), origin)
 
 
-def read_around(path: Path, axes: str = "rub", base: Origin = NO_ORIGIN) -> tuple[Gaussians, Origin]:
+def read_around(path: Path, axes: str = AUTO, base: Origin = NO_ORIGIN) -> tuple[Gaussians, Origin]:
     """Read a splat file as (Gaussians around an origin of their own, that origin), where coordinates count from `base`;
     errors as `read_gaussians`."""
     x, y, z = base
@@ -121,32 +153,79 @@ def read_around(path: Path, axes: str = "rub", base: Origin = NO_ORIGIN) -> tupl
     return around(gaussians, origin), origin
 
 
-def read_in_double(path: Path, axes: str = "rub") -> Gaussians:
+def read_in_double(path: Path, axes: str = AUTO) -> Gaussians:
     """Read a splat file as `read_gaussians`, with means in float64; the origin that a file states is added to them."""
+    content = read_splats(path, axes)
+    log_axes(content)
+    return content.gaussians
+
+
+def read_splats(path: Path, axes: str = AUTO) -> SplatContent:
+    """Read a splat file without a word on its axes; errors as `read_gaussians`."""
+    if axes not in CHOICES:
+        raise InputError(f"axes is {axes!r}: choose {EXAMPLES}")
     path = splat_file_at(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: check the path")
     refuse_lfs_pointer(path)
     try:
         content = path.read_bytes()
-        kind = format_of(content[:MOST_HEADER], path)
-        if kind != format_of(b"", path):
-            logger.info("%s is read as %s, which its first bytes show", path, kind)
-        return away(decode(content, kind, axes, str(path)), stated_in(content[:MOST_HEADER]))
+        kind = kind_of(content, path)
+        if axes != AUTO and kind == ".glb":
+            raise InputError(f"axes is {axes}, and glTF fixes the axes of its files: leave it out")
+        gaussians, stated = decode(content, kind, str(path))
+        gaussians = away(gaussians, stated_in(content[:MOST_HEADER]))
     except (OSError, InputError) as problem:
         raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
+    if axes != AUTO and stated not in (None, axes):
+        logger.warning("%s states axes %s, and is read as %s, as given", path, stated, axes)
+    axes, by = (axes, "given") if axes != AUTO else (stated, "stated") if stated else usual_axes(kind)
+    return SplatContent(path=path, gaussians=to_training_axes(gaussians, axes), axes=axes, by=by)
 
 
-def decode(content: bytes, kind: str, axes: str, name: str) -> Gaussians:
-    """Return the splats of a file's content, means in float64. kind: one of SUFFIXES; name: of the file, for the log.
+def kind_of(content: bytes, path: Path) -> str:
+    """Return which of SUFFIXES a file is; where its name says otherwise, the log does."""
+    kind = format_of(content[:MOST_HEADER], path)
+    if kind != format_of(b"", path):
+        logger.info("%s is read as %s, which its first bytes show", path, kind)
+    return kind
+
+
+def usual_axes(kind: str) -> tuple[str, str]:
+    """Return (axes of files of one of SUFFIXES that state none, why)."""
+    return (SPECIFIED, "specified") if kind == ".spz" else (TRAINED, "conventional")
+
+
+def log_axes(content: SplatContent) -> None:
+    """Log which axes a file was taken to hold, and the remedy if that is wrong; nothing where its format fixes them."""
+    if content.by == "specified":
+        logger.info(
+            "%s: axes %s, as SPZ specifies; the file states none. Where it lies upside down or out of view, give axes "
+            "%s (--axes %s, or axes=%s)",
+            *(content.path, content.axes, TRAINED, TRAINED, TRAINED),
+        )
+    elif content.by != "conventional":
+        logger.info("%s: axes %s, as %s", content.path, content.axes, REASONS[content.by])
+
+
+def decode(content: bytes, kind: str, name: str) -> tuple[Gaussians, str | None]:
+    """Return (splats of a file's content, means in float64; axes that it states, if any).
+
+    kind: one of SUFFIXES; name: of the file, for the log.
 
     Raises:
         InputError: it is damaged, or lacks a property.
     """
+    if kind == ".spz":
+        arrays, stated = decode_spz(content)
+        return in_double(arrays), stated
+    return decode_trained(content, kind, name), None
+
+
+def decode_trained(content: bytes, kind: str, name: str) -> Gaussians:
+    """Return the splats of a file whose format has the axes of training worlds, or is turned; errors as `decode`."""
     if kind == STANDARD:
         return decode_standard_ply(content, name)
-    if kind == ".spz":
-        return in_double(decode_spz(content, axes))
     if kind == ".glb":
         return in_double(decode_glb(content, name, Path(name).parent))
     if kind == ".sog":

@@ -18,6 +18,8 @@ STANDARD = ".ply"
 """Nothing is lost in it, and a backbone's own file is one."""
 MOST_META = 1 << 24
 """Bytes of a meta.json; those of SOG have a few thousand."""
+SPZ_VERSIONS = (3, 4)
+"""That are written."""
 
 
 def suffix_of(path: Path) -> str:

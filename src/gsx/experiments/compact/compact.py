@@ -34,14 +34,14 @@ from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import finish
-from gsx.experiments.runs.export import export, own_columns
+from gsx.experiments.runs.export import export, own_columns, read_again
+from gsx.experiments.runs.file_axes import in_axes_of
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings, write_config
 from gsx.experiments.runs.start_file import composition_of, in_scene, start_doubts, starting_splats
 from gsx.experiments.runs.verified import verified
-from gsx.formats.splat_files import read_gaussians
 from gsx.formats.suffixes import STANDARD
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,8 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
         return run, settings
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
     settings = compose([*words, f"iterations={FILE_STEPS}"], plugins)
-    scene, start = verified(load_scene(settings)), starting_splats(settings)
+    content, scene = starting_splats(settings), verified(load_scene(settings))
+    start = in_axes_of(scene, content)
     start = start and in_scene(start, scene)
     start_doubts(settings, scene, start)
     run = build(settings, scene, Path(), training=True, start=start)
@@ -205,7 +206,7 @@ def written(run: Run, shrinking: Shrinking, folder: Path, suffixes: Sequence[str
         try:
             with without_bands(run, degree):
                 export(run, path)
-            again = read_gaussians(path, origin=run.scene.origin)
+            again = read_again(path, origin=run.scene.origin)
             read = figures(run, shrinking.judging, [float(zoom) for zoom in own], again)
             out[suffix] = File(path.stat().st_size, max(own[zoom] - read[zoom] for zoom in own))
         except (ConfigError, InputError) as error:  # a package is missing, or a value is beyond what it holds

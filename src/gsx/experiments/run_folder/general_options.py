@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from gsx.core.options import label, without_effect
 from gsx.core.ranges import MOST_STEPS, Gigabytes, Range, Seed, Share, Steps
+from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES
 from gsx.formats.suffixes import READABLE, suffix_of
 
 BEGINNINGS = ("scratch", "warm_start")
@@ -38,6 +39,8 @@ class GeneralOptions:
     init: str = without_effect(default="scratch")
     """scratch; warm_start: branch from an earlier run that differs in its augmenters alone (`warm_start`); or a splat
     file that Gaussians go on from, which does count for what is trained (`run_key`)."""
+    axes: str = without_effect(default=AUTO)
+    """Axes of the splat file of `init`: auto, or three letters; given ones count for what is trained (`run_key`)."""
     warm_start_at: Annotated[list[int], Range(1, MOST_STEPS)] = without_effect(default_factory=list)
     """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
     disk_cache_gb: Gigabytes = without_effect(default=20.0)
@@ -56,6 +59,8 @@ class GeneralOptions:
         file = splat_file(self.init)
         if file is not None and not suffix_of(file):
             raise ValueError(f"init is '{self.init}'; choose scratch, warm_start, or a splat file ({READABLE})")
+        if self.axes not in CHOICES:
+            raise ValueError(f"axes is '{self.axes}'; choose {EXAMPLES}")
         if self.iterations < 1 and file is None:
             raise ValueError("iterations is 0; give 1 or more steps, or init=FILE, a splat file to evaluate as it is")
         if self.reuse and self.folder:

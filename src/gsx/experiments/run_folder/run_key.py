@@ -11,6 +11,7 @@ from gsx.core.options import fields_with, flattened
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.stamps import tree_stamp
+from gsx.formats.axis_names import AUTO
 from gsx.formats.suffixes import META
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
@@ -32,8 +33,14 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     counts.
     """
     kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *EVALUATION)}
-    begun = {"init": "splat file"} if splat_file(config.get("init")) else {}
+    begun = {"init": "splat file"} | given_axes(config) if splat_file(config.get("init")) else {}
     return kept | {"regenerator": asked_for(kept)} | begun
+
+
+def given_axes(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the axes that a composition names for its splat file; empty: none, as in those of older gsx."""
+    axes = config.get("axes", AUTO)
+    return {} if axes == AUTO else {"axes": axes}
 
 
 def asked_for(config: dict[str, Any]) -> dict[str, Any]:
@@ -156,4 +163,5 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
 def comparable(config: dict[str, Any]) -> dict[str, Any]:
     """Values by dotted key that runs may be compared by: not those that say where a run ran."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
-    return flattened(kept | ({"init": config["init"]} if splat_file(config.get("init")) else {}))
+    begun = {"init": config["init"]} | given_axes(config) if splat_file(config.get("init")) else {}
+    return flattened(kept | begun)

@@ -1,5 +1,6 @@
 """Splat files of a run, and pages that show one."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +29,11 @@ from gsx.experiments.runs.coordinates import COMMENTED, log_coordinates, placeme
 from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.arrays import arrays_of, gaussians_from
+from gsx.formats.axis_names import AUTO
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from gsx.formats.origin import NO_ORIGIN, in_words
+from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words
 from gsx.formats.ply import write_whole
-from gsx.formats.splat_files import read_gaussians, write_columns, write_gaussians
+from gsx.formats.splat_files import SpzForm, read_splats, write_columns, write_gaussians
 from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
 
 PAGE = ".html"
@@ -40,6 +42,9 @@ PAGE_VIEWS = 6
 """Test views that a page has as places to go to; it starts at the first."""
 LOOKED_AT = 5
 """Views by which losses are told."""
+SPZ_FORM = SpzForm()
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,13 +58,13 @@ class Exported:
 
 @yielding_cores()
 def export(
-    run: Run, path: Path, camera: Camera | None = None, axes: str = "rub", zoom: float = 0, local: bool = False
+    run: Run, path: Path, camera: Camera | None = None, spz: SpzForm = SPZ_FORM, zoom: float = 0, local: bool = False
 ) -> Exported | None:
     """Write the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
 
     camera: what is drawn for it alone. Without one a model that has no standard form is baked where the file is to hold
-    one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. axes: of SPZ.
-    local: positions relative to the scene's origin.
+    one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. local: positions
+    relative to the scene's origin.
 
     Raises:
         InputError: the format cannot hold the splats, or the model cannot be baked.
@@ -81,9 +86,22 @@ def export(
         write_whole(path, page_of(run, gaussians, comments).encode())
     else:
         refuse_too_far(path, gaussians, origin)
-        write_gaussians(path, gaussians, comments, run.raster.compensate, axes, origin)
+        write_gaussians(path, gaussians, comments, run.raster.compensate, spz, origin)
+        log_axes_written(path, spz)
     log_coordinates(path, run.scene.origin, local or is_page(path), gaussians)
     return Exported(gaussians=gaussians, baked=baked)
+
+
+def log_axes_written(path: Path, spz: SpzForm) -> None:
+    """Log the axes of a file whose reader may take it for others."""
+    if suffix_of(path) == ".spz":
+        states = "which it states" if spz.version > 3 else "which version 3 cannot state"
+        logger.info("%s: SPZ version %d, axes %s, %s", path, spz.version, spz.axes, states)
+
+
+def read_again(path: Path, spz: SpzForm = SPZ_FORM, origin: Origin = NO_ORIGIN) -> Gaussians:
+    """Read a file that was written here, relative to an origin."""
+    return around(read_splats(path, spz.axes if suffix_of(path) == ".spz" else AUTO).gaussians, origin)
 
 
 def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
@@ -175,14 +193,14 @@ def losses(
     path: Path,
     views: Sequence[View],
     written: Exported,
-    axes: str = "rub",
+    spz: SpzForm = SPZ_FORM,
     local: bool = False,
 ) -> list[str]:
     """What a standard file, read again, and baking have lost, in PSNR of renders of some views; in words."""
     views, inside = views[:LOOKED_AT], written.gaussians
     stated = local and suffix_of(path) in COMMENTED
     origin = NO_ORIGIN if local and not stated else run.scene.origin
-    again = as_in_page(inside) if is_page(path) else read_gaussians(path, axes, origin)
+    again = as_in_page(inside) if is_page(path) else read_again(path, spz, origin)
 
     def pictures(gaussians: Gaussians) -> list[Float[Tensor, "3 H W"]]:
         pixels = settings.evaluation.tile_pixels

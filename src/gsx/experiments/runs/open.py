@@ -33,6 +33,7 @@ from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
 from gsx.experiments.runs.compose import key_of
 from gsx.experiments.runs.environment import environment
+from gsx.experiments.runs.file_axes import in_axes_of
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
@@ -44,7 +45,7 @@ from gsx.experiments.runs.verified import verified
 
 logger = logging.getLogger(__name__)
 
-OF_TRAINING = ("iterations", "length", "seed", "init", "reuse", "warm_start_at", "output", "folder")
+OF_TRAINING = ("iterations", "length", "seed", "init", "axes", "reuse", "warm_start_at", "output", "folder")
 """How long a run is trained, from what, and where it goes: nothing of what it shows once it is there."""
 
 
@@ -101,8 +102,9 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     build_trackers(settings.trackers)  # the same: a missing package
     if settings.general.viewer:
         require("viewer=true", ("viser",), "gsx[viewer]")
-    start = starting_splats(settings)
+    content = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
+    start = in_axes_of(scene, content)
     start = start and in_scene(start, scene)
     doubts = start_doubts(settings, scene, start)
     run = build(settings, scene, Path(), training=True, start=start)

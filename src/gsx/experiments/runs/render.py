@@ -22,6 +22,7 @@ from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import refuse_nothing_in_view
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
+from gsx.formats.axis_names import AUTO
 from gsx.formats.splat_files import read_around
 from gsx.scenes.origin import moved
 
@@ -81,13 +82,14 @@ def run_pictures(run: Run, settings: Settings) -> Draw:
     return lambda camera: render(run, moved(camera, origin), pixels).image
 
 
-def file_pictures(path: Path, cameras: Sequence[Camera] = ()) -> Draw:
-    """Return what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those.
+def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) -> Draw:
+    """Return what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those;
+    axes: the file's.
 
     Raises:
         InputError: it cannot be read, or no splat is in view of any of the cameras.
     """
-    (gaussians, origin), raster = read_around(path), rules_of(path)
+    (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:
         refuse_nothing_in_view(
             gaussians, [moved(camera, origin) for camera in cameras], "camera of the path", path, origin

@@ -91,18 +91,27 @@ def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -
 
 def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
     """Yield a sentence if the scene's points are far from all splats; random points, which are grey, say nothing."""
-    measured = points.positions[(points.colours != GREY).any(1)]
-    if len(measured) < LEAST_POINTS:
+    places = evident_points(points)
+    if not len(places):
         return
-    means = spread(gaussians.means, MOST_SPLATS).double()
-    places = spread(measured, MOST_POINTS).to(means)
     size = float((places - places.median(0).values).norm(dim=1).median())
-    distance = float(torch.cat([torch.cdist(part, means).amin(1) for part in places.split(100)]).median())
+    distance = distance_from_points(spread(gaussians.means, MOST_SPLATS).cpu(), places)
     if size > 0 and distance > FAR * size:
         yield (
             f"half of the scene's points are more than {distance:.3g} from its nearest splat, and the points have a "
             f"size of {size:.3g}: it holds a part of the scene, or is in other coordinates"
         )
+
+
+def evident_points(points: PointCloud) -> Float[Tensor, "n 3"]:
+    """Return some of the points that were measured, float64; none of scenes that have few, as random ones are grey."""
+    measured = points.positions[(points.colours != GREY).any(1)]
+    return spread(measured, MOST_POINTS).double() if len(measured) >= LEAST_POINTS else measured[:0].double()
+
+
+def distance_from_points(means: Float[Tensor, "N 3"], places: Float[Tensor, "n 3"]) -> float:
+    """Return the median distance of a scene's points from the nearest of some means, scene units."""
+    return float(torch.cat([torch.cdist(part, means.double()).amin(1) for part in places.split(100)]).median())
 
 
 def middle(places: Float[Tensor, "N 3"], origin: Origin) -> str:

@@ -20,8 +20,9 @@ from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.compose import key_of, quoted
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import doubts_about
+from gsx.formats.axis_names import AUTO
 from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words, rounding_at, stored_in_single
-from gsx.formats.splat_files import compensated, is_linear, read_in_double
+from gsx.formats.splat_files import SplatContent, compensated, is_linear, read_splats
 
 logger = logging.getLogger(__name__)
 
@@ -36,20 +37,23 @@ MIP_KERNEL = 0.1
 """px^2 by which models of Mip-Splatting are dilated, with opacities compensated (Yu et al. 2024)."""
 
 
-def starting_splats(settings: Settings) -> Gaussians | None:
-    """Return the Gaussians that a run begins with, means in float64 as the file has them; None: it begins with points.
+def starting_splats(settings: Settings) -> SplatContent | None:
+    """Return what the splat file holds that a run begins with, means in float64; None: it begins with points.
 
     Raises:
+        ConfigError: axes are given, and there is no file.
         InputError: the file cannot be read, or holds nothing.
     """
-    path = splat_file(settings.general.init)
+    path, axes = splat_file(settings.general.init), settings.general.axes
+    if path is None and axes != AUTO:
+        raise ConfigError(f"axes={axes} is about a splat file: give init=FILE, or leave it out")
     if path is None:
         return None
-    gaussians = read_in_double(path)
-    if not len(gaussians.means):
+    content = read_splats(path, axes)
+    if not len(content.gaussians.means):
         raise InputError(f"init: {path} holds no splats: choose another file")
-    logger.info("beginning with the %d splats of %s", len(gaussians.means), path)
-    return gaussians
+    logger.info("beginning with the %d splats of %s", len(content.gaussians.means), path)
+    return content
 
 
 def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
@@ -57,18 +61,22 @@ def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
 
     A file that lies around (0, 0, 0), as other programs leave it, is taken as written around that origin.
     """
-    if not any(scene.origin):
-        return around(gaussians, scene.origin)
-    if lies_around_zero(gaussians.means, scene.origin):
+    origin = origin_of_file(gaussians, scene)
+    if origin != scene.origin:
         logger.warning(
             "init: the splats lie around (0, 0, 0), and the scene around %s: taken for coordinates relative to that",
             in_words(scene.origin),
         )
-        return around(gaussians, NO_ORIGIN)
-    if stored_in_single(gaussians.means):
+    elif any(origin) and stored_in_single(gaussians.means):
         step = rounding_at(gaussians.means)
         logger.warning("init: positions are stored in single precision, in steps of %.2g scene units there", step)
-    return around(gaussians, scene.origin)
+    return around(gaussians, origin)
+
+
+def origin_of_file(gaussians: Gaussians, scene: Scene) -> Origin:
+    """Return what is to be subtracted from the positions of a file: the scene's origin, unless that was done before."""
+    lies_there = any(scene.origin) and lies_around_zero(gaussians.means, scene.origin)
+    return NO_ORIGIN if lies_there else scene.origin
 
 
 def lies_around_zero(positions: Float[Tensor, "P 3"], origin: Origin) -> bool:

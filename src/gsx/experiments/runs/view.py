@@ -76,9 +76,9 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
 
 
 @yielding_cores()
-def view_file(path: Path, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Show a splat file until Ctrl-C; errors as `view_run`."""
-    gaussians, origin = read_around(path)
+def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[str], None]) -> None:
+    """Show a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
+    gaussians, origin = read_around(path, axes)
     if not len(gaussians.means):
         raise InputError(f"{path} holds no splats: choose another file")
     raster = rules_of(path)

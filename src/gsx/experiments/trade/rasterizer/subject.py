@@ -32,7 +32,7 @@ FIELD_OF_VIEW = math.radians(60)
 ELEVATION = math.radians(25)
 DISTANCE = 1.3
 """Times the distance at which the sphere of half the splats fills the picture."""
-FILE_KEYS = ("rasterizer", "device", "seed")
+FILE_KEYS = ("rasterizer", "device", "seed", "axes")
 """What can be overridden for a splat file, which brings no scene."""
 
 
@@ -170,7 +170,7 @@ def subject_of_file(path: Path, overrides: Sequence[str], views: int, plugins: P
         if override.partition("=")[0].lstrip("+~").split(".")[0] not in FILE_KEYS:
             raise ConfigError(f"'{override}' means nothing to a splat file: override only {', '.join(FILE_KEYS)}")
     device = choose_device(settings.general.device)
-    gaussians, _ = read_around(path)
+    gaussians, _ = read_around(path, settings.general.axes)
     cameras, note = framing_cameras(gaussians.means, views, path)
     shots = [
         Shot(name=f"around {i}", camera=camera, splats=on(splats_of(gaussians, camera.centre), device))

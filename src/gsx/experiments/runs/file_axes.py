@@ -1,0 +1,117 @@
+"""Which axes the numbers of a splat file are in, by the scene that they are to fit."""
+
+import logging
+from dataclasses import dataclass
+from math import isnan
+from statistics import fmean
+
+import torch
+
+from gsx.core.data.scene import Scene
+from gsx.core.gaussians.splats import Gaussians
+from gsx.experiments.runs.start_checks import (
+    MOST_SPLATS,
+    MOST_VIEWS,
+    distance_from_points,
+    evident_points,
+    reaching,
+    spread,
+)
+from gsx.experiments.runs.start_file import origin_of_file
+from gsx.formats.axes import flipped
+from gsx.formats.axis_names import SPECIFIED, TRAINED
+from gsx.formats.origin import around
+from gsx.formats.splat_files import SplatContent, log_axes
+
+logger = logging.getLogger(__name__)
+
+OTHER = {SPECIFIED: TRAINED, TRAINED: SPECIFIED}
+"""The two systems that programs write; each is the other one turned by 180 degrees about x."""
+NEARER = 1.5
+"""Ratio of distances from the scene's points from which on they decide."""
+MORE_IN_VIEW = 1.2
+"""Ratio of shares in view from which on they decide."""
+LEAST_IN_VIEW = 0.05
+"""Share in view of axes that are chosen: what lies elsewhere fits in no axes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How splats in some axes lie in a scene."""
+
+    in_view: float
+    """Share of splats that a view has in front of it and within its picture, mean over views."""
+    distance: float
+    """Median distance of the scene's points from the nearest splat, scene units; nan: it has none, or random ones."""
+
+    def __str__(self) -> str:
+        points = "" if isnan(self.distance) else f", points {self.distance:.3g} from the nearest splat"
+        return f"{self.in_view:.1%} in view{points}"
+
+
+def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
+    """Return the Gaussians of a file, if there is one, in the axes that fit the scene where the file leaves them open.
+
+    Which axes are taken, why, and how to choose others go to the log.
+    """
+    if content is None:
+        return None
+    other = OTHER.get(content.axes)
+    if content.by in ("given", "stated") or other is None:
+        log_axes(content)
+        return content.gaussians
+    turned = flipped(content.gaussians, torch.tensor([1.0, -1.0, -1.0]))
+    fits = {content.axes: fit(content.gaussians, scene), other: fit(turned, scene)}
+    best = better(fits)
+    if content.by == "specified":
+        log_choice(content, fits, best)
+        return turned if best == other else content.gaussians
+    if best == other:
+        log_doubt(content, fits, other)
+    return content.gaussians
+
+
+def fit(gaussians: Gaussians, scene: Scene) -> Fit:
+    """Return how Gaussians of a file lie in a scene."""
+    some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
+    some = around(some, origin_of_file(some, scene))
+    views = [*scene.train, *scene.test]
+    cameras = [view.camera for view in views[:: -(-len(views) // MOST_VIEWS)]]
+    in_view = fmean(float(reaching(some, camera, 0).double().mean()) for camera in cameras)
+    places = evident_points(scene.points)
+    distance = distance_from_points(some.means, places) if len(places) else float("nan")
+    return Fit(in_view=in_view, distance=distance)
+
+
+def better(fits: dict[str, Fit]) -> str | None:
+    """Return the axes of the better of two fits; None: undecided.
+
+    Points decide where they are clearly nearer; else the share in view does, which a scene on a table top that is
+    turned over may leave as it was.
+    """
+    (first, a), (second, b) = fits.items()
+    if max(a.in_view, b.in_view) < LEAST_IN_VIEW:
+        return None
+    if a.distance > NEARER * b.distance or b.distance > NEARER * a.distance:
+        return first if a.distance < b.distance else second
+    if a.in_view > MORE_IN_VIEW * b.in_view or b.in_view > MORE_IN_VIEW * a.in_view:
+        return first if a.in_view > b.in_view else second
+    return None
+
+
+def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) -> None:
+    """Log which axes were taken for a file that states none."""
+    evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
+    if best:
+        message = "%s: axes %s, which fit the scene (%s); the file states none, axes=%s takes the others"
+        logger.info(message, content.path, best, evidence, OTHER[best])
+    else:
+        message = "%s: axes %s, as SPZ specifies; file and scene leave them open (%s): compare with axes=%s"
+        logger.warning(message, content.path, content.axes, evidence, OTHER[content.axes])
+
+
+def log_doubt(content: SplatContent, fits: dict[str, Fit], other: str) -> None:
+    """Warn of a file of a format with usual axes that would fit the scene better in others."""
+    evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
+    message = "%s: its splats would fit the scene better in axes %s (%s): try axes=%s"
+    logger.warning(message, content.path, other, evidence, other)
