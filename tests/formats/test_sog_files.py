@@ -177,6 +177,7 @@ UNFIT: dict[str, tuple[Callable[[Sog], dict[str, bytes]], str]] = {
     "another palette": (changed("shN", bands=2), "palette of 2 bands is 192 pixels wide"),
     "a label beyond the palette": (changed("shN", count=5), "vector 5 of a palette of 5"),
     "a path out of the folder": (changed("quats", files=["../quats.webp"]), "outside of its folder|has no '../quats"),
+    "ranges that overflow": (changed("means", maxs=[1e300] * 3), "'means' that are not finite"),
     "names that are none": (changed("quats", files=[7]), "no whole SOG"),
 }
 

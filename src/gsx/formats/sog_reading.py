@@ -85,7 +85,8 @@ def decode_sog(content: bytes, path: Path) -> Arrays:
     archive = archive_of(content, path)
     refuse_model(archive.meta)
     try:
-        return finite(splats_in(archive))
+        with np.errstate(all="ignore"):  # `finite` refuses what overflows
+            return finite(splats_in(archive))
     except InputError:
         raise
     except Exception as error:  # of JSON's and pictures' content: all say that it is damaged

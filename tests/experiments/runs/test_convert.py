@@ -12,6 +12,7 @@ from foreign_splats import row as row_of
 from tiny import tiny_settings
 
 import gsx.api
+from gsx.cli.compact import beside
 from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
 from gsx.experiments.run_folder.run_key import scene_stamp
@@ -128,3 +129,9 @@ def test_the_page_on_formats_names_all_kinds() -> None:
     page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
     reading = page[page.index("\n## In\n") :]
     assert all(f"`{kind}`" in reading for kind in (*SUFFIXES, META))
+
+
+def test_a_smaller_run_lies_beside_what_it_is_made_of(tmp_path: Path) -> None:
+    files = kinds(tmp_path)
+    assert beside(files[".splat"]) == beside(files[".compressed.ply"]) == tmp_path / "a_compact"
+    assert beside(files["folder"] / "meta.json") == tmp_path / "sog_compact"
