@@ -1,15 +1,15 @@
-#!/bin/bash
-# pycolmap 4.2.1: a pose that is changed in images.bin, as scripts for COLMAP 3 do it, changes nothing.
-#
-# A model of COLMAP 4 states each pose twice: in frames.bin with rigs.bin, and in images.bin for older programs. One
-# would guess that both have to agree, or that a reader warns. Reconstruction reads frames.bin and drops the poses of
-# images.bin without a word; without frames.bin and rigs.bin the same images.bin counts. Writing the model again
-# restores the old pose in images.bin.
-#
+#!/usr/bin/env bash
+# Package: pycolmap 4.2.1 (PyPI).
+# Input: a model of COLMAP 4, which states each pose twice: in frames.bin with rigs.bin, and in images.bin for older
+#   programs. A pose is changed in images.bin, as scripts for COLMAP 3 do it.
+# Expected: both have to agree, or the reader warns.
+# Seen: Reconstruction takes the pose of frames.bin and says nothing. Without frames.bin and rigs.bin the same
+#   images.bin counts. Writing the model again restores the old pose in images.bin.
 # Output seen:
 #   images.bin moved by 7 units; read with frames.bin: moved by 0.0
 #   read without frames.bin and rigs.bin: moved by 7.0
 #   written again from the first: images.bin is as before the change: True
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

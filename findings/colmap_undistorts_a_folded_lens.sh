@@ -1,16 +1,15 @@
-#!/bin/bash
-# pycolmap 4.2.1: the camera that undistort_camera proposes for a lens that folds within the photo.
-#
-# SIMPLE_RADIAL with k = -0.25 maps a slope r to f r (1 - r^2 / 4), which stops growing at r = 1.155. At f = 120 px that
-# is 92 px from the middle of a photo of 200 x 150 px: pixels farther out have no ray, and cam_from_img says so (NaN).
-# One would guess that undistort_camera, which promises no blank pixels by default, stays within that or refuses.
-# It proposes 400 x 170 px, twice the photo's width, whose outer columns show the photo again, mirrored. A lens with
-# k = -0.18, whose photo reaches past the fold in its corners only, is undistorted rightly.
-#
+#!/usr/bin/env bash
+# Package: pycolmap 4.2.1 (PyPI).
+# Input: SIMPLE_RADIAL, f = 120 px, k = -0.25, a photo of 200 x 150 px. It maps a slope r to f r (1 - r^2 / 4), which
+#   stops growing at r = 1.155, 92 px from the middle. Pixels farther out have no ray, and cam_from_img says so (NaN).
+# Expected: undistort_camera, which leaves no blank pixels by default, stays within that, or refuses.
+# Seen: it proposes 400 x 170 px, twice the photo's width. The outer columns show the photo again, mirrored. A lens with
+#   k = -0.18, whose photo reaches past the fold in its corners only, is undistorted rightly.
 # Output seen:
 #   pixels without a ray: 19.2 %
 #   k = -0.25: proposed 400 x 170, mirrored pixels 35.1 %
 #   k = -0.18: proposed 244 x 162, mirrored pixels 0.0 %
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
