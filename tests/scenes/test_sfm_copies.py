@@ -132,7 +132,7 @@ def test_every_promised_format_comes_to_colmap_as_gsx_sees_it(every_format: Path
 
 
 def test_photos_that_both_read_are_used_in_place(every_format: Path, tmp_path: Path) -> None:
-    for name in ("rgb.png", "plain.tif"):
+    for name in ("rgb.png", "plain.tif"):  # nothing is decoded twice, nothing written
         (tmp_path / name).write_bytes((every_format / name).read_bytes())
     assert prepared(tmp_path, tmp_path / "work")[0] == tmp_path
     assert not (tmp_path / "work").exists()
@@ -159,6 +159,14 @@ def test_mirrored_photos_come_to_colmap_without_the_mirror(tmp_path: Path) -> No
     assert torch.equal(copied, torch.from_numpy(PICTURE).permute(2, 0, 1).flip(-1))
     assert torch.equal(copied, oriented(read_image(tmp_path / "a.png"), 2))
     assert pycolmap.Bitmap.read(folder / "a.png", True).exif_orientation() in (None, 1)
+
+
+def test_copies_take_no_other_photos_place(tmp_path: Path) -> None:
+    for name in ("a.webp", "a.webp.png", "a.png"):
+        by_openimageio(PICTURE)(tmp_path / name)
+    folder, names = prepared(tmp_path, tmp_path / "work")
+    assert sorted(file.name for file in folder.iterdir()) == sorted(names) == ["a.png", "a.webp", "a.webp.png"]
+    assert [name for name in names if not (folder / name).is_symlink()] == ["a.webp"]
 
 
 # what is not read

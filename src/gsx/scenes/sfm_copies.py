@@ -25,6 +25,8 @@ SAME = ("jpeg", "png", "bmp")
 """Formats, by OpenImageIO's names, that both decode to the same pixels (a test compares them)."""
 TOLERANCE = 2.0
 """Mean difference of 8-bit values up to which a decoded photo is the same: JPEG decoders round differently."""
+WORKERS = 4
+"""Photos that are decoded at once: each takes several times its size of memory."""
 KEPT = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
 """What COLMAP derives focal lengths and shared cameras from."""
 
@@ -53,7 +55,7 @@ def prepared(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], wo
     Raises:
         InputError: a photo is damaged, or a copy cannot be written.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(WORKERS) as pool:
         needed = list(pool.map(lambda name: doubtful[name] != 1 or not reads_alike(folder / name), doubtful))
         copies = [name for name, need in zip(doubtful, needed, strict=True) if need]
         if not copies:
@@ -89,7 +91,7 @@ def link(photo: Path, place: Path) -> None:
 def copy(photo: Path, place: Path, orientation: int) -> None:
     """Write the colours of a photo as PNG of 8 bits, turned by an EXIF orientation, with its lens's EXIF."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    written = place.with_name(f"{place.name}.png")
+    written = place.with_name(f".{place.name}.png")  # hidden files are no photos: it replaces none
     write_image(written, colours_of(photo, orientation), lens_attributes(photo))
     os.replace(written, place)
 
