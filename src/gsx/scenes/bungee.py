@@ -82,7 +82,8 @@ def load(options: BungeeOptions) -> Scene:
         centre = scene.points.positions.median(dim=0).values
     else:
         scene = load_enu(options, folder)
-        centre = torch.zeros(3)
+        x, y, _ = origin_of_cameras([view.camera for view in scene.train])
+        centre = torch.tensor([x, y, 0.0], dtype=torch.float64)
     groups, basis = _scales(scene.train, centre, folder, options.images)
     views = [replace(view, group=f"scale-{scale}") for view, scale in zip(scene.train, groups, strict=True)]
     train, test = split_views([view.name for view in views], options.split, folder, photos_of(views))

@@ -134,7 +134,11 @@ def test_exports_hold_the_coordinates_of_the_scene(
     distance = torch.cdist(found - UTM, world(run) - UTM)
     assert distance.min(1).values.max() < steps
     assert distance.min(0).values.max() < steps
-    told = {".ply": "read floats alone round", ".glb": "node adds", ".compressed.ply": "rounded to steps of 0.5 units"}
+    told = {
+        ".ply": "read floats alone round",
+        ".glb": "node adds",
+        ".compressed.ply": "floats, rounded to steps of 0.5 units",
+    }
     words = "as its comment states" if "local" in suffix else told[suffix_of(path)]
     assert words in caplog.text
     assert in_words(run.scene.origin) in caplog.text

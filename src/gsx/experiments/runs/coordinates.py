@@ -50,7 +50,7 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
     elif suffix == ".glb":
         told = f"positions are the scene's own: floats, to which the node adds {middle} exactly"
     elif suffix == ".compressed.ply":
-        told = f"positions are the scene's own, rounded to {steps}: {remedy}"
+        told = f"positions are the scene's own; ends of chunks are floats, rounded to {steps}: {remedy}"
     else:
         told = f"positions are the scene's own; programs that read floats alone round them to {steps}: {remedy}"
     logger.info("%s: %s", path, told)
