@@ -170,3 +170,20 @@ def test_axes_of_a_run_folder_are_refused(tmp_path: Path, capsys: pytest.Capture
     (tmp_path / "run").mkdir()
     assert main([verb, str(tmp_path / "run"), "--axes", "rdf"]) == 2
     assert f"gsx {verb}: --axes rdf is for splat files" in capsys.readouterr().err
+
+
+def test_a_file_is_converted_from_given_axes_into_version_4(
+    model: Gaussians, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gsx")
+    write_gaussians(tmp_path / "a.spz", model, spz=SpzForm(axes="rdf"))
+    words = ["--from-axes", "rdf", "--axes", "rdf", "--spz-version", "4"]
+    assert main(["export", str(tmp_path / "a.spz"), str(tmp_path / "b.spz"), *words]) == 0
+    content = read_splats(tmp_path / "b.spz")
+    assert (content.axes, content.by) == ("rdf", "stated")
+    torch.testing.assert_close(content.gaussians.means.float(), model.means, atol=1 / 4096, rtol=0)
+
+
+def test_flags_of_spz_for_another_file_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path / "run"), str(tmp_path / "a.ply"), "--spz-version", "4"]) == 2
+    assert "--spz-version 4 is of .spz files" in capsys.readouterr().err
