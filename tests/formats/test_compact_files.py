@@ -255,7 +255,9 @@ def test_no_byte_can_be_missing(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"a{kind}"
     write_gaussians(path, many(3, 1))
     content = path.read_bytes()
-    for end in range(0, len(content) - 9, 7):  # the last 8 bytes of gzip are its checksum, which numbers check, too
+    for end in range(
+        0, len(content) - 9, max(7, len(content) // 500)
+    ):  # the last 8 bytes of gzip are its checksum, which numbers check, too
         path.write_bytes(content[:end])
         with pytest.raises(InputError, match=r"cannot be read: .*anew|cannot be read: it is no GLB"):
             read_gaussians(path)
