@@ -159,8 +159,11 @@ def test_none_trains_on_the_images_of_both_files(folder: Path) -> None:
 def test_a_file_to_train_on_alone_is_split_by_rule(folder: Path) -> None:
     """The remedy of the error is what `gsx FOLDER` and `gsx scenes` do."""
     write(folder, "train", [FRONT, SIDE, FRONT])
-    (folder / "transforms_test.json").unlink()
-    with pytest.raises(InputError, match=r"hold out training images with scene\.split=every:8, or none with"):
+    (folder / "transforms_test.json").write_text('{"camera_angle_x": 1, "frames": []}')
+    with pytest.raises(
+        InputError,
+        match=r"nor transforms_val\.json with frames: hold out training images with scene\.split=every:8, or none with",
+    ):
         load(options(folder))
     assert FORMAT.recognise(folder)
     assert FORMAT.overrides(folder) == {"split": "every:8"}

@@ -556,7 +556,7 @@ def test_of_two_files_that_share_an_image_none_is_read(tmp_path: Path) -> None:
 
 def test_a_file_to_train_on_alone_is_split(tmp_path: Path) -> None:
     write_pair(tmp_path)
-    (tmp_path / "transforms_test.json").unlink()
+    (tmp_path / "transforms_test.json").write_text('{"frames": []}')
     with pytest.raises(InputError, match="leaves 1 image to train on"):
         load(options(tmp_path))
     (tmp_path / "transforms_train.json").write_text(json.dumps(COMMON | {"frames": frame_changes()}))

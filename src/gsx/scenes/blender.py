@@ -22,7 +22,7 @@ from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.formats.origin import in_words
 from gsx.scenes.duplicates import photos_of, refuse_shared
-from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, needs_lens, test_file
+from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, is_empty, needs_lens, test_file
 from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
@@ -211,8 +211,8 @@ def _test_file(folder: Path, rule: str) -> Path | None:
     found = test_file(folder)
     if found is None and rule == "json":
         raise InputError(
-            f"'{folder}' has neither {' nor '.join(TEST_FILES)}: hold out training images with scene.split=every:8, or "
-            "none with scene.split=none."
+            f"'{folder}' has neither {' nor '.join(TEST_FILES)} with frames: hold out training "
+            "images with scene.split=every:8, or none with scene.split=none."
         )
     if found is not None and rule not in ("json", "none"):
         raise ConfigError(
@@ -252,7 +252,7 @@ def _points(options: BlenderOptions, folder: Path, cameras: Sequence[Camera]) ->
 
 def facts(path: Path) -> Iterator[str]:
     """Images of every split."""
-    return (frames_line(file) for file in sorted(path.glob("transforms_*.json")))
+    return (frames_line(file) for file in sorted(path.glob("transforms_*.json")) if not is_empty(file))
 
 
 def recognise(path: Path) -> bool:

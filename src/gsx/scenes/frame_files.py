@@ -63,8 +63,17 @@ def without_shared(parts: list[FrameFile]) -> list[FrameFile]:
 
 
 def test_file(folder: Path) -> Path | None:
-    """Return the file that says what to test on, if there is one: transforms_test.json, else transforms_val.json."""
-    return next((folder / name for name in TEST_FILES if (folder / name).is_file()), None)
+    """Return the file that says what to test on, if it lists any: transforms_test.json, else transforms_val.json."""
+    files = (folder / name for name in TEST_FILES)
+    return next((file for file in files if file.is_file() and not is_empty(file)), None)
+
+
+def is_empty(file: Path) -> bool:
+    """Return whether a transforms file lists no frames; False for a damaged one, which is refused when it is read."""
+    try:
+        return read_json(file).get("frames") == []
+    except InputError:
+        return False
 
 
 def nodes(part: FrameFile) -> Iterator[Mapping[str, Any]]:

@@ -19,7 +19,7 @@ from gsx.core.errors import InputError, nearest
 from gsx.core.files import at_home, is_file
 from gsx.core.ranges import Points, Seed
 from gsx.scenes.duplicates import photos_of, refuse_shared
-from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, needs_lens, nodes
+from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, is_empty, needs_lens, nodes
 from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import completed, lens_of
 from gsx.scenes.masked import mask_notes
@@ -232,7 +232,7 @@ def facts(path: Path) -> Iterator[str]:
     """Yield how many images of each transforms file are there."""
     single = path if path.is_file() else path / FILE
     files = [single] if single.is_file() else [path / name for name in (TRAIN_FILE, *TEST_FILES)]
-    return (frames_line(file) for file in files if file.is_file())
+    return (frames_line(file) for file in files if file.is_file() and not is_empty(file))
 
 
 FORMAT = SceneFormat(
