@@ -141,7 +141,7 @@ def test_figures_are_over_what_counts():
 
 def test_where_a_mask_may_lie(tmp_path):
     names = [str(path.relative_to(tmp_path)) for path in candidates(tmp_path, "images/a.jpg")]
-    assert {"images/a.jpg.png", "images/a.jpg", "images/a.png", "a.jpg.png", "a.png"} <= set(names)
+    assert {"images/a.jpg.png", "images/a.jpg", "images/a.png", "a.jpg.png", "a.png", "a.webp", "a.tif"} <= set(names)
 
 
 def test_a_photograph_is_not_its_own_mask(tmp_path):

@@ -19,6 +19,8 @@ from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
 """Folder of the photos, unless a scene says otherwise."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+"""Of masks that have another suffix than their photographs, in the order in which they are looked for."""
 FOLDER = "masks"
 """Beside the folder of the photographs (COLMAP)."""
 
@@ -94,7 +96,7 @@ def candidates(folder: Path, name: str) -> list[Path]:
     folders, or without the first of them."""
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     names = dict.fromkeys(PurePosixPath(*parts[first:]) for first in range(min(len(parts), 2)))
-    forms = [(f"{one}.png", str(one), str(one.with_suffix(".png")), str(one.with_suffix(".jpg"))) for one in names]
+    forms = [(f"{one}.png", str(one), *(str(one.with_suffix(suffix)) for suffix in SUFFIXES)) for one in names]
     return [folder / form for several in forms for form in several]
 
 

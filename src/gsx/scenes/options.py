@@ -60,9 +60,10 @@ class SceneOptions:
     """Which pixels of photographs count. auto: what the scene names (`mask_path` of nerfstudio), else files in a folder
     `masks`; alpha: what is opaque counts, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
     orientation: str = "auto"
-    """How EXIF's orientation is heeded. auto: photos and their cameras are turned upright, from the raster that the
-    cameras are stated for: the stored one, or the turned one where only that has their shape; stored: not at all;
-    turned: as auto, but the cameras are stated for turned photos of any shape (gsx.scenes.orientation)."""
+    """How scene=photos, colmap and transforms heed EXIF's orientation. auto: photos and their cameras are turned upright,
+    from the raster that the cameras are stated for: the stored one, or the turned one where only that has their shape;
+    stored: not at all; turned: as auto, but the cameras are stated for turned photos of any shape
+    (gsx.scenes.orientation)."""
     split: str = "every:8"
     """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: all are trained on, and nothing is
     measured (gsx.scenes.splits)."""
