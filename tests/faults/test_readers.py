@@ -1,5 +1,6 @@
 """Readers of damaged files: each case gives something sound, or one sentence, in bounded memory."""
 
+import base64
 import hashlib
 import json
 import os
@@ -7,6 +8,7 @@ import random
 import resource
 import shutil
 import signal
+import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from foreign_gltf import Builder, glb
 from foreign_splats import files_of, header, row, section, splat, unpacked, version_1, version_2, whole, zipped
 from synthetic_colmap import synthesize, write_photos, write_scene
 from tiny import tiny_run
@@ -238,6 +241,43 @@ def read_foreign(folder: Path) -> None:
         compensated(folder / name)
 
 
+OTHERS = ("faces.ply", "text.ply", "a.glb", "a.gltf")
+"""Splat files as other programs write them."""
+
+
+def others(folder: Path) -> list[Path]:
+    names = [*"xyz", "red", "green", "blue", "alpha", "scale_0", "scale_1", "scale_2", *(f"rot_{i}" for i in range(4))]
+    head = "element face 2\nproperty list uchar int corners\nelement vertex 2\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    values = struct.pack(">28f", *[0.5] * 28)
+    faces = struct.pack(">BiiiBi", 3, 0, 1, 0, 1, 1)
+    (folder / "faces.ply").write_bytes(f"ply\nformat binary_big_endian 1.0\n{head}".encode() + faces + values)
+    rows = "3 0 1 0\n1 1\n" + 2 * (14 * "0.5 " + "\n")
+    (folder / "text.ply").write_text(f"ply\nformat ascii 1.0\n{head}{rows}")
+    builder = Builder()
+    values = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
+    made = Gaussians(means=values, log_scales=values - 4, quats=values[:, [0, 1, 2, 0]], opacity_logits=values[:, 0],
+                     sh_dc=values, sh_rest=values[:, None].repeat(1, 3, 1))  # fmt: skip
+    primitive = builder.splats(made, colorSpace="lin_rec709_display")
+    indices, replacing = builder.view(b"\1"), builder.view(bytes(12))
+    builder.accessors[0]["sparse"] = {"count": 1, "indices": {"bufferView": indices, "componentType": 5121},
+                                      "values": {"bufferView": replacing}}  # fmt: skip
+    nodes = [{"rotation": [0.1, 0.2, 0.3, 0.9], "children": [1]}, {"mesh": 0, "scale": [1, 2, 3]}]
+    document = builder.document([[primitive]], nodes)
+    (folder / "a.glb").write_bytes(glb(document, builder.body))
+    document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(builder.body).decode()
+    (folder / "a.gltf").write_text(json.dumps(document))
+    return [folder / name for name in OTHERS]
+
+
+def read_others(folder: Path) -> None:
+    for name in OTHERS:
+        read = read_gaussians(folder / name)
+        assert len({len(column) for column in vars(read).values()}) == 1
+        assert all(bool(torch.isfinite(column).all()) for column in vars(read).values()), name
+        compensated(folder / name)
+
+
 def images(folder: Path) -> list[Path]:
     picture = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
     for suffix in ("png", "jpg"):
@@ -258,6 +298,7 @@ READERS = {
     "PLY": Reader(cloud, read_clouds, PURE),
     "splat file": Reader(splats, read_splats, PURE),
     "compact splat file": Reader(compact, read_compact, PURE // 10),
+    "splat file of another program": Reader(others, read_others, PURE // 10),
     "splat file of a viewer": Reader(foreign, read_foreign, PURE // 10),
     "transforms.json": Reader(scene_files("transforms"), load("transforms"), PURE),
     "transforms.json of fisheyes": Reader(scene_files("lenses"), load("transforms"), NATIVE * 5),
