@@ -11,9 +11,12 @@ from tiny import tiny_settings
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
-from gsx.core.data.scene import PointCloud, Scene
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.errors import ConfigError
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.render import render_gaussians
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.file_axes import Fit, better, fit, in_axes_of
 from gsx.experiments.runs.load_scene import load_scene
@@ -120,6 +123,31 @@ def test_random_points_say_nothing_and_views_decide(scene: Scene) -> None:
 def test_points_decide_before_views(first: tuple[float, float], second: tuple[float, float], best: str | None) -> None:
     fits = {name: Fit(in_view=a, distance=b) for name, (a, b) in {"rub": first, "rdf": second}.items()}
     assert better(fits) == best
+
+
+def test_photos_decide_where_points_and_views_do_not(
+    scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A wall of splats before each camera has the colour of the photo in axes rdf; turned over it stays in view."""
+    caplog.set_level(logging.INFO, "gsx")
+    camera = look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0), fov_x=0.6, width=40, height=40)
+    two = replace(at(torch.tensor([[0.0, 0.4, 0.0], [0.0, -0.4, 0.0]])), log_scales=torch.full((2, 3), -1.0))
+    bright = replace(two, sh_dc=torch.tensor([[3.0] * 3, [-3.0] * 3]), opacity_logits=torch.full((2,), 6.0))
+    picture = render_gaussians(bright, camera, RasterSettings(path="eager"), torch.zeros(3)).mul(255).to(torch.uint8)
+
+    class Photo:
+        def image(self, camera: Camera) -> torch.Tensor:
+            return picture
+
+        def max_zoom(self, camera: Camera) -> float:
+            return 1.0
+
+    none = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    one = replace(scene, train=[View("a", camera, Photo())], test=[], points=none, background=torch.zeros(3))
+    write_gaussians(tmp_path / "a.spz", bright, spz=SpzForm(axes="rdf"))
+    read = in_axes_of(one, read_splats(tmp_path / "a.spz"))
+    assert read.means[0, 1].item() == pytest.approx(0.4, abs=1 / 4096)
+    assert "axes rdf, which fit the scene (rub: 100.0% in view, thumbnails" in caplog.text
 
 
 def test_a_ply_that_would_fit_turned_over_is_named_and_left(

@@ -1,14 +1,19 @@
 """Which axes the numbers of a splat file are in, by the scene that they are to fit."""
 
 import logging
-from dataclasses import dataclass
-from math import isnan
+from dataclasses import dataclass, replace
+from math import isnan, nan
 from statistics import fmean
 
 import torch
+from torch import Tensor
 
-from gsx.core.data.scene import Scene
+from gsx.core.data.scene import Scene, View
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.quality.metrics import psnr
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.shapes import Float
+from gsx.core.training.render import render_gaussians
 from gsx.experiments.runs.start_checks import (
     MOST_SPLATS,
     MOST_VIEWS,
@@ -33,6 +38,10 @@ MORE_IN_VIEW = 1.2
 """Ratio of shares in view from which on they decide."""
 LEAST_IN_VIEW = 0.05
 """Share in view of axes that are chosen: what lies elsewhere fits in no axes."""
+MORE_ALIKE = 1.0
+"""Difference in PSNR of thumbnails, dB, from which on it decides."""
+THUMBNAIL, MOST_THUMBNAILS = 96, 4
+"""Longer side in px, and how many are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +52,13 @@ class Fit:
     """Share of splats that a view has in front of it and within its picture, mean over views."""
     distance: float
     """Median distance of the scene's points from the nearest splat, scene units; nan: it has none, or random ones."""
+    likeness: float = nan
+    """Mean PSNR of thumbnails against photos, dB; nan: not needed."""
 
     def __str__(self) -> str:
         points = "" if isnan(self.distance) else f", points {self.distance:.3g} from the nearest splat"
-        return f"{self.in_view:.1%} in view{points}"
+        pictures = "" if isnan(self.likeness) else f", thumbnails {self.likeness:.1f} dB from photos"
+        return f"{self.in_view:.1%} in view{points}{pictures}"
 
 
 def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
@@ -64,6 +76,10 @@ def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
     fits = {content.axes: fit(content.gaussians, scene), other: fit(turned, scene)}
     best = better(fits)
     if content.by == "specified":
+        if best is None and in_view(fits):
+            candidates = {content.axes: content.gaussians, other: turned}
+            fits = {axes: replace(fits[axes], likeness=likeness(candidates[axes], scene)) for axes in fits}
+            best = more_alike(fits)
         log_choice(content, fits, best)
         return turned if best == other else content.gaussians
     if best == other:
@@ -77,10 +93,10 @@ def fit(gaussians: Gaussians, scene: Scene) -> Fit:
     some = around(some, origin_of_file(some, scene))
     views = [*scene.train, *scene.test]
     cameras = [view.camera for view in views[:: -(-len(views) // MOST_VIEWS)]]
-    in_view = fmean(float(reaching(some, camera, 0).double().mean()) for camera in cameras)
+    shares = [float(reaching(some, camera, 0).double().mean()) for camera in cameras]
     places = evident_points(scene.points)
     distance = distance_from_points(some.means, places) if len(places) else float("nan")
-    return Fit(in_view=in_view, distance=distance)
+    return Fit(in_view=fmean(shares), distance=distance)
 
 
 def better(fits: dict[str, Fit]) -> str | None:
@@ -90,13 +106,42 @@ def better(fits: dict[str, Fit]) -> str | None:
     turned over may leave as it was.
     """
     (first, a), (second, b) = fits.items()
-    if max(a.in_view, b.in_view) < LEAST_IN_VIEW:
+    if not in_view(fits):
         return None
     if a.distance > NEARER * b.distance or b.distance > NEARER * a.distance:
         return first if a.distance < b.distance else second
     if a.in_view > MORE_IN_VIEW * b.in_view or b.in_view > MORE_IN_VIEW * a.in_view:
         return first if a.in_view > b.in_view else second
     return None
+
+
+def in_view(fits: dict[str, Fit]) -> bool:
+    """Return whether splats are in view in some axes."""
+    return max(fit.in_view for fit in fits.values()) >= LEAST_IN_VIEW
+
+
+def likeness(gaussians: Gaussians, scene: Scene) -> float:
+    """Return the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
+    gaussians = around(gaussians, origin_of_file(gaussians, scene))
+    views = [*scene.train, *scene.test]
+    return fmean(
+        thumbnail_psnr(gaussians, view, scene.background) for view in views[:: -(-len(views) // MOST_THUMBNAILS)]
+    )
+
+
+def thumbnail_psnr(gaussians: Gaussians, view: View, background: Float[Tensor, "3"]) -> float:
+    """Return the PSNR of a small render against a small photo, dB."""
+    camera = view.camera.zoom(min(1.0, THUMBNAIL / max(view.camera.size)))
+    photo = torch.nn.functional.interpolate(view.image()[None], size=(camera.height, camera.width), mode="area")[0]
+    return psnr(render_gaussians(gaussians, camera, RasterSettings(path="eager"), background), photo)
+
+
+def more_alike(fits: dict[str, Fit]) -> str | None:
+    """Return the axes of the fit whose thumbnails are clearly more like photos; None: undecided."""
+    (first, a), (second, b) = fits.items()
+    if abs(a.likeness - b.likeness) < MORE_ALIKE:
+        return None
+    return first if a.likeness > b.likeness else second
 
 
 def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) -> None:
