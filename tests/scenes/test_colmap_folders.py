@@ -101,6 +101,14 @@ def test_the_folder_of_a_model_finds_photos_above(tmp_path: Path, inner: str) ->
     assert chosen(tmp_path / inner) == ("colmap", f"{up}/images", 5)
 
 
+def test_photos_in_an_unusual_place_are_found_and_named(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse" / "0")
+    write_photos(RECONSTRUCTION, tmp_path / "photos")
+    for changes in ({}, {"model": str(tmp_path / "sparse" / "0")}, {"model": "../copy"}, {"adjust": "always"}):
+        write_model(tmp_path.parent / "copy")
+        assert load(colmap_options(tmp_path, **changes)).notes[0] == "Photos are those in photos."
+
+
 def test_numbered_models_find_photos_above(tmp_path: Path) -> None:
     write_model(tmp_path / "sparse" / "0")
     write_model(tmp_path / "sparse" / "1", reconstruction=synthesize(frames=7))

@@ -81,8 +81,10 @@ def load(options: ColmapOptions) -> Scene:
     refuse_other("adjust", options.adjust, WHEN)
     path = at_home(options.path)
     folder, notes = find_model(path, options.model)
-    model, adjustment = adjusted(read_model(folder), options.adjust)
-    images = options.images if folder in model_folders(path) else images_elsewhere(path, model, options.images)
+    stated = read_model(folder)
+    images = images_elsewhere(path, stated, options.images)
+    model, adjustment = adjusted(stated, options.adjust)
+    notes += [f"Photos are those in {images}."] if images != options.images else []
     return build(model, path / images, replace(options, images=images), [*notes, *adjustment])
 
 
@@ -304,8 +306,9 @@ def _fits(folder: Path, model: Model) -> bool:
 
 
 def images_elsewhere(path: Path, model: Model, images: str) -> str:
-    """Return the folder of the images of a model in an unusual place, where `images` is not set otherwise."""
-    return image_folder(path, model) if images == IMAGES else images
+    """Return the folder of the images: where none is set, that of a model in an unusual place is searched for."""
+    usual = model.folder in model_folders(path) and (path / IMAGES).is_dir()
+    return images if images != IMAGES or usual else image_folder(path, model)
 
 
 def recognise(path: Path) -> bool:

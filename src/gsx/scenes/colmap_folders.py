@@ -1,5 +1,6 @@
 """Where COLMAP models lie in the folders that programs write, which files are theirs, and where their photos are."""
 
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -225,9 +226,10 @@ def photo_folders(path: Path, model: Path) -> list[Path]:
 
     The model of INRIA's `distorted` is that of the photos in `input`; `images` holds undistorted ones.
     """
-    bases = [base for base in (*model.parents, model) if base == path or path in base.parents]
-    usual = ("input", "images") if "distorted" in model.relative_to(path).parts else ("images", "input")
-    near = [folder for base in sorted(bases, key=lambda base: -len(base.parts)) for folder in _near(base, usual)]
+    inner = Path(os.path.relpath(model, path)).parts
+    bases = [Path(path, *inner[:count]) for count in range(len(inner) + 1)] if ".." not in inner else [path]
+    usual = ("input", "images") if "distorted" in inner else ("images", "input")
+    near = [folder for base in reversed(bases) for folder in _near(base, usual)]
     return list(dict.fromkeys(near))
 
 

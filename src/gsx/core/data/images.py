@@ -179,8 +179,9 @@ def open_image(path: Path) -> Any:
     hints.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), hints)
     if reader is None:
+        problem = in_one_line(oiio.geterror())
         refuse_lfs_pointer(path)
-        raise InputError(f"Image '{path}' cannot be read ({in_one_line(oiio.geterror())}), convert it to PNG or JPEG.")
+        raise InputError(f"Image '{path}' cannot be read ({problem}), convert it to PNG or JPEG.")
     return reader
 
 
