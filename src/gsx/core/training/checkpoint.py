@@ -7,7 +7,6 @@ read, or of another gsx, is not damaged, and nobody goes on from an older one.
 
 import hashlib
 import logging
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -99,18 +98,6 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
 def sidecars(folder: Path) -> list[Path]:
     """Sidecars of a checkpoint folder, oldest first."""
     return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdecimal())
-
-
-def origin_in(folder: Path) -> tuple[float, float, float] | None:
-    """Return the origin of the positions in a run's checkpoints, (0, 0, 0) for those of gsx before origins.
-
-    None: there is no checkpoint that can be read; `restore` says why.
-    """
-    for sidecar in reversed(sidecars(folder / "checkpoints")):
-        with suppress(OSError, ValueError, AttributeError, TypeError):
-            x, y, z = map(float, read_json(sidecar).get("origin", (0, 0, 0)))
-            return x, y, z
-    return None
 
 
 def step_of(sidecar: Path) -> int:

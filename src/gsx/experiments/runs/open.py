@@ -3,7 +3,7 @@
 import logging
 import shutil
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -12,7 +12,7 @@ from gsx.core.cache import source_revision
 from gsx.core.collector import collecting_nothing
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
-from gsx.core.files import keep_names, write_json
+from gsx.core.files import keep_names, read_json, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -42,6 +42,7 @@ from gsx.experiments.runs.settings import Settings, named_code, read_config, val
 from gsx.experiments.runs.start_file import in_scene, start_doubts, starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
+from gsx.formats.origin import NO_ORIGIN, Origin
 
 logger = logging.getLogger(__name__)
 
@@ -176,9 +177,21 @@ def open_run(
     return restored(settings, folder, training), settings
 
 
+def trained_origin(folder: Path) -> Origin | None:
+    """Return the origin of positions in a run's checkpoints, (0, 0, 0) for those of gsx before origins.
+
+    None: no checkpoint can be read; `checkpoint.restore` says why.
+    """
+    for sidecar in reversed(checkpoint.sidecars(folder / "checkpoints")):
+        with suppress(OSError, ValueError, AttributeError, TypeError):
+            x, y, z = map(float, read_json(sidecar).get("origin", NO_ORIGIN))
+            return x, y, z
+    return None
+
+
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
-    origin = checkpoint.origin_in(folder)
+    origin = trained_origin(folder)
     checked = verified if training else (lambda scene: scene)
     loaded = ranks_here().rank0_first(lambda: checked(load_scene(settings, origin)))
     run = build(settings, loaded, folder, training, begins=False)
