@@ -15,6 +15,8 @@ RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and
 IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
 POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
 
+LARGEST_SIDE = 2**20
+"""Of photos, px: larger numbers are none, and COLMAP undistorts borders pixel by pixel."""
 Bytes = bytes | mmap.mmap
 
 
@@ -63,7 +65,7 @@ def _skip_camera(data: Bytes, at: int) -> int:
     _, model, width, height = ID_MODEL_SIZE.unpack_from(data, at)
     if model not in camera_models():
         raise ValueError(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
-    if not (0 < width < 2**31 and 0 < height < 2**31):
+    if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         raise ValueError(f"a camera of {width}x{height} pixels")
     return at + ID_MODEL_SIZE.size + 8 * camera_models()[model][1]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsx.core.errors import InputError, nearest
-from gsx.scenes.colmap_records import FRAME, ID_MODEL_SIZE, U64, camera_models
+from gsx.scenes.colmap_records import FRAME, ID_MODEL_SIZE, LARGEST_SIDE, U64, camera_models
 
 KEYPOINTS = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 NO_POINT = 2**64 - 1
@@ -124,7 +124,7 @@ def _cameras(lines: Lines) -> Iterator[bytes]:
 
 def _size(width: str, height: str) -> tuple[int, int]:
     size = _whole(width), _whole(height)
-    if not all(0 < side < 2**31 for side in size):
+    if not all(0 < side <= LARGEST_SIDE for side in size):
         raise ValueError(f"a camera of {width}x{height} pixels")
     return size
 
