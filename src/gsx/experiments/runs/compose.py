@@ -24,7 +24,7 @@ from gsx.experiments.runs.launched import waiting_for_all
 from gsx.experiments.runs.settings import Settings, dotted, right_key, settings_from
 
 NEWER = "replace" in signature(OmegaConf.register_resolver).parameters  # OmegaConf 2.4: an older function of this name
-register = OmegaConf.register_resolver if NEWER else OmegaConf.register_new_resolver
+register: Callable[..., None] = OmegaConf.register_resolver if NEWER else OmegaConf.register_new_resolver
 register("either", lambda first, second: first or second, replace=True)
 register("share_of", lambda whole, share: max(1, round(whole * share)), replace=True)
 
