@@ -67,7 +67,7 @@ COLUMNS = [
 NOTE = (
     "PSNR of renders from the first five test views, mean, against those of the model; 200: equal. Largest errors of "
     "any splat: position in scene units, opacity in [0, 1], colour of the constant band in [0, 1]; rotation: median "
-    "angle. Splats are matched by position, since some formats order them anew. Axes: those in which gsx read the file."
+    "angle. Splats are matched by position, colour and opacity, since some formats order them anew. Axes: those in which gsx read the file."
 )
 
 
@@ -188,8 +188,9 @@ class Model:
 
 
 def errors(found: Gaussians, model: Gaussians) -> dict[str, float]:
-    """Return the largest errors of splats, each compared with the model's splat nearest to it."""
-    nearest = torch.cat([torch.cdist(rows, model.means).argmin(1) for rows in found.means.split(ROWS_AT_ONCE)])
+    """Return the largest errors of splats, each compared with the model's splat most like it."""
+    rows, others = features(found).split(ROWS_AT_ONCE), features(model)
+    nearest = torch.cat([torch.cdist(part, others).argmin(1) for part in rows])
     cosines = (unit(found.quats) * unit(model.quats)[nearest]).sum(1).abs().clamp_max(1)
     opacities = found.opacity_logits.sigmoid() - model.opacity_logits[nearest].sigmoid()
     return {
@@ -198,6 +199,11 @@ def errors(found: Gaussians, model: Gaussians) -> dict[str, float]:
         "opacity": float(opacities.abs().max()),
         "colour": float((found.sh_dc - model.sh_dc[nearest]).abs().max()) * BAND_0,
     }
+
+
+def features(gaussians: Gaussians) -> Float[Tensor, "N 7"]:
+    """Return what tells splats apart in any order."""
+    return torch.cat([gaussians.means, gaussians.sh_dc, gaussians.opacity_logits.sigmoid()[:, None]], 1)
 
 
 def unit(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
