@@ -67,8 +67,8 @@ COLUMNS = [
 NOTE = (
     "PSNR of renders from the first five test views, mean, against those of the model; 200: equal. Largest errors of "
     "any splat: position in scene units, opacity in [0, 1], colour of the constant band in [0, 1]; rotation: median "
-    "angle. Splats are matched by position, colour and opacity, since some formats order them anew. Axes: those in which "
-    "gsx read the file."
+    "angle. Splats are matched by position, colour and opacity, since some formats order them anew. Axes: those in "
+    "which gsx read the file."
 )
 
 
