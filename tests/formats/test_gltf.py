@@ -271,6 +271,11 @@ def refused(folder: Path, change: Any, words: str) -> None:
         read(folder, document, builder.body)
 
 
+def of_zeros(document: dict[str, Any], count: int) -> None:
+    """Make the first accessor one without a buffer view."""
+    document["accessors"].insert(0, {"componentType": 5126, "type": "VEC3", "count": count})
+
+
 def rules_of(primitive: dict[str, Any]) -> dict[str, Any]:
     return primitive["extensions"][PREFIX]
 
@@ -291,7 +296,9 @@ def rules_of(primitive: dict[str, Any]) -> dict[str, Any]:
         (lambda d, p: d["accessors"][0].update(count=1.5), "'count' is 1.5, no whole number"),
         (lambda d, p: d["accessors"][0].update(type="MAT4"), "no type that splats have"),
         (lambda d, p: d["accessors"][0].pop("bufferView"), None),
-        (lambda d, p: d["accessors"].insert(0, {"componentType": 5126, "type": "VEC3", "count": 10**9}), "than th"),
+        (lambda d, p: of_zeros(d, 10**9), "than the file has bytes"),
+        (lambda d, p: of_zeros(d, 10**15) or d.update(buffers=[{"byteLength": 2**52}]), "buffer 0 has .* of 4,503,"),
+        (lambda d, p: of_zeros(d, 5) or d.update(buffers=[3]), r"buffers\[0\] is missing"),
         (lambda d, p: d["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}), "compressed .EXT_mesh"),
         (lambda d, p: d["bufferViews"][0].update(byteLength=10**9), "ends beyond its buffer"),
         (lambda d, p: d["nodes"].append({"children": [1]}) or d.update(scenes=[{"nodes": [0, 1]}]), "two parents"),
