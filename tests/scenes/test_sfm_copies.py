@@ -211,6 +211,8 @@ def cut(suffix: str, **attributes: int | str) -> Callable[[Path], None]:
         ("a.bmp", cut(".bmp"), "cannot be read|is damaged"),
         ("a.tif", by_openimageio(np.zeros((8, 9, 5), np.uint8)), "has channels"),
         ("a.jpg", lambda path: path.write_bytes(b""), "cannot be read"),
+        ("a.jpg", lambda path: path.mkdir(), "does not exist"),
+        ("a.jpg", lambda path: path.symlink_to("elsewhere.jpg"), "does not exist"),
     ],
 )
 def test_photos_that_cannot_be_read_are_named_with_reason_and_remedy(

@@ -1,6 +1,7 @@
 """Photos that can be decoded to their end, which is checked without decoding most of them."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ def readable_size(photo: Path) -> Size:
 
 def refuse_heif(photo: Path) -> None:
     """Raise InputError for a HEIC or AVIF file of any name: phones and converters rename them to .jpg."""
-    with photo.open("rb") as file:
+    head = b""
+    with suppress(OSError), photo.open("rb") as file:  # the reader of pictures reports what cannot be opened
         head = file.read(12)
     if head[4:8] == b"ftyp":
         kind = HEIF_BRANDS.get(head[8:], "HEIC")
