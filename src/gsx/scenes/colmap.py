@@ -18,7 +18,6 @@ from gsx.core.data.scene import Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
-from gsx.core.options import without_effect
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.adjust import WHEN, adjusted, fit_line
@@ -62,7 +61,7 @@ class ColmapOptions(SceneOptions):
 
     images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
-    model: str = without_effect(default=AUTO)
+    model: str = AUTO
     """Folder of the model, relative to `path`; auto: the one with the most images (gsx.scenes.colmap_folders)."""
     adjust: str = "never"
     """never | auto | always: whether poses and intrinsics are found anew from the model's observations

@@ -141,6 +141,8 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         assert key("augmenter=upscale", "regenerator/upscale=lanczos") != upscaled
         assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
         settings = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"])
+        assert key("scene=colmap", "scene.path=a", "scene.model=auto") == key("scene=colmap", "scene.path=a")
+        assert key("scene=colmap", "scene.path=a", "scene.model=sparse/1") != key("scene=colmap", "scene.path=a")
     config, idle = settings.resolved, settings.idle
     assert place_of(config, "s", idle) == Path("o/my_scene/gs3d_zoom") / composition_key(config, "s", idle)
     assert place_of(config, "s", idle) != place_of(config, "t", idle)

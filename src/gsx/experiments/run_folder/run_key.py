@@ -22,6 +22,8 @@ EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
 PICTURES = (".webp", ".png")
 """Those of an unbundled SOG."""
+UNCHANGED = {"scene.model": "auto"}
+"""Keys that older gsx did not have, with the values that train the same: these do not count."""
 NEWER = {"supersample": 0, "colours": "rendered", "poses": "given", "flight": True}
 """Keys of `eval` that older gsx did not have, as it looked at models."""
 
@@ -32,9 +34,11 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     `idle`: dotted keys that their options say to have no effect. The folder of a scene is among them: what lies there
     counts.
     """
-    kept = {key: value for key, value in without(config, idle).items() if key not in (*WHERE, *NAMES, *EVALUATION)}
-    begun = {"init": "splat file"} | given_axes(config) if splat_file(config.get("init")) else {}
-    return kept | {"regenerator": asked_for(kept)} | begun
+    unchanged = [key for key, value in flattened(config).items() if UNCHANGED.get(key, ...) == value]
+    counted = without(config, {*idle, *unchanged})
+    kept = {key: value for key, value in counted.items() if key not in (*WHERE, *NAMES, *EVALUATION)}
+    start = {"init": "splat file"} | given_axes(config) if splat_file(config.get("init")) else {}
+    return kept | {"regenerator": asked_for(kept)} | start
 
 
 def given_axes(config: dict[str, Any]) -> dict[str, Any]:
@@ -163,5 +167,5 @@ def finished(files: RunFiles, config: dict[str, Any], stamp: str, idle: Collecti
 def comparable(config: dict[str, Any]) -> dict[str, Any]:
     """Values by dotted key that runs may be compared by: not those that say where a run ran."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
-    begun = {"init": config["init"]} | given_axes(config) if splat_file(config.get("init")) else {}
-    return flattened(kept | begun)
+    start = {"init": config["init"]} | given_axes(config) if splat_file(config.get("init")) else {}
+    return flattened(kept | start)
