@@ -197,6 +197,14 @@ def test_the_page_does_what_it_says(
     assert told[0] == f"{run.folder} 3 {run.folder / 'report.html'}"
 
 
+def test_options_that_would_change_nothing_are_refused(run: gsx.TrainedRun, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a run, around the origin of its scene"):
+        gsx.load(run.folder, origin=(1.0, 2.0, 3.0))
+    with pytest.raises(InputError, match=r"axes and spz_version are of \.spz files"):
+        run.export(tmp_path / "a.ply", axes="rdf")
+    assert not list(tmp_path.iterdir())
+
+
 def test_zlib_is_loaded_before_the_copy_in_the_wheel_of_pycolmap() -> None:
     """In this order both compress; harmless input."""
     program = (

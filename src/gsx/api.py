@@ -45,7 +45,7 @@ from gsx.experiments.tables.sweep import is_table
 from gsx.formats.axis_names import AUTO, SPECIFIED
 from gsx.formats.origin import NO_ORIGIN
 from gsx.formats.splat_files import SpzForm, read_around
-from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at
+from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at, suffix_of
 from gsx.scenes.origin import moved
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
@@ -121,10 +121,13 @@ class TrainedRun:
         spz_version (3, 4): of .spz.
 
         Raises:
-            InputError: the suffix is that of no format that is written, or there is no such view, or form of .spz.
+            InputError: the suffix is that of no format that is written, there is no such view, or no such form of .spz;
+                or a form of .spz is set for another format.
         """
         refuse_export(path := Path(path))
         spz = SpzForm(version=spz_version, axes=axes)
+        if spz != SpzForm() and suffix_of(path) != ".spz":
+            raise InputError(f"axes and spz_version are of .spz files, not of {path}: leave them out, or write .spz")
         export(self.run, path, None if seen is None else camera_in(self.run, seen), spz, local=local)
         return path
 
@@ -141,7 +144,7 @@ class SplatFile:
     raster: RasterSettings
     """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What was subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
+    """Subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
 
     @yielding_cores()
     def render(
@@ -217,13 +220,15 @@ def load(
     axes: of the splat file: auto (what it states, else its format's), rub, rdf, or any three letters.
 
     Raises:
-        InputError: it is neither, or damaged; or `raster` or `axes` are given for a run, which has its own.
+        InputError: it is neither, or damaged; or `raster`, `origin` or `axes` are set for a run, which has its own.
         CheckpointError: the run has no usable checkpoint.
     """
     path = splat_file_at(at_home(path))
     if path.is_dir():
         if raster is not None:
             raise InputError(f"{path} is a run, drawn as it was trained: raster is for splat files")
+        if any(origin):
+            raise InputError(f"{path} is a run, around the origin of its scene: origin is for splat files")
         if axes != AUTO:
             raise InputError(f"{path} is a run, in the axes of its scene: axes is for splat files")
         return load_run(path)
