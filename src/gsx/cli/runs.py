@@ -80,10 +80,10 @@ def verb_photographs(arguments: list[str]) -> int:
 
 def add_axes(parser: Parser, flag: str = "--axes") -> None:
     """Add a flag for the axes of a splat file that is read."""
-    told = (
+    values = (
         "of the FILE: rub (SPZ as specified), rdf (as trained), any three letters (auto: as it states, or its format)"
     )
-    parser.add_argument(flag, choices=CHOICES, default=AUTO, metavar="AXES", help=told)
+    parser.add_argument(flag, choices=CHOICES, default=AUTO, metavar="AXES", help=values)
 
 
 def refuse_axes_of_run(verb: str, given: argparse.Namespace) -> None:
@@ -214,11 +214,21 @@ def refuse_spz_form(given: argparse.Namespace) -> None:
 def verb_export(arguments: list[str]) -> int:
     """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--spz-version 3|4] [--from-axes AXES]
     [--local]"""
-    told = (
+    given = export_parser().parse_args(arguments)
+    refuse_export_options(given)
+    source = splat_file_at(given.run)
+    is_file = bool(suffix_of(source)) and not source.is_dir()
+    sys.stdout.write(f"{converted(source, given) if is_file else exported(given)}\n")
+    return 0
+
+
+def export_parser() -> Parser:
+    """Return the parser of `gsx export`."""
+    description = (
         f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
         "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
     )
-    parser = Parser(prog="gsx export", description=told)
+    parser = Parser(prog="gsx export", description=description)
     parser.add_argument("run", type=Path, metavar="RUN|FILE", help=f"run folder, or splat file: {READABLE}")
     parser.add_argument("file", type=Path, nargs="?", metavar="TO", help="splat file to write (RUN/point_cloud.ply)")
     parser.add_argument("--view", metavar="NAME", help="only what is drawn for this view, as a standard splat file")
@@ -234,14 +244,13 @@ def verb_export(arguments: list[str]) -> int:
     add_axes(parser, "--from-axes")
     parser.add_argument("--local", action="store_true", help="of a scene far from (0, 0, 0): positions relative to the "
                         "origin that it was trained around, which the file states where it can")  # fmt: skip
-    given = parser.parse_args(arguments)
+    return parser
+
+
+def refuse_export_options(given: argparse.Namespace) -> None:
+    """Raise InputError for options of `gsx export` that are out of range, or that do not go together."""
     with loading():
-        from gsx.core.files import remove_partial
-        from gsx.experiments.reports.report import write_report
-        from gsx.experiments.runs.export import export, is_page, losses, refuse_export, shown_views
-        from gsx.experiments.runs.open import open_run
-        from gsx.experiments.runs.render import view_named
-        from gsx.formats.splat_files import SpzForm
+        from gsx.experiments.runs.export import refuse_export
 
     if given.file:
         refuse_export(given.file)
@@ -250,10 +259,22 @@ def verb_export(arguments: list[str]) -> int:
     refuse_spz_form(given)
     if given.view and given.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
-    source = splat_file_at(given.run)
-    if suffix_of(source) and not source.is_dir():
-        sys.stdout.write(f"{converted(source, given)}\n")
-        return 0
+
+
+def exported(given: argparse.Namespace) -> Path:
+    """Write the model of a run as a splat file or a page; return that.
+
+    Raises:
+        InputError: an option is for splat files alone, or the format cannot hold the model.
+    """
+    with loading():
+        from gsx.core.files import remove_partial
+        from gsx.experiments.reports.report import write_report
+        from gsx.experiments.runs.export import export, is_page, losses, shown_views
+        from gsx.experiments.runs.open import open_run
+        from gsx.experiments.runs.render import view_named
+        from gsx.formats.splat_files import SpzForm
+
     if given.from_axes != AUTO:
         raise InputError(
             f"gsx export: --from-axes {given.from_axes} is for splat files, {given.run} is a run: leave it out"
@@ -261,7 +282,7 @@ def verb_export(arguments: list[str]) -> int:
     run, settings = open_run(given.run, plugins())
     view = view_named(run, given.view) if given.view else None
     stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
-    path = given.file or given.run / f"{stem}.ply"
+    path: Path = given.file or given.run / f"{stem}.ply"
     remove_partial(path.parent, below=False)
     if given.local and not any(run.scene.origin):
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
@@ -273,8 +294,7 @@ def verb_export(arguments: list[str]) -> int:
             logger.info("read back and rendered again: %s", line)
     if is_page(path) and path.parent.resolve() == given.run.resolve():
         write_report(given.run)  # it links to its pages
-    sys.stdout.write(f"{path}\n")
-    return 0
+    return path
 
 
 def converted(source: Path, given: argparse.Namespace) -> Path:
