@@ -77,8 +77,8 @@ def test_a_run_without_any_checkpoint_says_which_is_missing_and_that_nothing_bri
 @pytest.mark.parametrize(
     ("name", "length", "told"),
     [
-        ("point_cloud.ply", 0, "no complete header"),
-        ("point_cloud.ply", 1000, "no complete header"),
+        ("point_cloud.ply", 0, "no complete PLY header"),
+        ("point_cloud.ply", 1000, "no complete PLY header"),
         ("point_cloud.ply", -1, "bytes, its header tells"),
         ("renders/index.json", 1, "renders/index.json cannot be read"),
         ("environment.json", 1, "environment.json cannot be read"),
