@@ -1,6 +1,7 @@
 """Gaussians as arrays of numpy in the units that compact files hold, and what their formats share."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -67,6 +68,19 @@ def gaussians_from(arrays: Arrays) -> Gaussians:
     raw = vars(arrays) | {"opacity_logits": np.log(inner / (1 - inner))}
     raw.pop("opacities")
     return Gaussians(**{name: torch.from_numpy(value.astype(np.float32)) for name, value in raw.items()})
+
+
+def joined(parts: Sequence[Arrays]) -> Arrays:
+    """Return the splats of several parts, with the bands of the highest degree among them; those that some lack are 0.
+
+    One part is returned as it is.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh_rest.shape[1] for part in parts)
+    padded = [replace(part, sh_rest=np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))))
+              for part in parts]  # fmt: skip
+    return Arrays(**{name: np.concatenate([vars(part)[name] for part in padded]) for name in vars(parts[0])})
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -10,7 +10,6 @@ import json
 import logging
 import struct
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy as np
 from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import degree_of
 from gsx.core.shapes import Float
-from gsx.formats.arrays import Arrays
+from gsx.formats.arrays import Arrays, joined
 from gsx.formats.gltf_asset import (
     BINARY_CHUNK,
     FLOAT,
@@ -162,7 +161,7 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
                          "Choose another file, or export it anew")  # fmt: skip
     if others:
         logger.info("%s: %d primitives of its scene are no splats, and are left out", name, others)
-    arrays = together(parts)
+    arrays = joined(parts)
     refuse_far(arrays)
     return arrays
 
@@ -281,16 +280,6 @@ def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
         sh_dc=found[CONSTANT],
         sh_rest=np.stack(rest, 1) if rest else np.empty((len(scales), 0, 3)),
     )
-
-
-def together(parts: Sequence[Arrays]) -> Arrays:
-    """Return the splats of several primitives, with harmonics of the highest degree among them."""
-    if len(parts) == 1:
-        return parts[0]
-    most = max(part.sh_rest.shape[1] for part in parts)
-    padded = [replace(part, sh_rest=np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))))
-              for part in parts]  # fmt: skip
-    return Arrays(**{key: np.concatenate([vars(part)[key] for part in padded]) for key in vars(parts[0])})
 
 
 def refuse_far(arrays: Arrays) -> None:

@@ -7,14 +7,13 @@ training worlds.
 """
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, Int
-from gsx.formats.arrays import Arrays, unit_quaternions
+from gsx.formats.arrays import Arrays, joined, unit_quaternions
 from gsx.formats.splat import constants_of, log_scales_of
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024
@@ -108,6 +107,8 @@ def decode_ksplat(content: bytes) -> Arrays:
     count = sum(len(part.means) for part in parts)
     if count != header.splats:
         raise InputError(f"its header says {header.splats:,} splats, its sections {count:,}: save it anew")
+    if not count:
+        raise InputError("it holds no splats: choose another file")
     return joined(parts)
 
 
@@ -219,17 +220,3 @@ def higher_bands(values: Float[np.ndarray, "N C"], degree: int) -> Float[np.ndar
         bands.append(values[:, begin : begin + 3 * size].reshape(-1, 3, size).transpose(0, 2, 1))
         begin += 3 * size
     return np.concatenate(bands, 1)
-
-
-def joined(parts: Sequence[Arrays]) -> Arrays:
-    """Return the splats of all sections; bands that some lack are 0 there.
-
-    Raises:
-        InputError: there are none.
-    """
-    if not sum(len(part.means) for part in parts):
-        raise InputError("it holds no splats: choose another file")
-    most = max(part.sh_rest.shape[1] for part in parts)
-    rest = [np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))) for part in parts]
-    padded = [replace(part, sh_rest=values) for part, values in zip(parts, rest, strict=True)]
-    return Arrays(**{name: np.concatenate([vars(part)[name] for part in padded]) for name in vars(padded[0])})

@@ -242,7 +242,7 @@ def in_double(arrays: Arrays) -> Gaussians:
 
 
 def compensated(path: Path) -> bool:
-    """Whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
+    """Return whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
 
     SPZ has a flag for it, SOG an entry (`sog_is_antialiased`); PLY a comment, `SplatRenderMode: mip` (Brush,
     SuperSplat) or `antialiased 1` (Postshot), of which the last counts. `.splat` and `.ksplat` do not say.
@@ -268,11 +268,12 @@ def compensated(path: Path) -> bool:
         return False
     lines = head.partition(HEADER_END)[0].decode("latin-1").lower().splitlines()
     words = [line.split()[1:] for line in lines if line.startswith("comment ")]
-    told = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
-    return bool(told) and told[-1]
+    stated = [mode[1] in ("mip", "1") for mode in words if len(mode) == 2 and mode[0] in MODE_WORDS]
+    return bool(stated) and stated[-1]
 
 
 def is_linear(path: Path) -> bool:
     """Return whether a splat file that can be read has colours of linear light, which became sRGB."""
-    content = splat_file_at(path).read_bytes()
-    return format_of(content[:MOST_HEADER], path) == ".glb" and names_linear(content)
+    with splat_file_at(path).open("rb") as file:
+        head = file.read(MOST_HEADER)
+        return format_of(head, path) == ".glb" and names_linear(head + file.read())

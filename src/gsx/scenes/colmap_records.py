@@ -16,7 +16,7 @@ IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; 
 POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
 
 LARGEST_SIDE = 2**20
-"""Of photos, px: larger numbers are none, and COLMAP undistorts borders pixel by pixel."""
+"""Largest side of a photo, px: larger numbers are mistakes, and COLMAP undistorts borders pixel by pixel."""
 Bytes = bytes | mmap.mmap
 
 

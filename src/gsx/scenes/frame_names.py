@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from gsx.core.files import is_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""Tried in this order where a name has no suffix: NeRF-synthetic means .png, instant-ngp whatever is there."""
+"""Suffixes of photos and masks, in the order of the search: NeRF-synthetic means .png where it states none."""
 DRIVE = re.compile(r"^[A-Za-z]:/")
 """How absolute names of Windows begin."""
 

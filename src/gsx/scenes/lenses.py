@@ -10,10 +10,9 @@ from typing import Any
 from gsx.core.data.images import image_size
 from gsx.core.data.resize import Size
 from gsx.core.errors import InputError, nearest
+from gsx.scenes.colmap_records import LARGEST_SIDE
 from gsx.scenes.posed import finite_number
 
-LARGEST_SIDE = 2**20
-"""Of photographs, px: larger numbers are none."""
 BENDING = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """Keys of what lenses do to straight lines; their meaning depends on the camera model."""
 PARAMETERS = "distortion_params"

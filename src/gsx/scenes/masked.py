@@ -13,14 +13,13 @@ from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
+from gsx.scenes.frame_names import SUFFIXES
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import INVERSES, Turns, oriented_size
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
 """Folder of the photos, unless a scene says otherwise."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""Of masks that have another suffix than their photographs, in the order in which they are looked for."""
 FOLDER = "masks"
 """Beside the folder of the photographs (COLMAP)."""
 

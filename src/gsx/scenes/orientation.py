@@ -136,7 +136,10 @@ def of_model(photo: Path, raster: Size) -> Turns:
     Mirrored photos stay mirrored where the camera saw them so.
     """
     exif = orientation_of(photo)
-    if not is_reduction(image_size(photo), raster) and is_reduction(oriented_size(image_size(photo), exif), raster):
+    if exif == 1:  # as nearly all: the size need not be read
+        return Turns()
+    size = image_size(photo)
+    if not is_reduction(size, raster) and is_reduction(oriented_size(size, exif), raster):
         return Turns(exif=exif, first=exif)
     return Turns(exif=exif, last=WITHOUT_MIRROR.get(exif, exif))
 

@@ -35,12 +35,12 @@ from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import finish
 from gsx.experiments.runs.export import export, own_columns, read_again
-from gsx.experiments.runs.file_axes import in_axes_of
+from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings, write_config
-from gsx.experiments.runs.start_file import composition_of, in_scene, start_doubts, starting_splats
+from gsx.experiments.runs.start_file import composition_of, starting_splats
 from gsx.experiments.runs.verified import verified
 from gsx.formats.suffixes import STANDARD
 
@@ -134,9 +134,7 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
     settings = compose([*words, f"iterations={FILE_STEPS}"], plugins)
     content, scene = starting_splats(settings), verified(load_scene(settings))
-    start = in_axes_of(scene, content)
-    start = start and in_scene(start, scene)
-    start_doubts(settings, scene, start)
+    start, _ = start_in_scene(settings, scene, content)
     run = build(settings, scene, Path(), training=True, start=start)
     run.step = run.iterations
     return run, settings

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.core.files import at_home
+from gsx.core.files import LFS_POINTER, at_home
 
 REMEDY = "give a local .pth file with a state dict"
 SAVED = (b"PK\x03\x04", b"\x80")
 """First bytes of what `torch.save` writes: a ZIP archive, or a pickle as before torch 1.6."""
-OTHERS = ((b"version https://git-lfs", "a Git LFS pointer (`git lfs pull` fetches the file)"), (b"<", "a web page"))
+OTHERS = ((LFS_POINTER, "a Git LFS pointer (`git lfs pull` fetches the file)"), (b"<", "a web page"))
 """First bytes of files that often lie where weights should."""
 
 

@@ -5,10 +5,8 @@ from pathlib import Path
 
 from gsx.core.errors import InputError
 from gsx.core.files import read_json
+from gsx.formats.detect import MOST_HEADER
 from gsx.formats.ply import length_of
-
-MOST_HEADER = 1 << 16
-"""Bytes within which the header of a splat file ends."""
 
 
 def splats_problem(path: Path) -> str:

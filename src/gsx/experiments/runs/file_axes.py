@@ -14,6 +14,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.render import render_gaussians
+from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import (
     MOST_SPLATS,
     MOST_VIEWS,
@@ -22,7 +23,7 @@ from gsx.experiments.runs.start_checks import (
     reaching,
     spread,
 )
-from gsx.experiments.runs.start_file import origin_of_file
+from gsx.experiments.runs.start_file import in_scene, origin_of_file, start_doubts
 from gsx.formats.axes import flipped
 from gsx.formats.axis_names import SPECIFIED, TRAINED
 from gsx.formats.origin import around
@@ -85,6 +86,19 @@ def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
     if best == other:
         log_doubt(content, fits, other)
     return content.gaussians
+
+
+def start_in_scene(
+    settings: Settings, scene: Scene, content: SplatContent | None
+) -> tuple[Gaussians | None, list[str]]:
+    """Return the Gaussians of the file that a run begins with, as they lie in its scene, and doubts about them.
+
+    Raises:
+        InputError: no splat is in view.
+    """
+    gaussians = in_axes_of(scene, content)
+    start = None if gaussians is None else in_scene(gaussians, scene)
+    return start, start_doubts(settings, scene, start)
 
 
 def fit(gaussians: Gaussians, scene: Scene) -> Fit:

@@ -33,13 +33,13 @@ from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
 from gsx.experiments.runs.compose import key_of
 from gsx.experiments.runs.environment import environment
-from gsx.experiments.runs.file_axes import in_axes_of
+from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import help_at_once
 from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
-from gsx.experiments.runs.start_file import in_scene, start_doubts, starting_splats
+from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
 from gsx.formats.origin import NO_ORIGIN, Origin
@@ -105,9 +105,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         require("viewer=true", ("viser",), "gsx[viewer]")
     content = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
-    start = in_axes_of(scene, content)
-    start = start and in_scene(start, scene)
-    doubts = start_doubts(settings, scene, start)
+    start, doubts = start_in_scene(settings, scene, content)
     run = build(settings, scene, Path(), training=True, start=start)
     run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims, doubts))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
