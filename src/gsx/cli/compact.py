@@ -40,13 +40,13 @@ def verb_compact(arguments: list[str]) -> int:
         from gsx.experiments.compact.compact import compact
 
     file = splat_file_at(given.target)
-    to = given.to or beside(file.resolve())
+    to = given.to or compact_folder(file.resolve())
     page = compact(file, to, given.max_drop_db, given.steps, given.overrides, plugins())
     sys.stdout.write(f"{page}\n")
     return 0
 
 
-def beside(target: Path) -> Path:
+def compact_folder(target: Path) -> Path:
     """Return the new folder next to a run or a splat file, named after it."""
     place = target.parent if target.name.lower() == META else target
     return place.with_name(f"{place.name.split('.')[0] if place.is_file() else place.name}_compact")

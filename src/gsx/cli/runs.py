@@ -24,12 +24,12 @@ MOST_FRAMES = 100_000
 
 def verb_eval(arguments: list[str]) -> int:
     """gsx eval RUN|FILE [KEY=VALUE ...]"""
-    told = (
+    description = (
         "Evaluate a run again, for example with 'eval.zoom=[1,2,4]', drawn by the path that trained it; or a splat "
         "file of any program on a scene, in a run folder of its own: gsx eval FILE scene=colmap scene.path=FOLDER. "
         f"FILE: {READABLE}"
     )
-    folder, overrides = run_arguments("eval", arguments, told)
+    folder, overrides = run_arguments("eval", arguments, description)
     file = splat_file_at(folder)
     if suffix_of(file) and not file.is_dir():
         return evaluate_file(file, overrides)

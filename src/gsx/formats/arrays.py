@@ -35,10 +35,10 @@ class Arrays:
 
 
 def arrays_of(gaussians: Gaussians) -> Arrays:
-    """Arrays of Gaussians; a zero quaternion is the identity.
+    """Return the arrays of Gaussians; a zero quaternion becomes the identity.
 
     Raises:
-        InputError: a value is not finite; which, and in how many rows, is told.
+        InputError: a value is not finite; the message has its name and the number of rows.
     """
     raw = {name: value.detach().double().cpu().numpy() for name, value in vars(gaussians).items()}
     for name, value in raw.items():

@@ -14,7 +14,7 @@ from gsx.core.shapes import Float
 from gsx.formats.axis_names import SYSTEMS, TRAINED
 
 QUARTER = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
-"""From (x, y, z) to (x, z, -y)."""
+"""Rotation from (x, y, z) to (x, z, -y)."""
 
 
 def to_training_axes(gaussians: Gaussians, axes: str) -> Gaussians:

@@ -3,12 +3,12 @@
 TRAINED, SPECIFIED = "rdf", "rub"
 """Axes of training worlds (COLMAP, OpenCV), and those that SPZ specifies (OpenGL, three.js)."""
 AUTO = "auto"
-"""What the file states, else what the scene at hand says, else what the format specifies."""
+"""The axes that the file states, else those that fit the scene at hand, else those of the format."""
 SYSTEMS = (
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
     *("lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"),
 )
-"""By code - 1 in SPZ's extension SPZ_ADOBE_coordinate_system (nianticlabs/spz, splat-types.h)."""
+"""Names by code - 1 in SPZ's extension SPZ_ADOBE_coordinate_system (nianticlabs/spz, splat-types.h)."""
 CHOICES = (AUTO, *SYSTEMS)
 """Values of `axes`."""
 EXAMPLES = "auto, rub (SPZ as specified), rdf (as trained), or another of three letters, for example ruf"

@@ -3,7 +3,7 @@
 Follows the ratified extension, in the text of KhronosGroup/glTF 63770cc (2026-04-15).
 
 Splats are written as training has them (x right, y down, z front) below a node that turns them by 180 degrees about z,
-into glTF's world (y up): a viewer that heeds the node turns their spherical harmonics with them.
+into glTF's world (y up): a viewer that applies the node turns their spherical harmonics with them.
 """
 
 import json
@@ -54,7 +54,7 @@ CONSTANT = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
 REQUIRED = (POSITION, ROTATION, SCALE, OPACITY, CONSTANT)
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 RULES = {"kernel": "ellipse", "projection": "perspective"}
-"""How splats are drawn. The order of blending is gsx's own: by depth, not by distance."""
+"""Rules for drawing splats. The order of blending is gsx's own: by depth, not by distance."""
 SPZ_EXTENSIONS = (
     "KHR_gaussian_splatting_compression_spz_2",
     "KHR_gaussian_splatting_compression_spz",

@@ -36,9 +36,9 @@ class Asset:
     binary: bytes
     """The binary chunk of a GLB; empty where it has none."""
     folder: Path | None
-    """Of the buffers in files of their own; None: these are not read."""
+    """Folder of the buffers in files of their own; None: these are not read."""
     buffers: dict[int, bytes] = field(default_factory=dict)
-    """Those read so far, by index."""
+    """Buffers read so far, by index."""
 
 
 # -- the document ------------------------------------------------------------------------------------------------------

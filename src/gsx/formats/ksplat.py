@@ -24,7 +24,7 @@ SECTION = struct.Struct("<IIIIfHxxIIIIH")
 partly filled ones, degree."""
 MAJOR, LEAST_MINOR = 0, 1
 CENTRE_BYTES = 12
-"""Of a bucket."""
+"""Bytes of a bucket's centre."""
 HALF_RANGE = 32767
 """Steps from a bucket's centre to its side, where a section states none."""
 COEFFICIENT_RANGE = 1.5
@@ -39,11 +39,11 @@ class Level:
 
     mean: str
     value: str
-    """Of scales and quaternions."""
+    """Type of scales and quaternions."""
     coefficient: str
 
     def row(self, coefficients: int) -> np.dtype:
-        """Return the type of a splat's row; coefficients: beside the constant ones, of all colours."""
+        """Return the type of a splat's row; coefficients: number without the constant ones, of all colours."""
         parts = [("mean", self.mean, 3), ("scale", self.value, 3), ("quat", self.value, 4), ("colour", "u1", 4)]
         return np.dtype([*parts, ("rest", self.coefficient, coefficients)])
 
@@ -85,7 +85,7 @@ class Section:
 
     @property
     def coefficients(self) -> int:
-        """Beside the constant ones, of all colours."""
+        """Number of coefficients without the constant ones, of all colours."""
         return 3 * sum(BANDS[self.degree])
 
 

@@ -93,6 +93,6 @@ def stated_in(head: bytes) -> Origin:
     found = STATED.search(head)
     try:
         x, y, z = (float(word) for word in found.groups()) if found else NO_ORIGIN
-    except ValueError:  # somebody else's words
+    except ValueError:  # another program's words
         return NO_ORIGIN
     return (x, y, z) if np.isfinite([x, y, z]).all() else NO_ORIGIN

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from gsx.core.errors import InputError
 
 MOST_SIDE = 16383
-"""Pixels; of WebP."""
+"""Longest side of a WebP, px."""
 PNG = b"\x89PNG\r\n\x1a\n"
 MOST_CHUNKS = 64
-"""Of a WebP, before its pixels."""
+"""Chunks of a WebP before its pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureHeader:
-    """What the first bytes of a picture state."""
+    """Facts that the first bytes of a picture state."""
 
     width: int
     height: int

@@ -24,9 +24,9 @@ VERTICES = "vertex"
 """The element of points and splats."""
 
 HEADER_END = b"\nend_header"
-"""Of a PLY, at the beginning of a line."""
+"""Last line of a header."""
 MOST_DIGITS = 15
-"""Of a number of vertices: a file with more does not exist."""
+"""Digits of a number of rows: a file with more does not exist."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,7 +94,7 @@ def decode_sog(content: bytes, path: Path) -> Arrays:
 
 
 def sog_is_antialiased(path: Path) -> bool:
-    """Tell if meta.json states that opacities are compensated; False for what is no SOG.
+    """Return whether meta.json states that opacities are compensated; False for what is no SOG.
 
     `model` (splat-transform since 3.2) counts before the older `antialias`.
     """
@@ -250,7 +250,9 @@ def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
     coefficients = bands.get(centroids.shape[1], 0)
     if coefficients != COEFFICIENTS.get(entry.get("bands", 0), coefficients) or not coefficients:
         stated = f" of {entry['bands']} bands" if "bands" in entry else ""
-        raise InputError(f"its palette{stated} is {centroids.shape[1]} pixels wide; bands 1 to 3 have 192, 512, 960")
+        raise InputError(
+            f"its palette{stated} is {centroids.shape[1]} pixels wide; bands 1 to 3 have 192, 512, 960: export it anew"
+        )
     palette = centroids[..., :3].reshape(-1, coefficients, 3)[: entry.get("count", PALETTE * len(centroids))]
     numbers = pixels(archive, "shN", 1).astype(np.int64)
     labels = numbers[:, 0] | numbers[:, 1] << 8
@@ -281,7 +283,8 @@ def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 
     if header.width * header.height < needed:
         raise InputError(f"'{name}' is {header.width}x{header.height}, too small for {needed:,} splats: export it anew")
     if header.width * header.height > most or max(header.width, header.height) > MOST_SIDE:
-        raise InputError(f"'{name}' is {header.width}x{header.height}, far more than {archive.count:,} splats need")
+        raise InputError(f"'{name}' is {header.width}x{header.height}, far more than {archive.count:,} splats need: "
+                         "export it anew")  # fmt: skip
     if not header.lossless:
         raise InputError(f"'{name}' is a lossy picture, which has changed its values: export it anew, lossless")
     try:

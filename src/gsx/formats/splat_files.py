@@ -32,7 +32,7 @@ from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, splat_file_at, suffix_o
 logger = logging.getLogger(__name__)
 
 DECODERS = {".compressed.ply": decode_compressed_ply, ".splat": decode_splat, ".ksplat": decode_ksplat}
-"""Those that need nothing but a file's content."""
+"""Decoders that need nothing but a file's content."""
 
 MODE_WORDS = ("splatrendermode:", "antialiased")
 """First words of the comments that say how a file is to be drawn."""
@@ -57,7 +57,7 @@ def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
 
 @dataclass(frozen=True, kw_only=True)
 class SpzForm:
-    """How .spz is written."""
+    """Version and axes of a .spz to write."""
 
     version: int = 3
     """4: streams of Zstandard, and the axes are stated; 3: what more programs read."""
@@ -122,15 +122,15 @@ def write_columns(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SplatContent:
-    """What a splat file holds."""
+    """Content of a splat file."""
 
     path: Path
     gaussians: Gaussians
-    """In the axes of training worlds, if the file is in `axes`; means in float64, with the origin that it states."""
+    """Splats in the axes of training worlds, if the file is in `axes`; means in float64, with its stated origin."""
     axes: str
-    """Which the file's numbers are taken to be in: one of `axis_names.SYSTEMS`."""
+    """Axes of the file's numbers: one of `axis_names.SYSTEMS`."""
     by: str
-    """Why: given, stated, specified (the format's, which programs do not keep to), conventional (the format's)."""
+    """Reason: given, stated, specified (the format's, which programs do not keep to), conventional (the format's)."""
 
 
 def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> Gaussians:
@@ -139,7 +139,7 @@ def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> 
     axes: one of `axis_names.CHOICES`; origin: subtracted from positions in float64.
 
     Raises:
-        InputError: it is damaged, or lacks a property; or axes are given for a format that fixes them.
+        InputError: it is damaged, or lacks a property; or axes are set for a format that fixes them.
     """
     return around(read_in_double(path, axes), origin)
 

@@ -28,7 +28,7 @@ FURTHEST = 2048 - 2**-FRACTION_BITS
 """Coordinates that 24 bits hold, scene units."""
 COLOUR_SCALE = 0.15
 MOST_COEFFICIENTS = 15
-"""Of degree 3, without the constant one."""
+"""Coefficients of degree 3, without the constant one."""
 ROOT_2 = 2**0.5
 
 

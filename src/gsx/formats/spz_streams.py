@@ -21,15 +21,15 @@ STREAMED_HEADER = 32
 TABLE, ENTRY, RECORD = struct.Struct("<I"), struct.Struct("<QQ"), struct.Struct("<II")
 ANTIALIASED, EXTENDED = 1, 2
 COEFFICIENTS = (0, 3, 8, 15, 24)
-"""By degree, without the constant one."""
+"""Number of coefficients by degree, without the constant one."""
 COORDINATE_SYSTEM = 0xADBE0003
 """Extension that states the axes: SPZ_ADOBE_coordinate_system."""
 SMALLEST_THREE, STREAMED = 3, 4
 """First versions with quaternions of 4 bytes, and with streams of Zstandard."""
 POSITION_BYTES, MOST_RATIO = 9, 1024
-"""Of a splat, and how much smaller than all positions a file is at most (the library's bound): more is refused."""
+"""Bytes of a position, and the ratio of all positions to the file from which on it is refused (the library's bound)."""
 MOST_EXTENSION_BYTES = 1 << 16
-"""Of versions 2 and 3, where extensions follow the arrays."""
+"""Bytes of extensions in versions 2 and 3, where they follow the arrays."""
 MOST_FRACTION_BITS = 23
 
 
@@ -38,14 +38,14 @@ class Header(NamedTuple):
 
     version: int
     splats: int
-    """How many."""
+    """Number of splats."""
     degree: int
-    """Of the spherical harmonics, 0 to 4."""
+    """Degree of the spherical harmonics, 0 to 4."""
     fraction_bits: int
-    """Of positions."""
+    """Bits of positions after the point."""
     flags: int
     streams: int = 0
-    """In version 4; 0 before."""
+    """Number of streams in version 4; 0 before."""
 
     def sizes(self) -> list[int]:
         """Return bytes a splat of positions, opacities, colours, scales, rotations, coefficients."""
@@ -62,9 +62,9 @@ class Content:
 
     header: Header
     arrays: Sequence[bytes]
-    """In the order of `Header.sizes`."""
+    """Bytes of the arrays in the order of `Header.sizes`."""
     axes: str | None
-    """What the file states; None: nothing."""
+    """Axes that the file states; None: it states none."""
 
 
 def read_content(content: bytes) -> Content:

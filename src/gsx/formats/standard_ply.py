@@ -24,9 +24,9 @@ from gsx.formats.ply import header_in, vertices_of
 logger = logging.getLogger(__name__)
 
 MOST_LOGIT = 30.0
-"""What infinite logits, of opacities 0 and 1, are read as."""
+"""Logit in place of an infinite one, of opacities 0 and 1."""
 MOST_COEFFICIENTS = 15
-"""Beside the constant one, of degree 3."""
+"""Coefficients of degree 3, without the constant one."""
 Columns = Mapping[str, np.ndarray]
 
 BAKED = "whose Gaussians a network decodes for each camera: export Gaussians (gsx export RUN FILE --bake ZOOM does)"
@@ -40,7 +40,7 @@ FORMS = {
 }
 """Forms of files that lack a property of splats, by properties that only they have."""
 ANCHORS = ("f_anchor_feat_0", "f_offset_0")
-"""Files with one of these are no splats, whatever else they have."""
+"""Properties that no file of splats has."""
 
 
 def decode_standard_ply(content: bytes, name: str) -> Gaussians:

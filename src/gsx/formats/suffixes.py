@@ -1,4 +1,4 @@
-"""Which splat files are read and written, by the ends of their names."""
+"""Splat files that are read and written, by the ends of their names."""
 
 import json
 from contextlib import suppress
@@ -19,7 +19,7 @@ STANDARD = ".ply"
 MOST_META = 1 << 24
 """Bytes of a meta.json; those of SOG have a few thousand."""
 SPZ_VERSIONS = (3, 4)
-"""That are written."""
+"""Versions of SPZ that are written."""
 
 
 def suffix_of(path: Path) -> str:
@@ -36,7 +36,7 @@ def splat_file_at(path: Path) -> Path:
 
 
 def is_sog_folder(path: Path) -> bool:
-    """Tell if a folder holds the META of an unbundled SOG; a run folder never does."""
+    """Return whether a folder holds the META of an unbundled SOG; a run folder never does."""
     meta = path / META
     if not path.is_dir() or not meta.is_file() or (path / "config.yaml").exists():
         return False

@@ -7,7 +7,7 @@ from typing import Any
 from gsx.core.errors import InputError
 
 LEVEL = 12
-"""Of compression, as Niantic's library has it."""
+"""Level of compression, as in Niantic's library."""
 PIECE = 1 << 20
 """Bytes that are decompressed at a time: no claim of a stream's header is believed."""
 

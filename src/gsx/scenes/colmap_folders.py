@@ -1,4 +1,4 @@
-"""Where COLMAP models lie in the folders that programs write, which files are theirs, and where their photos are."""
+"""Places of COLMAP models in the folders that programs write, their files, and the places of their photos."""
 
 import os
 import re
@@ -23,7 +23,7 @@ PLACES = {
     "outputs", "reconstruction", "reconstructions", "triangulated", "export", "poses",
 }  # fmt: skip
 """First or last words of folders in which COLMAP, INRIA's convert.py, hloc, GLOMAP, instant-ngp and nerfstudio keep
-models, beside `sparse`."""
+models, apart from `sparse`."""
 DEPTH = 4
 """Levels below a scene's folder: `dense/0/sparse/0`."""
 UNUSUAL_DEPTH = 3
@@ -180,7 +180,7 @@ def other_model_folders(path: Path) -> list[Path]:
 
 
 def unusual_model_folders(path: Path) -> list[Path]:
-    """Return the folders of models below a folder, whatever they are called."""
+    """Return the folders of models below a folder, under any name."""
     return _search(path, UNUSUAL_DEPTH, lambda folder, depth: True)
 
 

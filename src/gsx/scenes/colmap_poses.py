@@ -30,7 +30,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Difference:
-    """How two statements of poses differ."""
+    """Difference of two statements of poses."""
 
     names: list[str]
     """Images whose poses differ."""
@@ -39,7 +39,7 @@ class Difference:
     units: float
     """Largest distance between two camera centres."""
     broken: int
-    """How many of the images are stated without a rotation, as by zeros."""
+    """Number of images stated without a rotation, as by zeros."""
 
     def __str__(self) -> str:
         """Return how many images differ, by how much, and some names."""
@@ -62,7 +62,7 @@ def pose_conflict(folder: Path, files: Mapping[str, Path], reconstruction: Any) 
 
 
 def text_conflict(files: Mapping[str, Path], reconstruction: Any) -> str:
-    """Return a note where images.txt lies beside the binary model in use and states other poses; empty: it does not."""
+    """Return a note where images.txt lies next to the binary model in use and states other poses; else empty."""
     text = files["images"].with_name("images.txt")
     if files["images"].suffix.lower() != ".bin" or not text.is_file():
         return ""

@@ -109,7 +109,7 @@ def _skip_frame(data: Bytes, at: int) -> int:
 SKIPS: dict[str, Callable[[Bytes, int], int]] = {
     "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig, "frames": _skip_frame,
 }  # fmt: skip
-"""What returns the end of the record that begins at a place."""
+"""Functions that return the end of the record that begins at a place."""
 
 
 # -- ids ---------------------------------------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class Lines:
     def __init__(self, file: Path, errors: str = "strict") -> None:
         self.file, self.errors = file, errors
         self.number = 0
-        """Of the latest line, from 1."""
+        """Number of the latest line, from 1."""
 
     def __iter__(self) -> Iterator[str]:
         with self.file.open(encoding="utf-8-sig", errors=self.errors) as stream:
@@ -67,7 +67,7 @@ Reader = Callable[[Lines], Iterator[bytes]]
 
 
 def records_of(file: Path, read: Reader) -> Iterator[bytes]:
-    """The binary records of a text file.
+    """Yield the binary records of a text file.
 
     Raises:
         InputError: it is no text, or a line is wrong.
@@ -88,14 +88,14 @@ def records_of(file: Path, read: Reader) -> Iterator[bytes]:
 
 
 def stated_count(file: Path) -> int | None:
-    """The number of records that the comments at the top of a file state; None: they state none."""
+    """Return the number of records that the comments at the top of a file state; None: they state none."""
     with file.open(encoding="utf-8-sig", errors="replace") as stream:
         top = takewhile(lambda line: line.startswith("#"), stream)
         return next((int(found[1]) for line in top if (found := STATED.match(line))), None)
 
 
 def count_text_images(file: Path) -> int:
-    """The number of images in an images.txt, which may be damaged."""
+    """Return the number of images in an images.txt, which may be damaged."""
     return sum(1 for _ in _image_lines(Lines(file, errors="replace")))
 
 
@@ -140,7 +140,7 @@ def _images(lines: Lines) -> Iterator[bytes]:
 
 
 def _image_lines(lines: Lines) -> Iterator[tuple[str, str]]:
-    """The two lines of each image. The second may be empty; some programs leave empty ones out."""
+    """Yield the two lines of each image. The second may be empty; some programs leave empty ones out."""
     header = ""
     for line in lines:
         if not header:
@@ -170,7 +170,7 @@ def _are_keypoints(line: str) -> bool:
 
 
 def _header_words(line: str) -> list[str]:
-    """Nine numbers and the name, which goes to the end of the line and may hold blanks."""
+    """Return nine numbers and the name, which goes to the end of the line and may hold blanks."""
     return re.split(r"[ \t]+", line, maxsplit=NAME_AT)
 
 
@@ -189,13 +189,13 @@ def _keypoints(line: str) -> bytes:
 
 
 def _keypoint_rows(rows: np.ndarray) -> np.ndarray:
-    """Keypoints [K, 3] as COLMAP stores them."""
+    """Return keypoints [K, 3] as COLMAP stores them."""
     ids, stored = rows[:, 2], np.empty(len(rows), KEYPOINTS)
     if not (ids == np.floor(ids)).all():
         raise ValueError("a POINT3D_ID is no whole number")
-    seen = (ids >= 0) & (ids < 2.0**63)
+    observed = (ids >= 0) & (ids < 2.0**63)
     stored["x"], stored["y"] = rows[:, 0], rows[:, 1]
-    stored["point"] = np.where(seen, np.where(seen, ids, 0).astype(np.uint64), np.uint64(NO_POINT))
+    stored["point"] = np.where(observed, np.where(observed, ids, 0).astype(np.uint64), np.uint64(NO_POINT))
     return stored
 
 
@@ -232,7 +232,7 @@ def _rigs(lines: Lines) -> Iterator[bytes]:
 
 
 def _posed_sensor(words: list[str]) -> tuple[bytes, list[str]]:
-    """A sensor with its pose, if it has one, and the words after it."""
+    """Return a sensor with its pose, if it has one, and the words after it."""
     posed = words[2:3] == ["1"]
     end = 10 if posed else 3
     if len(words) < end:
@@ -241,7 +241,7 @@ def _posed_sensor(words: list[str]) -> tuple[bytes, list[str]]:
 
 
 def _sensor(words: Sequence[str]) -> bytes:
-    """Type and id of a sensor."""
+    """Return the type and id of a sensor."""
     import pycolmap
 
     kinds = pycolmap.SensorType.__members__
@@ -271,7 +271,7 @@ READERS: dict[str, Reader] = {
 
 
 def _rows(lines: Lines, least: int, columns: str) -> Iterator[list[str]]:
-    """Words of the lines that are not empty, at least so many."""
+    """Yield the words of the lines that are not empty, at least so many."""
     for line in lines:
         words = line.split()
         if 0 < len(words) < least:
@@ -281,7 +281,7 @@ def _rows(lines: Lines, least: int, columns: str) -> Iterator[list[str]]:
 
 
 def _whole(word: str) -> int:
-    """A whole number, also one that is written `12.0`.
+    """Return a whole number, also one that is written `12.0`.
 
     Raises:
         ValueError: it is none, or negative.
@@ -293,7 +293,7 @@ def _whole(word: str) -> int:
 
 
 def _floats(words: Sequence[str]) -> np.ndarray:
-    """Numbers, float64."""
+    """Return numbers, float64."""
     return np.array([_float(word) for word in words], dtype="<f8")
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from gsx.core.data.images import header_of
 
 Lens = tuple[str, str, float, float]
-"""Maker, model, focal length in mm, and that of the same view on 35 mm film; empty or 0 where a file does not tell."""
+"""Maker, model, focal length in mm, and that of the same view on 35 mm film; empty or 0 where a file lacks it."""
 
 NO_LENS: Lens = ("", "", 0.0, 0.0)
-"""That of files that state nothing."""
+"""Lens of files that state nothing."""
 
 
 def lens_of(path: str | Path) -> Lens:

@@ -1,4 +1,4 @@
-"""Which transforms files a folder holds: one with all frames, or one to train on and one to test on."""
+"""Transforms files of a folder: one with all frames, or one to train on and one to test on."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

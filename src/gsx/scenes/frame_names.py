@@ -10,7 +10,7 @@ from gsx.core.files import is_file
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of photos and masks, in the order of the search: NeRF-synthetic means .png where it states none."""
 DRIVE = re.compile(r"^[A-Za-z]:/")
-"""How absolute names of Windows begin."""
+"""Beginning of absolute names of Windows."""
 
 
 def plain_name(file_path: str) -> str:

@@ -20,13 +20,13 @@ from gsx.core.shapes import Bool, Float, Int
 STEPS = 129
 """Places along each side of an undistorted picture at which its orientation is checked."""
 FINE_STEPS = 257
-"""The same where a part has to be cut out: the cut is exact to so many parts of the side."""
+"""Places along each side where a part has to be cut out: the cut is exact to so many parts of the side."""
 RAY_STEPS = 257  # along each side of a photo, at which it is checked whether pixels have rays
 DIFFERENCE = 1e-6  # of a ray's slope, by which derivatives are taken
 LARGEST_SCALE = 2.0
 """An undistorted side is at most so many times the photo's, as COLMAP's are (UndistortCameraOptions.max_scale)."""
 LEAST_AREA = 0.01
-"""Px of the photo, for one in its middle, that a pixel of a cut picture shows at least: at the fold it is none."""
+"""Least area of the photo that a pixel of a cut picture shows, px for one in its middle: at the fold it is 0."""
 REACH = 2.0  # px of the photo, along each axis, from which a pixel is interpolated
 LEAST_SHARE = 0.2
 """Share of a photo that its cut picture shows at least; of less, the lens is wrong."""
@@ -37,9 +37,9 @@ class Cut:
     """The part of a photo that an undistorted picture shows where its lens folds."""
 
     pixels: int
-    """Of the photo, which the picture shows."""
+    """Pixels of the photo that the picture shows."""
     radius: float
-    """Px from the principal point to the nearest pixel without a ray; infinite: the lens has a ray for each."""
+    """Distance in px from the principal point to the nearest pixel without a ray; infinite: each has one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Lattice:
     """Slopes x/z, increasing."""
     y: Float[Tensor, "Y"]
     pixels: Float[Tensor, "Y X 2"]
-    """Where the lens sees them, px; NaN where it does not."""
+    """Positions of the rays on the photo, px; NaN where the lens has none."""
     areas: Float[Tensor, "Y X"]
     """Jacobian determinant, px^2 per unit of slopes; negative where the picture is mirrored, along one axis or both."""
 

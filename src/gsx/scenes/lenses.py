@@ -23,7 +23,7 @@ FOCAL = {"x": ("x_fov", "fl_x", "camera_angle_x"), "y": ("y_fov", "fl_y", "camer
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera model of a transforms file is one of pycolmap's."""
+    """Camera model of a transforms file as one of pycolmap's."""
 
     model: str
     keys: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from gsx.scenes.undistort import pinhole_of, undistort_points
 
 @dataclass(frozen=True)
 class Unmeasured:
-    """How many observations are left out, or infinitely wrong."""
+    """Numbers of observations that are left out, or infinitely wrong."""
 
     no_ray: int = 0
     """Keypoints for which the lens has no ray, or that are not finite."""

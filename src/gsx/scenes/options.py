@@ -60,7 +60,7 @@ class SceneOptions:
     """Which pixels of photographs count. auto: what the scene names (`mask_path` of nerfstudio), else files in a folder
     `masks`; alpha: what is opaque counts, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
     orientation: str = "auto"
-    """How scene=photos, colmap and transforms heed EXIF's orientation. auto: photos and cameras are turned upright,
+    """Use of EXIF's orientation by scene=photos, colmap and transforms. auto: photos and cameras are turned upright,
     from the raster that cameras are stated for: the stored one, or the turned one where only that has their shape;
     stored: not at all; turned: as auto, but the cameras are stated for turned photos of any shape
     (gsx.scenes.orientation)."""

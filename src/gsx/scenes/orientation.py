@@ -84,10 +84,10 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Turns:
-    """How a stored photo comes to the raster of its camera, and from there upright."""
+    """Turns of a stored photo to the raster of its camera, and from there upright."""
 
     exif: int = 1
-    """Orientation that the file states, where it is heeded."""
+    """Orientation that the file states; 1 where EXIF is not used."""
     first: int = 1
     """Orientation to apply to the stored photo: the result is what its camera sees."""
     last: int = 1
@@ -125,7 +125,7 @@ TurnsOf = Callable[[Path, Size], Turns]
 
 
 def as_stored(photo: Path, raster: Size) -> Turns:
-    """Return no turns: EXIF is not heeded."""
+    """Return no turns: EXIF is not used."""
     return Turns()
 
 
@@ -145,7 +145,7 @@ def of_model(photo: Path, raster: Size) -> Turns:
 
 
 def of_turned_model(photo: Path, raster: Size) -> Turns:
-    """Return the turns of a photo whose camera is stated for the photo upright, of whatever shape."""
+    """Return the turns of a photo whose camera is stated for the photo upright, of any shape."""
     exif = orientation_of(photo)
     return Turns(exif=exif, first=exif)
 

@@ -1,4 +1,4 @@
-"""Models that lie near photos: these are not reconstructed anew before somebody has decided so."""
+"""Models near photos: gsx reconstructs such photos again only if the user says so."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -62,7 +62,7 @@ def _foreign(path: Path) -> Iterator[str]:
     for pattern, meaning in FOREIGN.items():
         for file in sorted(path.glob(pattern))[:1]:
             yield (
-                f"{file} holds {meaning}, which gsx does not read: photos are reconstructed anew. Export a COLMAP "
+                f"{file} holds {meaning}, which gsx does not read: photos are reconstructed again. Export a COLMAP "
                 "model to use them."
             )
 

@@ -37,7 +37,7 @@ PHOTO_SUFFIXES = (
     ".bmp",
     ".webp",
 )
-"""What gsx reads; COLMAP gets copies of what it reads otherwise (gsx.scenes.sfm_copies)."""
+"""Suffixes that gsx reads; COLMAP gets copies of photos that it reads otherwise (gsx.scenes.sfm_copies)."""
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
 FOREIGN = {".heic": "HEIC", ".heif": "HEIC", ".hif": "HEIC", ".avif": "AVIF"} | dict.fromkeys(RAW, "raw")
 """Kinds of photos by suffix that neither library decodes."""
@@ -143,7 +143,7 @@ def aside(name: str) -> bool:
 def foreign_sentences(folder: Path) -> list[str]:
     """Return a sentence with the remedy for each kind of photo that lies in a folder and that nothing here reads.
 
-    A raw file beside a photo of the same name is that photo once more.
+    A raw file next to a photo of the same name is that photo once more.
     """
     files = [file for file in folder.iterdir() if not aside(file.name)]
     stems = {file.stem for file in files if file.suffix.lower() in PHOTO_SUFFIXES}

@@ -53,7 +53,7 @@ class Shot:
     mask: Path | None = None
     """Its mask, where the poses file names one."""
     turns: Turns = Turns()
-    """From the stored photo to the raster of `whole`, and from there upright."""
+    """Turns from the stored photo to the raster of `whole`, and from there upright."""
 
     def __post_init__(self) -> None:
         if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):

@@ -28,7 +28,7 @@ TOLERANCE = 2.0
 WORKERS = 4
 """Photos that are decoded at once: each takes several times its size of memory."""
 KEPT = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
-"""What COLMAP derives focal lengths and shared cameras from."""
+"""EXIF from which COLMAP derives focal lengths and shared cameras."""
 
 
 def candidates(folder: Path, first: Mapping[str, int]) -> dict[str, int]:
@@ -50,7 +50,7 @@ def format_of(photo: Path) -> str:
 def prepared(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], work: Path) -> Path:
     """Return the folder for COLMAP: `folder`, or one below `work` with links to its photos and with copies of some.
 
-    Copies have the names of their photos, whatever their suffix says: COLMAP recognises formats by content.
+    Copies keep the names of their photos, with any suffix: COLMAP recognises formats by content.
 
     Raises:
         InputError: a photo is damaged, or a copy cannot be written.

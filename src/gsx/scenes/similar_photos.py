@@ -1,4 +1,4 @@
-"""Photos that a model names otherwise than they are called on disk: what each is probably called."""
+"""Photos that a model names otherwise than the disk does: the probable file of each."""
 
 import os
 import unicodedata
@@ -24,7 +24,7 @@ def similar_photo(folder: Path, names: Sequence[str]) -> str:
 
 
 def _difference(name: str, file: str) -> str:
-    """Words for how a file is called otherwise, with what to do."""
+    """Return the difference of two names in words, with a remedy."""
     wanted, present = PurePosixPath(name), PurePosixPath(file)
     if wanted.parent != present.parent and wanted.name == present.name:
         return "another folder: set scene.images to the folder to which names are relative"
@@ -36,7 +36,7 @@ def _difference(name: str, file: str) -> str:
 
 
 def _files(folder: Path) -> Iterator[str]:
-    """Files below a folder, relative to it, with `/`."""
+    """Yield the files below a folder, relative to it, with `/`."""
     count = 0
     for place, inner, names in os.walk(folder):
         inner.sort()
@@ -48,10 +48,10 @@ def _files(folder: Path) -> Iterator[str]:
 
 
 def _plain(name: str) -> str:
-    """A name without differences of case and Unicode form."""
+    """Return a name without differences of case and Unicode form."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def _stem(name: str) -> str:
-    """The same without folders and suffix."""
+    """Return a plain name without folders and suffix."""
     return _plain(PurePosixPath(name.replace("\\", "/")).stem)

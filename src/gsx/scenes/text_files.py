@@ -1,4 +1,4 @@
-"""Text files that people write or export: lists of photographs, and whatever else is read line by line."""
+"""Text files that people write or export, such as lists of photos."""
 
 import codecs
 from pathlib import Path

@@ -106,10 +106,10 @@ def _shots(parts: Sequence[FrameFile], options: TransformsOptions) -> tuple[list
     """Return the shots of each part whose photos are on disk, and notes on those that are not."""
     shots, notes = list[list[Shot]](), list[str]()
     for part in parts:
-        present, told = present_frames(part.file.parent, part.frames, part.file, options.missing)
+        present, absent = present_frames(part.file.parent, part.frames, part.file, options.missing)
         rule = RULES[options.orientation]
         shots.append([_shot(completed(part.content, frame), photo, part.file, rule) for frame, photo in present])
-        notes += told
+        notes += absent
     return shots, notes
 
 

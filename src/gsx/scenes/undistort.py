@@ -28,7 +28,7 @@ OUTSIDE = 1.0
 """An undistorted picture that would show what lies farther outside its photo, in sides of it, comes of no real lens."""
 STEPS = 9  # along each side of the picture, at which that is looked at
 SAME_PIXEL = 0.1
-"""Px by which a keypoint may differ from the projection of its ray; more, and the ray is another pixel's."""
+"""Largest distance of a keypoint from the projection of its ray, px; beyond it the ray is another pixel's."""
 LEAST_FOCAL, LARGEST_FOCAL = 1e-6, 1e12
 """Px; beyond them is no lens, and numbers overflow."""
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
@@ -62,12 +62,12 @@ def cut_of(camera: Any) -> Cut | None:
 
 @dataclass(frozen=True)
 class Undistorted:
-    """What a distorted camera is undistorted to."""
+    """Result of undistorting a distorted camera."""
 
     pinhole: Any
     """A pycolmap PINHOLE camera."""
     cut: Cut | None
-    """What is cut off its photos; None: nothing but the borders that COLMAP trims."""
+    """Part of its photos that is kept; None: all but the borders that COLMAP trims."""
 
 
 def undistorted(camera: Any) -> Undistorted:

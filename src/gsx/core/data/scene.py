@@ -128,7 +128,7 @@ class Scene:
     notes: Sequence[str] = ()
     """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What was subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
+    """Subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
 

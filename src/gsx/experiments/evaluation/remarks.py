@@ -11,7 +11,7 @@ from gsx.core.training.run import Run, Step
 logger = logging.getLogger(__name__)
 
 NOT_MEASURED = "no view is held out (scene.split=none), so quality is not measured"
-"""What figures are replaced by in words."""
+"""Sentence in place of figures."""
 CHECKS = {
     "colour": "changed their mean colour",
     "agreement": "disagree with their input",

@@ -21,7 +21,7 @@ NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
 EVALUATION = ("eval", "metrics")
 """Keys of what is looked at when training is over."""
 PICTURES = (".webp", ".png")
-"""Those of an unbundled SOG."""
+"""Suffixes of an unbundled SOG's pictures."""
 UNCHANGED = {"scene.model": "auto"}
 """Keys that older gsx did not have, with the values that train the same: these do not count."""
 NEWER = {"supersample": 0, "colours": "rendered", "poses": "given", "flight": True}

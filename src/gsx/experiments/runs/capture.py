@@ -100,7 +100,7 @@ def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P
 
 
 def exposures(views: Sequence[View], cloud: PointCloud) -> Float[Tensor, "V"] | None:
-    """Stops by which each view is brighter than the middle one, told from the same points; NaN for a view that shows
+    """Return stops by which each view is brighter than the middle one, by the same points; NaN for a view that shows
     none of them, None where their colours are not the scene's."""
     step = max(1, len(cloud) // POINTS)
     points, colours = cloud.positions[::step], linear_from_display(cloud.colours[::step].float() / 255)

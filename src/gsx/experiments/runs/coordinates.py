@@ -1,4 +1,4 @@
-"""In which coordinates a splat file is written, where these are far from (0, 0, 0), and what that costs."""
+"""Coordinates of splat files far from (0, 0, 0): which are written, and what that costs."""
 
 import logging
 from pathlib import Path
@@ -46,14 +46,14 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
     steps, remedy = f"steps of {step:.2g} units{scales}", f"--local writes them relative to {middle}"
     if local:
         states = "as its comment states" if suffix in COMMENTED else f"which {suffix} has no place to state"
-        told = f"positions are relative to {middle}, {states}"
+        message = f"positions are relative to {middle}, {states}"
     elif suffix == ".glb":
-        told = f"positions are the scene's own: floats, to which the node adds {middle} exactly"
+        message = f"positions are the scene's own: floats, to which the node adds {middle} exactly"
     elif suffix == ".compressed.ply":
-        told = f"positions are the scene's own; ends of chunks are floats, rounded to {steps}: {remedy}"
+        message = f"positions are the scene's own; ends of chunks are floats, rounded to {steps}: {remedy}"
     else:
-        told = f"positions are the scene's own; programs that read floats alone round them to {steps}: {remedy}"
-    logger.info("%s: %s", path, told)
+        message = f"positions are the scene's own; programs that read floats alone round them to {steps}: {remedy}"
+    logger.info("%s: %s", path, message)
 
 
 def median_scale(gaussians: Gaussians) -> float:

@@ -1,4 +1,4 @@
-"""Which axes the numbers of a splat file are in, by the scene that they are to fit."""
+"""Axes of a splat file, chosen by the scene that it is to fit."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ THUMBNAIL, MOST_THUMBNAILS = 96, 4
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """How splats in some axes lie in a scene."""
+    """Position of splats, in some axes, in a scene."""
 
     in_view: float
     """Share of splats that a view has in front of it and within its picture, mean over views."""
@@ -159,7 +159,7 @@ def more_alike(fits: dict[str, Fit]) -> str | None:
 
 
 def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) -> None:
-    """Log which axes were taken for a file that states none."""
+    """Log the axes of a file that states none, and the evidence."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
     if best:
         message = "%s: axes %s, which fit the scene (%s); the file states none, axes=%s takes the others"

@@ -26,7 +26,7 @@ from gsx.scenes.origin import around_origin, origin_of
 logger = logging.getLogger(__name__)
 
 SOG_PICTURE = "means_l.webp"
-"""In the folder of each unbundled SOG."""
+"""A picture of each unbundled SOG."""
 Readable = list[tuple[Component, SceneFormat]]
 """Loaders that can read a folder, the most telling first."""
 

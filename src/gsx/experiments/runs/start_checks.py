@@ -67,7 +67,7 @@ def refuse_nothing_in_view(
 
 
 def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor, "N"]:
-    """Return which splats are in front of a camera and within its picture, or so many of their deviations beside it."""
+    """Return which splats are in front of a camera and at most so many of their deviations outside its picture."""
     x, y, z = camera.to_camera(gaussians.means).unbind(1)
     radius = sigmas * camera.focal * gaussians.log_scales.double().amax(1).exp() / z.clamp_min(1e-12)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -78,10 +78,10 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
 def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -> Iterator[str]:
     """Yield a sentence if hardly any splat has its middle in view of some camera."""
     some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
-    seen = torch.zeros(len(some.means), dtype=torch.bool, device=some.means.device)
+    in_view = torch.zeros(len(some.means), dtype=torch.bool, device=some.means.device)
     for camera in cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]:
-        seen |= reaching(some, camera, 0)
-    share = float(seen.double().mean())
+        in_view |= reaching(some, camera, 0)
+    share = float(in_view.double().mean())
     if share < LEAST_IN_VIEW:
         yield (
             f"only {share:.2%} of its splats are in view of any {kind}, it may be in other coordinates: compare its "

@@ -32,7 +32,7 @@ BLENDS = (
     "its colours are of linear light and were made sRGB, in which splats are blended here: figures differ from those "
     "of programs that blend in linear light"
 )
-"""What evaluations say of such files."""
+"""Remark of evaluations on such files."""
 MIP_KERNEL = 0.1
 """px^2 by which models of Mip-Splatting are dilated, with opacities compensated (Yu et al. 2024)."""
 
@@ -41,7 +41,7 @@ def starting_splats(settings: Settings) -> SplatContent | None:
     """Return what the splat file holds that a run begins with, means in float64; None: it begins with points.
 
     Raises:
-        ConfigError: axes are given, and there is no file.
+        ConfigError: axes are set without a file.
         InputError: the file cannot be read, or holds nothing.
     """
     path, axes = splat_file(settings.general.init), settings.general.axes

@@ -110,7 +110,7 @@ class FileModel:
     gaussians: Gaussians
     raster: RasterSettings
     origin: Origin = NO_ORIGIN
-    """What is added to positions for the coordinates of the file."""
+    """Added to positions for the coordinates of the file."""
     height: int = 480
     """Of photographs that nobody knows."""
     focal: float = 0.5
