@@ -3,7 +3,7 @@
 # Input: a model of COLMAP 4, which states each pose twice: in frames.bin with rigs.bin, and in images.bin for older
 #   programs. A pose is changed in images.bin, as scripts for COLMAP 3 do it.
 # Expected: both have to agree, or the reader warns.
-# Seen: Reconstruction takes the pose of frames.bin and says nothing. Without frames.bin and rigs.bin the same
+# Behaviour: Reconstruction takes the pose of frames.bin and says nothing. Without frames.bin and rigs.bin the same
 #   images.bin counts. Writing the model again restores the old pose in images.bin.
 # Output seen:
 #   images.bin moved by 7 units; read with frames.bin: moved by 0.0
@@ -11,11 +11,11 @@
 #   written again from the first: images.bin is as before the change: True
 # Exit status 1: it behaves otherwise now.
 set -euo pipefail
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
-"$work/venv/bin/python" - "$work" <<'PYTHON'
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/venv"
+"$folder/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
+"$folder/venv/bin/python" - "$folder" <<'PYTHON'
 import shutil
 import struct
 import sys

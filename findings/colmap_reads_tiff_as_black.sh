@@ -1,10 +1,9 @@
-#!/bin/bash
-# pycolmap 4.2.1 (wheel for Linux): TIFF photos with a compression that its libtiff was built without.
-#
-# One would guess that such a photo is refused, as a damaged one is: Bitmap.read returns None for what it cannot read.
-# It returns a picture of the right size that is black everywhere, for Zstandard, WebP and JPEG XL inside of TIFF, all of
-# them plain RGB of 8 bits. Feature extraction then finds nothing in these photos, and reports no error.
-#
+#!/usr/bin/env bash
+# Package: pycolmap 4.2.1 (PyPI, wheel for Linux).
+# Input: TIFF photos, plain RGB of 8 bits, with a compression that its libtiff was built without.
+# Expected: such a photo is refused, as a damaged one is: Bitmap.read returns None for what it cannot read.
+# Behaviour: for Zstandard, WebP and JPEG XL inside of TIFF it returns a picture of the right size that is black
+#   everywhere. Feature extraction then finds nothing in these photos, and reports no error.
 # Output seen:
 #   mean value of the picture: 130.1
 #       None: pycolmap reads a mean of 130.1
@@ -14,14 +13,15 @@
 #       webp: pycolmap reads a mean of 0.0
 #     jpegxl: pycolmap reads a mean of 0.0
 #   features found: {'lzw.tif': 626, 'zstd.tif': 0}
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet --disable-pip-version-check \
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/venv"
+"$folder/venv/bin/pip" install --quiet --disable-pip-version-check \
     pycolmap==4.2.1 tifffile==2026.3.3 imagecodecs==2026.3.6 numpy==2.2.6
-cd "$work"
-"$work/venv/bin/python" - <<'PYTHON'
+cd "$folder"
+"$folder/venv/bin/python" - <<'PYTHON'
 import sys
 
 import numpy as np

@@ -1,17 +1,18 @@
-#!/bin/bash
-# pycolmap 4.2.1: names of images do not survive COLMAP's own text format.
-# Guess: a model that is written by Reconstruction.write_text and read again has the same images.
-# Seen: the writer puts a name with spaces into images.txt as it is, the reader ends it at the first space, without an
-#   error or a warning: two photos "SITE 1.jpg" and "SITE 2.jpg" become two images with the one name "SITE". The binary
-#   format keeps both names. Lines of comments before them make no difference.
-# Output seen: binary ['SITE 1.jpg', 'SITE 2.jpg'] text ['SITE', 'SITE']
-# Prints what it sees and exits 1 if that changes.
+#!/usr/bin/env bash
+# Package: pycolmap 4.2.1 (PyPI).
+# Expected: a model that is written by Reconstruction.write_text and read again has the same images.
+# Behaviour: the writer puts a name with spaces into images.txt as it is, the reader ends it at the first space,
+#   without an error or a warning: two photos "SITE 1.jpg" and "SITE 2.jpg" become two images with the one name
+#   "SITE". The binary format keeps both names. Lines of comments before them make no difference.
+# Output seen:
+#   binary ['SITE 1.jpg', 'SITE 2.jpg'] text ['SITE', 'SITE']
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 numpy
-"$work/venv/bin/python" - "$work" <<'PYTHON'
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/venv"
+"$folder/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 numpy==2.2.6
+"$folder/venv/bin/python" - "$folder" <<'PYTHON'
 import sys
 from pathlib import Path
 

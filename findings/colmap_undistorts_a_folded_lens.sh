@@ -3,19 +3,19 @@
 # Input: SIMPLE_RADIAL, f = 120 px, k = -0.25, a photo of 200 x 150 px. It maps a slope r to f r (1 - r^2 / 4), which
 #   stops growing at r = 1.155, 92 px from the middle. Pixels farther out have no ray, and cam_from_img says so (NaN).
 # Expected: undistort_camera, which leaves no blank pixels by default, stays within that, or refuses.
-# Seen: it proposes 400 x 170 px, twice the photo's width. The outer columns show the photo again, mirrored. A lens with
-#   k = -0.18, whose photo reaches past the fold in its corners only, is undistorted rightly.
+# Behaviour: it proposes 400 x 170 px, twice the photo's width. The outer columns show the photo again, mirrored. A
+#   lens with k = -0.18, whose photo reaches past the fold in its corners only, is undistorted rightly.
 # Output seen:
 #   pixels without a ray: 19.2 %
 #   k = -0.25: proposed 400 x 170, mirrored pixels 35.1 %
 #   k = -0.18: proposed 244 x 162, mirrored pixels 0.0 %
 # Exit status 1: it behaves otherwise now.
 set -euo pipefail
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
-"$work/venv/bin/python" - <<'PYTHON'
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/venv"
+"$folder/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
+"$folder/venv/bin/python" - <<'PYTHON'
 import sys
 
 import numpy as np

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Package: gaussforge 0.6.0 (PyPI).
 # Expected: a PLY converted to compressed PLY and back keeps its harmonics to the step of the format (1/32).
-# Seen: the converter writes the coefficients of the compressed file colour by colour within each coefficient
-#   (R G B R G B ...), but reads them, as PlayCanvas does, all of red first. Harmonics of degrees 1 to 3 come back mixed.
+# Behaviour: the converter writes the coefficients of the compressed file colour by colour within each coefficient (R
+#   G B R G B ...), but reads them, as PlayCanvas does, all of red first. Harmonics of degrees 1 to 3 come back mixed.
 # Output seen:
 #   first bytes of 'sh': 144 128 112 144 128 112 (all of red first would be 144 144 144 144 144 144)
 #   red coefficients 1 to 4: 0.5000 0.5000 0.5000 0.5000 -> 0.5156 0.0156 -0.4844 0.5156

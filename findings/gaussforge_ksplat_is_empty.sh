@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Packages: gaussforge 0.6.0 (PyPI), @mkkellogg/gaussian-splats-3d 0.4.7 (npm), whose own format .ksplat is, and
+# Package: gaussforge 0.6.0 (PyPI), @mkkellogg/gaussian-splats-3d 0.4.7 (npm), whose own format .ksplat is, and
 #   @playcanvas/splat-transform 3.7.0 (npm), another reader of it.
-# One would guess: a .ksplat that gaussforge writes shows its splats in the viewer that the format comes from.
+# Expected: a .ksplat that gaussforge writes shows its splats in the viewer that the format comes from.
 # Behaviour: gaussforge leaves the header's largest number of splats at 0. The viewer goes by that number and holds no
 #   splat, without an error; splat-transform goes by the number of loaded splats and reads all.
 # Output seen:
@@ -9,10 +9,11 @@
 #   GaussianSplats3D holds 0 of 10 splats
 #   splat-transform reads 10 of 10 splats
 #   empty for its own viewer, as recorded
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-place=$(mktemp -d)
-trap 'rm -rf "$place"' EXIT
-cd "$place"
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+cd "$folder"
 python3 -m venv venv
 venv/bin/pip install --quiet --disable-pip-version-check gaussforge==0.6.0 >/dev/null 2>&1
 npm init -y >/dev/null

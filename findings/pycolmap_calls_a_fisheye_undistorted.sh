@@ -1,22 +1,22 @@
-#!/bin/bash
-# pycolmap 4.2.1: is_undistorted() is True for fisheye cameras, which bend every picture.
-#
-# One would guess that a camera without distortion maps rays like a pinhole. Camera.is_undistorted() looks at the
-# distortion parameters alone: of an OPENCV_FISHEYE camera with k1 = k2 = k3 = k4 = 0 it is True, but the ray at 45
-# degrees lies at f * pi / 4 from the principal point and not at f. A program that decides by it whether photos have to
-# be undistorted trains on bent ones. is_perspective_pinhole() is the question that tells the two apart.
-#
+#!/usr/bin/env bash
+# Package: pycolmap 4.2.1 (PyPI).
+# Expected: a camera for which Camera.is_undistorted() is True maps rays like a pinhole.
+# Behaviour: is_undistorted() looks at the distortion parameters alone. It is True for fisheye cameras, which bend every
+#   picture: of an OPENCV_FISHEYE camera with k1 = k2 = k3 = k4 = 0 the ray at 45 degrees lies at f * pi / 4 from the
+#   principal point and not at f. A program that decides by it whether to undistort photos trains on bent ones.
+#   is_perspective_pinhole() distinguishes the two.
 # Output seen:
 #   OPENCV_FISHEYE: is_undistorted True, is_perspective_pinhole False, 45 degrees at 78.54 px, a pinhole has 100.00
 #   THIN_PRISM_FISHEYE: is_undistorted True, is_perspective_pinhole False, 45 degrees at 78.54 px, a pinhole has 100.00
 #   RAD_TAN_THIN_PRISM_FISHEYE: is_undistorted True, is_perspective_pinhole False, 45 degrees at 78.54 px, a pinhole has 100.00
 #   undistort_camera: 200x160 becomes 308x203
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
-python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
-"$work/venv/bin/python" - <<'PYTHON'
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+python3 -m venv "$folder/venv"
+"$folder/venv/bin/pip" install --quiet pycolmap==4.2.1 numpy==2.2.6
+"$folder/venv/bin/python" - <<'PYTHON'
 import math
 import sys
 

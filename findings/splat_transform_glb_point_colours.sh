@@ -2,7 +2,7 @@
 # Package: @playcanvas/splat-transform 3.7.0 (npm).
 # Expected: COLOR_0 of a GLB, which viewers without KHR_gaussian_splatting draw as points, is linear, as glTF has it.
 #   The extension says so: for srgb_rec709_display the colours are to be decoded from sRGB to linear.
-# Seen: the bytes are those of sRGB, not decoded. Points come out too bright: 0.50 is drawn as 0.74.
+# Behaviour: the bytes are those of sRGB, not decoded. Points come out too bright: 0.50 is drawn as 0.74.
 # Output seen:
 #   COLOR_0 of a splat of sRGB 0.782 0.500 0.218: 199 128 56 (linear would be 146 55 10)
 # Exit status 1: it behaves otherwise now.
@@ -10,6 +10,7 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
+npm init -y >/dev/null
 npm install --silent --no-audit --no-fund --ignore-scripts @playcanvas/splat-transform@3.7.0 >/dev/null 2>&1
 python3 - <<'PYTHON'
 import struct

@@ -2,8 +2,8 @@
 # Package: @playcanvas/splat-transform 3.7.0 (npm).
 # Expected: x, y and z that a PLY of georeferenced splats stores as doubles keep their precision until the translation
 #   on the command line (-t) has moved them near (0, 0, 0).
-# Seen: they become float32 when they are read, before the translation, and nothing says so. Steps of 0.1 in z become
-#   steps of 0.5, and the translation cannot bring them back.
+# Behaviour: they become float32 when they are read, before the translation, and nothing says so. Steps of 0.1 in z
+#   become steps of 0.5, and the translation cannot bring them back.
 # Output seen:
 #   z of the file less 5400000: 0 0.1 0.2 0.3 0.4
 #   after -t 0,0,-5400000:      0 0 0 0.5 0.5
@@ -12,6 +12,7 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
+npm init -y >/dev/null
 npm install --silent --no-audit --no-fund --ignore-scripts @playcanvas/splat-transform@3.7.0 >/dev/null 2>&1
 python3 - <<'PYTHON'
 import struct

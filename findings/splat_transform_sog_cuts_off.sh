@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Package: @playcanvas/splat-transform 3.7.0 (npm), SOG, version 2, written and read by itself.
-# One would guess: opacities and positions are rounded to the nearest step (1/255; 1/65535 of an axis), so that errors
+# Expected: opacities and positions are rounded to the nearest step (1/255; 1/65535 of an axis), so that errors
 #   are at most half a step, of both signs, and 0 on average.
 # Behaviour: they are cut off. Every opacity comes back smaller, half a step on average and up to a whole one; every
 #   position comes back at or below its place on the logarithmic axis, by up to a whole step.
@@ -8,10 +8,11 @@
 #   opacity, steps of 1/255: mean -0.50, from -1.00 to 0.00
 #   position, steps of its axis: mean -0.49, from -1.00 to 0.00
 #   cut off, as recorded
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-place=$(mktemp -d)
-trap 'rm -rf "$place"' EXIT
-cd "$place"
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+cd "$folder"
 npm init -y >/dev/null
 npm install --silent --no-audit --no-fund --ignore-scripts @playcanvas/splat-transform@3.7.0 >/dev/null 2>&1
 cat > splats.py <<'PYTHON'
@@ -48,7 +49,7 @@ def read(path):
     return sorted((row["x"], 1 / (1 + math.exp(-row["opacity"]))) for row in rows)
 
 
-def told(name, errors):
+def report(name, errors):
     mean = sum(errors) / len(errors)
     print("%s: mean %.2f, from %.2f to %.2f" % (name, mean, min(errors), round(max(errors), 2) + 0.0))
     return mean
@@ -60,8 +61,9 @@ else:
     made, back = model(), read(sys.argv[2])
     assert len(back) == COUNT
     step = (math.log1p(made[-1][0]) - math.log1p(made[0][0])) / 65535
-    opacity = told("opacity, steps of 1/255", [255 * (b[1] - a[1]) for a, b in zip(made, back)])
-    position = told("position, steps of its axis", [(math.log1p(b[0]) - math.log1p(a[0])) / step for a, b in zip(made, back)])
+    opacity = report("opacity, steps of 1/255", [255 * (b[1] - a[1]) for a, b in zip(made, back)])
+    steps = [(math.log1p(b[0]) - math.log1p(a[0])) / step for a, b in zip(made, back)]
+    position = report("position, steps of its axis", steps)
     cut = abs(opacity + 0.5) < 0.1 and abs(position + 0.5) < 0.1
     print("cut off, as recorded" if cut else "CHANGED: no longer cut off")
     sys.exit(not cut)

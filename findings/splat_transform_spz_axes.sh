@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Package: @playcanvas/splat-transform 2.7.1 and 3.7.0 (npm), .spz written by one version and read by the other; and
 #   the extension SPZ_ADOBE_coordinate_system of SPZ 4, by which a file states its axes.
-# One would guess: a file of one version comes back from the other as it was, and a file that states its axes is
+# Expected: a file of one version comes back from the other as it was, and a file that states its axes is
 #   read in them.
 # Behaviour: 2.7.1 stores the axes that the format specifies (x right, y up, z back), 3.7.0 those of the PLY, and
 #   nothing in the files says which. Each reads its own files, and turns the other's by 180 degrees about x. 3.7.0
@@ -13,10 +13,11 @@
 #   3.7.0 -> 3.7.0: (1, 2, 3)
 #   2.7.1, stating its axes -> 3.7.0: (1, -2, -3)
 #   turned, as recorded
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-place=$(mktemp -d)
-trap 'rm -rf "$place"' EXIT
-cd "$place"
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+cd "$folder"
 for version in 2.7.1 3.7.0; do
   mkdir "$version"
   (cd "$version" && npm init -y >/dev/null && npm install --silent --no-audit --no-fund --ignore-scripts \

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Package: @adobe/spz 0.2.3 (npm), Niantic's SPZ library as WebAssembly, conversion between named axes.
-# One would guess: RFD is x right, y front, z down, as its letters and its README say. A point 1 to the front, (0, 1, 0),
+# Expected: RFD is x right, y front, z down, as its letters and its README say. A point 1 to the front, (0, 1, 0),
 #   is (0, 0, 1) in RDF (x right, y down, z front).
 # Behaviour: the point comes out behind, at (0, 0, -1), and one below comes out above. So it is of the four systems
 #   LFD, RFD, LBU and RBU; of the other four with y to front or back (RFU and RBD among them) the letters hold.
@@ -12,10 +12,11 @@
 #   RBU back -> RDF: (0, 0, 1)
 #   RBU up -> RDF: (0, 1, 0)
 #   against the letters, as recorded
+# Exit status 1: it behaves otherwise now.
 set -euo pipefail
-place=$(mktemp -d)
-trap 'rm -rf "$place"' EXIT
-cd "$place"
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+cd "$folder"
 npm init -y >/dev/null
 npm install --silent --no-audit --no-fund --ignore-scripts @adobe/spz@0.2.3 >/dev/null 2>&1
 cat > axes.mjs <<'SCRIPT'
