@@ -135,6 +135,16 @@ def test_text_beside_a_binary_model_is_compared(tmp_path: Path) -> None:
     assert "(by up to 0 degrees and 1 units: " in conflict
 
 
+def test_a_list_of_photos_beside_a_binary_model_is_no_model(tmp_path: Path) -> None:
+    """Other programs have files of that name, too: an id and a name, or a few numbers."""
+    model = write_scene(synthesize(), tmp_path)
+    names = [image.name for image in read_model(model).images]
+    (model / "images.txt").write_text("".join(f"{number} {name}\n\n" for number, name in enumerate(names)))
+    assert read_model(model).conflict == ""
+    (model / "images.txt").write_text("".join(f"{number} 1 0 0 0 {name}\n\n" for number, name in enumerate(names)))
+    assert read_model(model).conflict == ""
+
+
 def test_a_scene_that_was_scaled_without_its_frames_is_explained(tmp_path: Path) -> None:
     """Points and images.bin by 3: the cameras of frames.bin miss the points, and the refusal says why."""
     reconstruction = synthesize()

@@ -103,6 +103,8 @@ def text_poses(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (name, quaternion w, x, y, z and translation) of each image of an images.txt; damaged lines are skipped."""
     for header, _ in _image_lines(Lines(file, errors="replace")):
         *numbers, name = _header_words(header)
+        if len(numbers) < NAME_AT:  # a list of photos of another program
+            continue
         with suppress(ValueError):
             yield name, _floats(numbers[1:8])
 
