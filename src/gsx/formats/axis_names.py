@@ -9,6 +9,8 @@ SYSTEMS = (
     *("lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"),
 )
 """Names by code - 1 in SPZ's extension SPZ_ADOBE_coordinate_system (nianticlabs/spz, splat-types.h)."""
+FIXED = "fixed"
+"""Reason for the axes of a glTF, which has no others."""
 CHOICES = (AUTO, *SYSTEMS)
 """Values of `axes`."""
 EXAMPLES = "auto, rub (SPZ as specified), rdf (as trained), or another of three letters, for example ruf"

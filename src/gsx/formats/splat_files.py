@@ -15,7 +15,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
 from gsx.formats.axes import to_training_axes
-from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES, SPECIFIED, TRAINED
+from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES, FIXED, SPECIFIED, TRAINED
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.formats.detect import MOST_HEADER, format_of
 from gsx.formats.glb import decode_glb, encode_glb, names_linear
@@ -130,7 +130,8 @@ class SplatContent:
     axes: str
     """Axes of the file's numbers: one of `axis_names.SYSTEMS`."""
     by: str
-    """Reason: given, stated, specified (the format's, which programs do not keep to), conventional (the format's)."""
+    """Reason: given, stated, specified (the format's, which programs do not keep to), conventional (the format's),
+    fixed (glTF's)."""
 
 
 def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> Gaussians:
@@ -193,7 +194,9 @@ def kind_of(content: bytes, path: Path) -> str:
 
 def usual_axes(kind: str) -> tuple[str, str]:
     """Return (axes of files of one of SUFFIXES that state none, why)."""
-    return (SPECIFIED, "specified") if kind == ".spz" else (TRAINED, "conventional")
+    if kind == ".spz":
+        return SPECIFIED, "specified"
+    return TRAINED, FIXED if kind == ".glb" else "conventional"
 
 
 def log_axes(content: SplatContent) -> None:
@@ -204,7 +207,7 @@ def log_axes(content: SplatContent) -> None:
             "%s (--axes %s, or axes=%s)",
             *(content.path, content.axes, TRAINED, TRAINED, TRAINED),
         )
-    elif content.by != "conventional":
+    elif content.by in REASONS:
         logger.info("%s: axes %s, as %s", content.path, content.axes, REASONS[content.by])
 
 

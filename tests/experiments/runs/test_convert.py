@@ -12,7 +12,7 @@ from foreign_splats import row as row_of
 from tiny import tiny_settings
 
 import gsx.api
-from gsx.cli.compact import beside
+from gsx.cli.compact import compact_folder
 from gsx.cli.dispatch import main
 from gsx.core.errors import InputError
 from gsx.experiments.run_folder.run_key import scene_stamp
@@ -133,5 +133,5 @@ def test_the_page_on_formats_names_all_kinds() -> None:
 
 def test_a_smaller_run_lies_beside_what_it_is_made_of(tmp_path: Path) -> None:
     files = kinds(tmp_path)
-    assert beside(files[".splat"]) == beside(files[".compressed.ply"]) == tmp_path / "a_compact"
-    assert beside(files["folder"] / "meta.json") == tmp_path / "sog_compact"
+    assert compact_folder(files[".splat"]) == compact_folder(files[".compressed.ply"]) == tmp_path / "a_compact"
+    assert compact_folder(files["folder"] / "meta.json") == tmp_path / "sog_compact"

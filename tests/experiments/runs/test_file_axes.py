@@ -150,6 +150,16 @@ def test_photos_decide_where_points_and_views_do_not(
     assert "axes rdf, which fit the scene (rub: 100.0% in view, thumbnails" in caplog.text
 
 
+def test_a_glb_that_would_fit_turned_over_is_named_with_a_remedy_that_works(
+    scene: Scene, model: Gaussians, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_gaussians(tmp_path / "a.glb", to_training_axes(model, "rub"))
+    in_axes_of(scene, read_splats(tmp_path / "a.glb"))
+    assert "a.glb: its splats would fit the scene better in axes rub" in caplog.text
+    assert "export it with y up" in caplog.text
+    assert "axes=" not in caplog.text  # which glTF refuses
+
+
 def test_a_ply_that_would_fit_turned_over_is_named_and_left(
     scene: Scene, model: Gaussians, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

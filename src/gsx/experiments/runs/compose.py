@@ -446,7 +446,7 @@ def launch(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig
         remedy = "mend its settings, or choose hydra/launcher=basic: one run after the other, here"
         raise ConfigError(f"the launcher failed ({type(error).__name__}: {first_line(error)}): {remedy}") from error
     finally:
-        os.environ.pop(FULL_ERROR)
+        os.environ.pop(FULL_ERROR, None)
         os.environ |= {} if before is None else {FULL_ERROR: before}
 
 

@@ -33,6 +33,8 @@ def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, l
     added, stated = placement(origin, local)
     refuse_too_far(to, gaussians, added)
     write_gaussians(to, gaussians, [*comments, *stated], mip, spz, added)
+    if local and not any(origin):
+        logger.info("--local changes nothing: the positions of %s are near (0, 0, 0)", source)
     log_axes_written(to, spz)
     log_coordinates(to, origin, local, gaussians)
     written = len(read_again(to, spz).means)

@@ -25,7 +25,7 @@ from gsx.experiments.runs.start_checks import (
 )
 from gsx.experiments.runs.start_file import in_scene, origin_of_file, start_doubts
 from gsx.formats.axes import flipped
-from gsx.formats.axis_names import SPECIFIED, TRAINED
+from gsx.formats.axis_names import FIXED, SPECIFIED, TRAINED
 from gsx.formats.origin import around
 from gsx.formats.splat_files import SplatContent, log_axes
 
@@ -172,5 +172,7 @@ def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) ->
 def log_doubt(content: SplatContent, fits: dict[str, Fit], other: str) -> None:
     """Warn of a file of a format with usual axes that would fit the scene better in others."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
-    message = "%s: its splats would fit the scene better in axes %s (%s): try axes=%s"
-    logger.warning(message, content.path, other, evidence, other)
+    remedy = "export it with y up, as glTF has it" if content.by == FIXED else f"try axes={other}"
+    logger.warning(
+        "%s: its splats would fit the scene better in axes %s (%s): %s", content.path, other, evidence, remedy
+    )
