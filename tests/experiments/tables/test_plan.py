@@ -12,6 +12,7 @@ from tiny import leave_results
 from gsx.builtin import plugins
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import (
+    comparable,
     composition_key,
     evaluation_settings,
     finished,
@@ -141,6 +142,9 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         assert key("augmenter=upscale", "regenerator/upscale=lanczos") != upscaled
         assert key("augmenter=[upscale,bootstrap]") != key("augmenter=[bootstrap,upscale]")
         settings = compositions.settings(["scene=colmap", "scene.path=/data/my scene", "output=o"])
+        newer = compositions.settings(["scene=colmap", "scene.path=a"]).resolved
+        before = {name: value for name, value in newer["scene"].items() if name != "model"}
+        assert comparable(newer) == comparable({**newer, "scene": before})
         assert key("scene=colmap", "scene.path=a", "scene.model=auto") == key("scene=colmap", "scene.path=a")
         assert key("scene=colmap", "scene.path=a", "scene.model=sparse/1") != key("scene=colmap", "scene.path=a")
     config, idle = settings.resolved, settings.idle

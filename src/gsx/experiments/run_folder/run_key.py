@@ -34,11 +34,15 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
     `idle`: dotted keys that their options say to have no effect. The folder of a scene is among them: what lies there
     counts.
     """
-    unchanged = [key for key, value in flattened(config).items() if UNCHANGED.get(key, ...) == value]
-    counted = without(config, {*idle, *unchanged})
+    counted = without(config, {*idle, *unchanged(config)})
     kept = {key: value for key, value in counted.items() if key not in (*WHERE, *NAMES, *EVALUATION)}
     start = {"init": "splat file"} | given_axes(config) if splat_file(config.get("init")) else {}
     return kept | {"regenerator": asked_for(kept)} | start
+
+
+def unchanged(config: dict[str, Any]) -> list[str]:
+    """Return the dotted keys of a composition by which it trains as older gsx did, which lacked them."""
+    return [key for key, value in flattened(config).items() if UNCHANGED.get(key, ...) == value]
 
 
 def given_axes(config: dict[str, Any]) -> dict[str, Any]:
@@ -168,4 +172,4 @@ def comparable(config: dict[str, Any]) -> dict[str, Any]:
     """Values by dotted key that runs may be compared by: not those that say where a run ran."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
     start = {"init": config["init"]} | given_axes(config) if splat_file(config.get("init")) else {}
-    return flattened(kept | start)
+    return flattened(without(kept | start, unchanged(config)))
