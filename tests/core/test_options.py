@@ -52,6 +52,7 @@ def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
             "tracker",
             "reuse",
             "init",
+            "axes",
             "disk_cache_gb",
             "warm_start_at",
             *viewer,

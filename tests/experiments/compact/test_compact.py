@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -50,10 +51,10 @@ def scenes_loaded_once() -> Iterator[None]:
     """By their options."""
     loaded: dict[str, Scene] = {}
 
-    def load(settings: Settings) -> Scene:
-        key = repr(settings.scene.options)
+    def load(settings: Settings, *origin: Any) -> Scene:
+        key = repr((settings.scene.options, *origin))
         if key not in loaded:
-            loaded[key] = load_scene(settings)
+            loaded[key] = load_scene(settings, *origin)
         return loaded[key]
 
     with pytest.MonkeyPatch.context() as patch:
