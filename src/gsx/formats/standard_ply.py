@@ -1,4 +1,4 @@
-"""The standard PLY of 3D-GS, with what programs are known to write otherwise; properties are found by name.
+"""The standard PLY of 3D-GS, and the forms in which other programs write it; properties count by name.
 
 Colours may be display RGB (nerfstudio), an opacity may be an alpha channel, bands beyond degree 3 are left out. A 3D
 filter next to the scales is fused (Mip-Splatting, training). Rows that are not finite are left out, as by viewers.

@@ -47,7 +47,7 @@ POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and convers
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderOptions(SceneOptions):
-    """What `conf/scene/blender.yaml` sets; the files themselves say which images are held out (split=json).
+    """Options of `conf/scene/blender.yaml`; the files themselves hold the split (split=json).
 
     `split` can be `none` as well, which trains on the images of both files, and any rule where there is but one file.
     """
