@@ -135,3 +135,17 @@ def test_a_smaller_run_lies_beside_what_it_is_made_of(tmp_path: Path) -> None:
     files = kinds(tmp_path)
     assert compact_folder(files[".splat"]) == compact_folder(files[".compressed.ply"]) == tmp_path / "a_compact"
     assert compact_folder(files["folder"] / "meta.json") == tmp_path / "sog_compact"
+
+
+@pytest.mark.parametrize("verb", [["eval"], ["photographs"], ["export", "to.ply"]])
+def test_a_file_whose_name_shows_no_format_is_a_file(
+    verb: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, remedy in (("model.spz.bak", True), ("model", True), ("model.ply", False)):
+        (tmp_path / name).write_bytes(b"")
+        if remedy or verb == ["photographs"]:
+            assert main([verb[0], name, *verb[1:]]) == 2
+            message = capsys.readouterr().err
+            assert f"{name} is a file and no run folder" in message
+            assert ("let its name end in one of .compressed.ply, .ply, .spz" in message) == remedy

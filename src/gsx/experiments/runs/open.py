@@ -43,6 +43,7 @@ from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
 from gsx.formats.origin import NO_ORIGIN, Origin
+from gsx.formats.suffixes import SUFFIXES, suffix_of
 
 logger = logging.getLogger(__name__)
 
@@ -133,7 +134,10 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
 
 
 def refuse_other(folder: Path) -> None:
-    """Raise InputError for a folder that is no run."""
+    """Raise InputError for a path that is no run."""
+    if folder.is_file():
+        name = "" if suffix_of(folder) else f". If it holds splats, let its name end in one of {', '.join(SUFFIXES)}"
+        raise InputError(f"{folder} is a file and no run folder: give a folder that `gsx` made{name}")
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
 
