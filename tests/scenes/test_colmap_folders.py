@@ -246,7 +246,7 @@ SIMILAR = {
         "cam/0001.png",
         r"0001\.png is there instead of cam/0001\.png \(another folder: set scene\.im",
     ),
-    "path": ("C:\\shots\\0001.png", r"0001\.png is there instead of C:/shots/0001\.png \(another folder"),
+    "path": ("C:\\shots\\0001.png", r"0001\.png is there instead of C:/shots/0001\.png \(an absolute path: cut"),
     "form": ("u\u0308.png", "\u00fc\\.png is there instead of u\u0308\\.png"),
 }
 

@@ -3,7 +3,7 @@
 import os
 import unicodedata
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 MOST_FILES = 100_000
 """Files of a folder that are compared with a name."""
@@ -26,6 +26,8 @@ def similar_photo(folder: Path, names: Sequence[str]) -> str:
 def _difference(name: str, file: str) -> str:
     """Return the difference of two names in words, with a remedy."""
     wanted, present = PurePosixPath(name), PurePosixPath(file)
+    if name.startswith("/") or PureWindowsPath(name).drive:
+        return "an absolute path: cut the names in images.txt to what follows the folder of the photos"
     if wanted.parent != present.parent and wanted.name == present.name:
         return "another folder: set scene.images to the folder to which names are relative"
     if wanted.stem == present.stem and wanted.suffix.lower() != present.suffix.lower():
