@@ -28,7 +28,7 @@ from gsx.core.gaussians.bands import BAND_0
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
-from gsx.core.shapes import Float
+from gsx.core.shapes import Float, Int
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.export import explicit_of
@@ -67,8 +67,8 @@ COLUMNS = [
 NOTE = (
     "PSNR of renders from the first five test views, mean, against those of the model; 200: equal. Largest errors of "
     "any splat: position in scene units, opacity in [0, 1], colour of the constant band in [0, 1]; rotation: median "
-    "angle. Splats are matched by position, colour and opacity, since some formats order them anew. Axes: those in "
-    "which gsx read the file."
+    "angle. Splats are matched by position, or by position, colour and opacity, since some formats order them anew. "
+    "Axes: those in which gsx read the file."
 )
 
 
@@ -190,16 +190,27 @@ class Model:
 
 def errors(found: Gaussians, model: Gaussians) -> dict[str, float]:
     """Return the largest errors of splats, each compared with the model's splat most like it."""
-    rows, others = features(found).split(ROWS_AT_ONCE), features(model)
-    nearest = torch.cat([torch.cdist(part, others).argmin(1) for part in rows])
-    cosines = (unit(found.quats) * unit(model.quats)[nearest]).sum(1).abs().clamp_max(1)
-    opacities = found.opacity_logits.sigmoid() - model.opacity_logits[nearest].sigmoid()
+    rows = matches(found, model)
+    cosines = (unit(found.quats) * unit(model.quats)[rows]).sum(1).abs().clamp_max(1)
+    opacities = found.opacity_logits.sigmoid() - model.opacity_logits[rows].sigmoid()
     return {
-        "position": float((found.means - model.means[nearest]).norm(dim=1).max()),
+        "position": float((found.means - model.means[rows]).norm(dim=1).max()),
         "rotation": float(torch.rad2deg(2 * cosines.acos()).median()),
         "opacity": float(opacities.abs().max()),
-        "colour": float((found.sh_dc - model.sh_dc[nearest]).abs().max()) * BAND_0,
+        "colour": float((found.sh_dc - model.sh_dc[rows]).abs().max()) * BAND_0,
     }
+
+
+def matches(found: Gaussians, model: Gaussians) -> Int[Tensor, "N"]:
+    """Return the model's splat for each one found: by position, or by position, colour and opacity, whichever leaves
+    fewer of the model's without one."""
+    pairs = [(found.means, model.means), (features(found), features(model))]
+    return max((nearest(*pair) for pair in pairs), key=lambda rows: len(rows.unique()))
+
+
+def nearest(found: Float[Tensor, "N k"], model: Float[Tensor, "M k"]) -> Int[Tensor, "N"]:
+    """Return the nearest row of the model for each row found."""
+    return torch.cat([torch.cdist(rows, model).argmin(1) for rows in found.split(ROWS_AT_ONCE)])
 
 
 def features(gaussians: Gaussians) -> Float[Tensor, "N 7"]:
