@@ -82,8 +82,9 @@ def records_of(file: Path, read: Reader) -> Iterator[bytes]:
             "the photos and reconstruct again."
         ) from None
     except (ValueError, OverflowError, struct.error) as problem:
+        end = "" if str(problem).endswith(("?", ".")) else "."
         raise InputError(
-            f"{file} cannot be read at line {lines.number}: {problem}; correct it, or make the model again."
+            f"{file} cannot be read at line {lines.number}: {problem}{end} Correct it, or make the model again."
         ) from None
 
 
