@@ -21,6 +21,7 @@ from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
 from gsx.cli.dispatch import VERBS, main
+from gsx.core.compiling import available
 from gsx.core.data.images import write_image
 from gsx.core.rasterizer import RasterSettings
 
@@ -79,6 +80,7 @@ def test_eval_render_export_report(run_folder: Path, tmp_path: Path, capsys: pyt
     assert main(["report", str(run_folder.parent)]) == 0
 
 
+@pytest.mark.skipif(not available(), reason="no working compiler")
 def test_eval_draws_by_the_path_of_training_and_names_it(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,7 @@ from gsx.augmenters.redraw import Redrawer
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core import files
+from gsx.core.compiling import available
 from gsx.core.errors import CompilerError, TrainingError
 from gsx.core.files import remove_partial, replacing
 from gsx.core.plugins import hookimpl
@@ -102,6 +103,7 @@ def test_an_error_within_a_step_keeps_the_step_before(
     assert_ends_as(tmp_path / "run", whole)
 
 
+@pytest.mark.skipif(not available(), reason="no working compiler")
 def test_a_run_that_asked_for_no_code_goes_eagerly_where_it_cannot_be_compiled(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -19,6 +19,7 @@ from processes import Begin
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
+from gsx.core.compiling import available
 from gsx.core.data.scene import Scene
 from gsx.core.kept_code import FOLDER, Call, KeptFunction, file_of, recorded, recording
 from gsx.core.rasterizer import RasterSettings
@@ -94,6 +95,7 @@ def files_of(calls: list[Call]) -> dict[str, Path]:
     return found
 
 
+@pytest.mark.skipif(not available(), reason="no working compiler")
 @pytest.mark.parametrize(
     "given",
     [
@@ -144,6 +146,7 @@ class Begun:
         self.ended.append("waited for")
 
 
+@pytest.mark.skipif(not available(), reason="no working compiler")
 @pytest.mark.parametrize("zoomed", ["plain", "magnified"])
 def test_the_helper_makes_from_the_other_end_what_no_backbone_changes_and_the_others_come_first(
     zoomed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
