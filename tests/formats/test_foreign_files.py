@@ -168,6 +168,14 @@ def test_rows_that_are_not_finite_are_left_out_and_told(tmp_path: Path, caplog: 
     write_gaussians(tmp_path / "again.ply", read)  # what was read can be written
 
 
+def test_a_signalling_nan_is_left_out_without_a_warning_of_numpys(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.ply", ORDERS["INRIA"], [{"x": 1.0}, {"x": 2.0}])
+    content = path.read_bytes()
+    assert content.count(struct.pack("<f", 2.0)) == 1
+    path.write_bytes(content.replace(struct.pack("<f", 2.0), struct.pack("<I", 0x7F800001)))
+    assert read_gaussians(path).means[:, 0].tolist() == [1.0]
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [

@@ -43,6 +43,7 @@ ANCHORS = ("f_anchor_feat_0", "f_offset_0")
 """Properties that no file of splats has."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # rows with NaN of any kind, or beyond float32, are left out
 def decode_standard_ply(content: bytes, name: str) -> Gaussians:
     """Return the splats of a file's content, means in float64. name: of the file, for the log.
 
