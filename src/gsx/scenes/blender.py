@@ -186,8 +186,7 @@ def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
     if stated := sorted({key for frame in ({}, *frames) for key in beyond_angle(content, frame)}):
         notes.append(
             f"{file.name} states {', '.join(stated)}, which the format's published readers leave out, and so does "
-            "scene=blender: pictures are taken for those of camera_angle_x, with nothing bent. scene=transforms reads "
-            "them."
+            "scene=blender: it uses camera_angle_x alone, without distortion. scene=transforms reads them."
         )
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes
 
