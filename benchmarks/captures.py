@@ -26,8 +26,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.core.data.disturbed import chosen, turn_of
 from gsx.core.files import read_json
+from gsx.experiments.runs.degraded import chosen, turn_of
 from gsx.experiments.runs.photographs import judge_photographs
 from measuring.wrong_models import wrong_model
 from zoom import (
@@ -36,8 +36,8 @@ from zoom import (
     Measure,
     Measured,
     compared,
-    looked_at,
     over_seeds,
+    render_probe,
     shared_arguments,
     steps_among,
     told,
@@ -273,7 +273,7 @@ def in_colours(arms: Arms, kind: str) -> Callable[..., dict[str, Any]]:
 
     def look(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
         found = figures(scene, seed, f"{kind}{arm}", arms[arm], "exposures", given)
-        return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
+        return found | {"fitted": render_probe(found["folder"], "fitted", FITTED)}
 
     return look
 
@@ -305,7 +305,7 @@ def light(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 def posed(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of poses, and what it found of them."""
     found = figures(scene, seed, f"poses {arm}", POSE_ARMS[arm], "poses", given)
-    return found | {"aligned": looked_at(found["folder"], "aligned", ["eval.poses=aligned"])}
+    return found | {"aligned": render_probe(found["folder"], "aligned", ["eval.poses=aligned"])}
 
 
 def pose_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
@@ -353,7 +353,7 @@ def of_model(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict
             wish.append(f"scene.path={wrong_model(given.scenes / scene, target, **wrong)}")
     found = figures(scene, seed, f"adjust {arm}", [*wish, *(ADJUSTED if auto else ())], "adjust", given)
     notes = read_json(found["folder"] / "environment.json")["scene"]["notes"]
-    aligned = looked_at(found["folder"], "aligned", ["eval.poses=aligned"])
+    aligned = render_probe(found["folder"], "aligned", ["eval.poses=aligned"])
     return found | {"note": next((note for note in notes if "adjust" in note), ""), "aligned": aligned}
 
 
@@ -389,7 +389,7 @@ def adjust(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 def seen_past(scene: str, seed: int, arm: str, arms: Arms, given: argparse.Namespace) -> dict[str, Any]:
     """Figures of a run by both protocols of colours, and what it found of distractors."""
     found = figures(scene, seed, f"distractors {arm}", arms[arm], "distractors", given)
-    return found | {"fitted": looked_at(found["folder"], "fitted", FITTED)}
+    return found | {"fitted": render_probe(found["folder"], "fitted", FITTED)}
 
 
 def past_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:

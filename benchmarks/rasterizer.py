@@ -17,8 +17,8 @@ from pathlib import Path
 
 import torch
 
-from gsx.core.allocator import keep_freed_memory
 from gsx.core.errors import GsxError, InputError, nearest
+from gsx.engine.allocator import keep_freed_memory
 from gsx.experiments.runs.build import choose_device
 from measuring import adapter
 from measuring.bench import Bench, say

@@ -1,6 +1,6 @@
 """Training while another program wants the cores, too: python benchmarks/shared_cores.py --against REVISION
 
-Alone, beside a program that keeps one core busy, and two runs at once (core/threads.py). Both revisions take turns,
+Alone, beside a program that keeps one core busy, and two runs at once (engine/threads.py). Both revisions take turns,
 round by round; ratios hold within a round. Wants an otherwise idle machine.
 """
 

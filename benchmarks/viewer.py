@@ -124,7 +124,7 @@ def drawn_alone(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def looked_at(name: str, when: str, words: Sequence[str], patience: float = 0.0) -> dict[str, Any]:
+def render_probe(name: str, when: str, words: Sequence[str], patience: float = 0.0) -> dict[str, Any]:
     """Figures of one session, whose pictures are kept."""
     with served(words) as address, browser(*SIZE) as page:
         page.call("Page.addScriptToEvaluateOnNewDocument", source=COUNTING)
@@ -171,8 +171,8 @@ def main(words: Sequence[str]) -> None:
     rows = []
     if given.training:
         words_of_training = [*given.training, "viewer=true", "viewer_port=0"]
-        rows.append(looked_at(given.run.name, "during_training", words_of_training, 60.0))
-    rows.append(looked_at(given.run.name, "after_training", ["view", str(given.run), "--port", "0"]))
+        rows.append(render_probe(given.run.name, "during_training", words_of_training, 60.0))
+    rows.append(render_probe(given.run.name, "after_training", ["view", str(given.run), "--port", "0"]))
     note = (
         f"A window of {SIZE[0]} x {SIZE[1]} px; the mouse turns the model for {MOVING:g} s; pictures: that arrive. "
         "Chromium draws without a GPU, on the same cores."

@@ -198,7 +198,7 @@ def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:
     return float(read_json(path)["psnr"])
 
 
-def looked_at(folder: Path, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def render_probe(folder: Path, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Figures by zoom of a trained run under other settings; kept beside it."""
     path = folder / f"zoom_{name}.json"
     if not path.is_file():
@@ -267,7 +267,7 @@ def rules(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
 
     def look(scene: str, seed: int) -> dict[str, Any]:
         folder = trained(scene, seed, given, ["backbone=gs3d"])
-        return {rule: looked_at(folder, rule, [f"backbone.filter={rule}"]) for rule in RULES}
+        return {rule: render_probe(folder, rule, [f"backbone.filter={rule}"]) for rule in RULES}
 
     found = over_seeds(look, scenes, given)
     rows = [{"scene": s, "name": rule} | row_of([one[rule] for one in found[s]]) for s in scenes for rule in RULES]

@@ -6,7 +6,7 @@ from unittest.mock import patch
 
 import torch
 
-from gsx.core.kept_code import KeptFunction
+from gsx.engine.compile_cache import KeptFunction
 
 
 @contextmanager

@@ -40,7 +40,7 @@ def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
 COMPILED = {
     *(f"gsx.core.rasterizer.{name}" for name in ("kernels", "segment_kernels", "pixel_windows")),
     *(f"gsx.core.rasterizer.{name}" for name in ("geometry", "selection", "boxes")),
-    *("gsx.core.gaussians.bands", "gsx.core.quality.similarity", "gsx.core.compiling"),
+    *("gsx.core.gaussians.bands", "gsx.core.quality.similarity", "gsx.engine.compiling"),
 }
 """torch.compile must see these functions themselves, not the checks around them."""
 

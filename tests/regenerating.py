@@ -7,6 +7,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Checks, Tally
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera, look_at
@@ -14,7 +15,6 @@ from gsx.core.data.reduction import as_blocks, box_average
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.training.augmenter import AugmenterContext
-from gsx.core.training.checked_regenerator import CheckedRegenerator, Checks, Tally
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext, Request
 from gsx.core.training.run import Run
 from gsx.experiments.runs.settings import typed

@@ -14,7 +14,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import BackboneContext
-from gsx.core.training.resolution import Resolution
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.settings import typed
 
 
@@ -61,7 +61,7 @@ def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **mor
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
-        resolution=Resolution(scene=scene, **more),
+        resolution=TrainingViews(scene=scene, **more),
     )
 
 

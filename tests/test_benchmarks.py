@@ -13,9 +13,9 @@ from torch import Tensor
 import rasterizer as benchmark
 import step
 from gsx.core.errors import InputError
-from gsx.core.rasterizer import compiled
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
+from gsx.engine import compiled
 from measuring import naive, rival, stages
 from measuring.adapter import LOOPS, blend_screen, learnable, loops_timed, settings_of
 from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, splats_of
@@ -587,7 +587,7 @@ def test_a_stage_is_slower_beyond_a_tenth_and_half_a_millisecond() -> None:
 
 @pytest.mark.skipif(not compiled.available(), reason="no working compiler on this machine")
 def test_loops_are_timed_by_the_names_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsx.core.rasterizer.lanes.chunks_at_most", lambda lengths, chunk: 1)
+    monkeypatch.setattr("gsx.engine.lanes.chunks_at_most", lambda lengths, chunk: 1)
     settings, own = replace(settings_of("compiled"), unrolled=2), compiled.settled
     screen = learnable(project(splats_of(CASE, CPU), camera_of(CASE), settings))
     with loops_timed() as spent:

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
-from gsx.core.rasterizer import RasterSettings, compiled
-from gsx.core.rasterizer.compiled import composite_compiled
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
+from gsx.engine import compiled
+from gsx.engine.compiled import composite_compiled
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
 

@@ -80,7 +80,7 @@ def scale_resolution(bench: Bench) -> Section:
         width, height = round(case.width * factor), round(case.height * factor)
         rows += compare(bench, Case(splats=case.splats, width=width, height=height, size=factor))
     return section(
-        bench, "Resolution", COLUMNS, rows, "The same scene on finer rasters; splats grow with them (size x)."
+        bench, "TrainingViews", COLUMNS, rows, "The same scene on finer rasters; splats grow with them (size x)."
     )
 
 

@@ -22,10 +22,10 @@ REST = "everything else"
 PLACES = [
     ("projection", "gsx.core.rasterizer.render", "project"),
     ("tiles", "gsx.core.rasterizer.render", "intersect_tiles"),
-    ("lists", "gsx.core.rasterizer.compiled", "lay_out"),
-    ("lists", "gsx.core.rasterizer.compiled", "places_of"),
+    ("lists", "gsx.engine.compiled", "lay_out"),
+    ("lists", "gsx.engine.compiled", "places_of"),
     ("blending", "gsx.core.rasterizer.render", "blend"),
-    ("blending, backward", "gsx.core.rasterizer.compiled", "CompiledComposite.backward"),
+    ("blending, backward", "gsx.engine.compiled", "CompiledComposite.backward"),
     ("loss", "gsx.core.training.trainer", "photometric"),
     ("backward, but for blending", "torch", "Tensor.backward"),
 ]
@@ -106,7 +106,7 @@ def measure_stages(folder: Path, steps: int) -> Measured:
     The step's number stays, so that density control, which comes now and then, is left out.
     """
     with suppress(ImportError):  # older sources know nothing of it
-        from gsx.core.allocator import keep_freed_memory
+        from gsx.engine.allocator import keep_freed_memory
 
         keep_freed_memory()
     loaded, clock = plugins(), StageClock()

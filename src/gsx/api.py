@@ -27,12 +27,12 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.processes import processes
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
-from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
+from gsx.engine.processes import processes
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose, quoted
 from gsx.experiments.runs.export import export, refuse_export
@@ -82,7 +82,7 @@ class TrainedRun:
         """
         return self.run.scene
 
-    @yielding_cores()
+    @relieve_oversubscription()
     def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
         """The model seen by a camera, or by a view or the camera of the view of that name; colours in [0, 1].
 
@@ -146,7 +146,7 @@ class SplatFile:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
 
-    @yielding_cores()
+    @relieve_oversubscription()
     def render(
         self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
     ) -> Float[Tensor, "3 H W"]:

@@ -9,12 +9,12 @@ import pytest
 from regenerating import of_role
 from torch import Tensor
 
+from gsx.augmenters import checked_regenerator
+from gsx.augmenters.checked_regenerator import displacement
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.quality.metrics import psnr
-from gsx.core.training import checked_regenerator
-from gsx.core.training.checked_regenerator import displacement
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.core.training.render import render
 from gsx.core.training.run import Run

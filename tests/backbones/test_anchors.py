@@ -25,7 +25,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, touches
 from gsx.core.training.backbone import Backbone, BackboneContext, remove_nonfinite
 from gsx.core.training.parameter_table import gradients, size_of, table_tensors, zero_grad
-from gsx.core.training.resolution import Resolution
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.settings import Settings
 
@@ -54,7 +54,7 @@ def small_anchors(
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
-        resolution=Resolution(scene=scene or small_scene(spread(60))),
+        resolution=TrainingViews(scene=scene or small_scene(spread(60))),
     )
     return chosen.component.factory(chosen.options, context)
 

@@ -21,20 +21,20 @@ from gsx.backbones.capacity import Budget, BudgetOptions, Growing, with_rows, wo
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.movement import motion_blurred
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
-from gsx.core.training.bilateral_grid import RANK, through_grid
-from gsx.core.training.blur import Blur
 from gsx.core.training.distributed import Ranks
-from gsx.core.training.evidence import Removal
-from gsx.core.training.exposure import Exposures
+from gsx.core.training.importance import Removal
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
+from gsx.modules.bilateral_grid import RANK, through_grid
+from gsx.modules.blur import Blur
+from gsx.modules.exposure import Exposures
+from gsx.modules.movement import motion_blurred
 
 PUBLISHED = Growing(500, 15000, 100)
 """3D-GS: steps 600, 700, ... 14900."""
@@ -401,7 +401,7 @@ def test_all_that_judges_by_photographs_takes_them_for_what_they_are(monkeypatch
     model.densify_and_prune(3000)
     with pytest.raises(Found):
         model.judge_degrees(3000)
-    assert seen == [model.context.resolution.compared] * 2
+    assert seen == [model.context.views.match_photo] * 2
 
 
 class Found(Exception):
@@ -432,7 +432,7 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
 
 def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an error, a share of it would be a price that nothing is below."""
-    monkeypatch.setattr("gsx.core.training.evidence.difference", lambda image, *_: torch.zeros_like(image))
+    monkeypatch.setattr("gsx.core.training.importance.difference", lambda image, *_: torch.zeros_like(image))
     scene, model = half_of_it_faint()
     assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())

@@ -21,6 +21,7 @@ from gsx.backbones.clone_split import (
     small_children,
     starting_points,
 )
+from gsx.backbones.density import within_room
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import everything, extents
 from gsx.backbones.levels import Levels, initial_nodes, kept
@@ -32,9 +33,8 @@ from gsx.core.errors import ConfigError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
-from gsx.core.training.density import within_room
 from gsx.core.training.parameter_table import size_of
-from gsx.core.training.resolution import Resolution
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.settings import read_config, write_config
 from gsx.formats.ply import read_ply
@@ -69,7 +69,7 @@ def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
-        resolution=Resolution(scene=scene or deep_scene()),
+        resolution=TrainingViews(scene=scene or deep_scene()),
     )
     backbone = free_gaussians(options, context)
     visibility = visibility_of(backbone)

@@ -16,7 +16,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
-from gsx.core.training.resolution import Resolution
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import in_units, warned_of_units
 from gsx.experiments.runs.scene_extent import measured
@@ -48,7 +48,7 @@ def built(name: str, scene: Scene, iterations: int = 30) -> Backbone:
         device=torch.device("cpu"),
         raster=settings.raster,
         generator=torch.Generator().manual_seed(0),
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
     )
     return settings.backbone.component.factory(settings.backbone.options, context)
 

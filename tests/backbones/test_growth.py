@@ -14,6 +14,7 @@ from torch.nn import Parameter
 
 from gsx.backbones import growth
 from gsx.backbones.decoding import Explicit, Neural
+from gsx.backbones.density import room_under
 from gsx.backbones.growth import (
     clamp_scales,
     eligible,
@@ -27,7 +28,6 @@ from gsx.backbones.growth import (
 )
 from gsx.backbones.growth_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
-from gsx.core.training.density import room_under
 from gsx.core.training.parameter_table import ParameterTable
 
 PUBLISHED = GrowthOptions(

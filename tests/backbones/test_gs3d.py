@@ -8,6 +8,7 @@ import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
+from gsx.backbones.density import mean_gradient
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import children
 from gsx.core.data.camera import Camera
@@ -15,7 +16,6 @@ from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, ScreenStatistics, rasterize
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.density import mean_gradient
 from gsx.core.training.parameter_table import gradients, restored_table, size_of, table_tensors, zero_grad
 
 NAMES = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from gsx.backbones import mip
+from gsx.backbones.density import mean_absolute, mean_gradient, zero_statistics
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.gs3d_parts import candidates
 from gsx.backbones.mip import MATCHED, MipOptions, earned_size, filter_sizes, several_views
@@ -31,7 +32,6 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled
-from gsx.core.training.density import mean_absolute, mean_gradient, zero_statistics
 from gsx.core.training.parameter_table import gradients, restored_table, table_tensors
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
@@ -355,7 +355,7 @@ def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
 
 
 def cameras_of(backbone: GS3D) -> list[Camera]:
-    return backbone.filter.context.resolution.rendered_cameras(1)
+    return backbone.filter.context.views.rendered_cameras(1)
 
 
 def drawn_opacities(backbone: GS3D) -> Tensor:

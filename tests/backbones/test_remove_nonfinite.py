@@ -21,9 +21,9 @@ from gsx.core.rasterizer import RasterSettings, rasterize, touches
 from gsx.core.training.backbone import remove_nonfinite
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import named_parameters, table_tensors
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import backward, train_step
+from gsx.core.training.training_views import TrainingViews
 
 NEURAL = ("scaffold", "octree_scaffold")
 WITH_QUATS = ("gs3d", "mip_splatting", "octree_gs3d", "octree_gs3d, clone_split")
@@ -45,7 +45,7 @@ def run_of(name: str, folder: Path) -> Run:
         iterations=30,
         device=torch.device("cpu"),
         generator=torch.Generator().manual_seed(0),
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
 

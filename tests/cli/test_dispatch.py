@@ -21,9 +21,9 @@ from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
 from gsx.cli.dispatch import VERBS, main
-from gsx.core.compiling import available
 from gsx.core.data.images import write_image
 from gsx.core.rasterizer import RasterSettings
+from gsx.engine.compiling import available
 
 GSX = [sys.executable, "-m", "gsx"]
 FEW = ("scene.points=100", "scene.train_views=3")
@@ -95,9 +95,9 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
         return False  # drawn eagerly after all: this test is not about compiling
 
     monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
-    monkeypatch.setattr("gsx.core.rasterizer.compiled.takes", lambda settings, **rest: settings.path == "compiled")
+    monkeypatch.setattr("gsx.engine.compiled.takes", lambda settings, **rest: settings.path == "compiled")
     monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.compiles", lambda settings, device: False)
-    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda device: False)
+    monkeypatch.setattr("gsx.engine.path.available", lambda device: False)
 
     def evaluated(*overrides: str) -> tuple[str, set[str], str]:
         asked.clear()

@@ -5,12 +5,12 @@ from typing import Annotated, Any
 
 import pytest
 
+from gsx.augmenters.checked_regenerator import Checks
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
 from gsx.core.ranges import Range, Share, beyond_range, without_range
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.checked_regenerator import Checks
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions

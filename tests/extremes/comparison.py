@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from extremes.cases import Case
-from gsx.core.compiling import available
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.rasterizer.reference import alpha_maps, frame_pixels, render_reference, whole
+from gsx.engine.compiling import available
 
 FLOAT64_TOLERANCE = 1e-12
 """Relative distance to a threshold within which float64 may decide either way."""

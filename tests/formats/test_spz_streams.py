@@ -13,8 +13,8 @@ import torch
 import zstandard
 from test_compact_files import many, the_splat
 
+from gsx.backbones.merging import covariances
 from gsx.core.errors import InputError
-from gsx.core.gaussians.merging import covariances
 from gsx.core.gaussians.sh import harmonics
 from gsx.core.gaussians.turned import spread_directions
 from gsx.formats import zstd

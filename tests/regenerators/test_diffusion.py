@@ -19,13 +19,13 @@ from small_scene import small_scene, spread
 from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import displacement
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, TrainingError
-from gsx.core.training.checked_regenerator import displacement
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.experiments.runs.compose import compose

@@ -8,12 +8,12 @@ import torch
 from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import strayed, unusable
 from gsx.core.data.reduction import Reduction, box_average, projected
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.device import multiplies_bfloat16
 from gsx.core.errors import ConfigError
-from gsx.core.training.checked_regenerator import strayed, unusable
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext
 from gsx.regenerators import scene_sr
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs

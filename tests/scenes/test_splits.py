@@ -7,8 +7,8 @@ import torch
 from torch.nn import functional
 
 from gsx.core.data.images import write_image
-from gsx.core.data.movement import motion_blurred
 from gsx.core.errors import ConfigError, InputError
+from gsx.modules.movement import motion_blurred
 from gsx.scenes.splits import check_rule, split_names
 
 NAMES = [f"{i:02d}.jpg" for i in range(17)]

@@ -7,7 +7,7 @@ import torch
 from torch.nn import Parameter
 from torch.nn.functional import logsigmoid
 
-from gsx.core.gaussians.neighbours import mean_square_distance
+from gsx.backbones.neighbours import mean_square_distance
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.ranges import Interval, Range, Rate

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Any
 
+from gsx.augmenters.regenerator_context import regenerator_context
 from gsx.core.data.resize import to_uint8
 from gsx.core.ranges import Share, Weight
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.pseudo_views import PseudoView, Term
 from gsx.core.training.regenerator import Request
-from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.run import Run
 
 

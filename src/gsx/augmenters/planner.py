@@ -68,7 +68,7 @@ class Planner:
 
     def spec(self, run: Run, event: int, parent: int, scale: int, variant: int) -> PseudoViewSpec:
         """One camera; variant 0 is the training camera's own."""
-        options, own = self.options, run.photographed[parent].camera
+        options, own = self.options, run.train_views[parent].camera
         generator = torch.Generator().manual_seed(derived_seed(self.seed, self.name, event, parent, scale, variant))
         zoom = scale if options.zoom == "intrinsics" else 1
         size = window_size(own.width, own.height, options.narrow, zoom)
@@ -107,7 +107,7 @@ class Planner:
         generator: torch.Generator,
     ) -> tuple[Camera, Window]:
         """(camera, window) of a pseudo view; of those drawn at random the first that shows enough of the scene."""
-        own, options = run.photographed[parent].camera, self.options
+        own, options = run.train_views[parent].camera, self.options
         checked = options.least_alpha > 0 and (variant > 0 or (options.window == "random" and size != own.size))
         for _ in range(MOST_TRIES if checked else 1):
             pose = own if variant == 0 else self.beside(own, scale, generator)
@@ -149,7 +149,7 @@ class Planner:
             each, place = (1, 0) if variant == 0 else (self.options.variants, variant - 1)
             return grid_window(width, height, size, self.events.index(event) * each + place + parent)
         if kind == "error":
-            view = run.photographed[parent]
+            view = run.train_views[parent]
             error = blacked(render(run, pose).image - view.image(), view.counted())
             return worst_window(error.abs().mean(0), size)
         return centred_window(width, height, size)

@@ -12,13 +12,13 @@ from gsx.augmenters.cameras import window_size
 from gsx.augmenters.planner import Planner
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.augmenters.redraw import Redrawer
+from gsx.augmenters.regenerator_context import regenerator_context
 from gsx.augmenters.store import Store
 from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term
-from gsx.core.training.regenerator_context import regenerator_context
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
 
@@ -94,12 +94,12 @@ class PseudoDetails:
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event = {}, 0
-            run.resolution.closer.pop(self.context.name, None)
+            run.views.closer.pop(self.context.name, None)
             return None
         if event != self.event:
             made = self.of_event(run, event, view)
             self.views, self.event = by_parent(made), event
-            run.resolution.closer[self.context.name] = made
+            run.views.closer[self.context.name] = made
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
         return self.weighted(run, self.views.get(view, []), place, inside)

@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from gsx.augmenters.cameras import KEPT, NOISES, WINDOWS
+from gsx.augmenters.checked_regenerator import Checks
 from gsx.augmenters.pixel_weights import WeightMap, sampled_better, splatsure
 from gsx.augmenters.timing import SPLITS, Timing, events_of
 from gsx.core.ranges import Range, Seed, Share, Steps, Weight
-from gsx.core.training.checked_regenerator import Checks
 from gsx.core.training.schedule import Schedule
 
 ZOOMS = ("intrinsics", "none")

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import CheckedRegenerator
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.pixel_weights import agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
@@ -23,7 +24,6 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.checked_regenerator import CheckedRegenerator
 from gsx.core.training.pseudo_views import PseudoView, picture_name
 from gsx.core.training.regenerator import Request
 from gsx.core.training.render import render, splats_for
@@ -74,7 +74,7 @@ class Redrawer:
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """What the regenerator is asked for."""
         run.refuse_if_stopping()
-        view = run.photographed[spec.parent]
+        view = run.train_views[spec.parent]
         image = render(run, spec.seen).image if spec.outer is None else photographed(run, view, spec.outer, spec.seen)
         return Request(
             image=image,
@@ -131,7 +131,7 @@ class Redrawer:
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
         """The training camera at a fraction of its size, without what fills no block at the right and below."""
         run.refuse_if_stopping()
-        view = run.photographed[parent]
+        view = run.train_views[parent]
         width, height = view.camera.size
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
@@ -161,7 +161,7 @@ class Redrawer:
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
-            photographs = [view.camera for view in run.photographed]
+            photographs = [view.camera for view in run.train_views]
             drawn = partial(splats_for, run)
             pixel_weight = pixel_weight * weights(drawn, spec.camera, photographs, spec.parent, run.raster).cpu()
         if options.gate > 0 and request.photo and spec.scale > 1:

@@ -19,15 +19,15 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import Growing, Undone, error_exponent, with_rows, worth_in_training
+from gsx.backbones.density import room_under
+from gsx.backbones.empty_space import in_empty_space
 from gsx.backbones.sky import not_sky
-from gsx.core.data.empty_space import in_empty_space
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.core.training.density import room_under
-from gsx.core.training.evidence import window_errors
+from gsx.core.training.importance import window_errors
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
@@ -115,7 +115,7 @@ class Adaptive:
 
     def windows(self, step: int) -> dict[View, Window]:
         """The windows that count in no loss at a step: those of the interval between events that it belongs to."""
-        views, interval = self.context.resolution.views(step), (step - 1) // self.growing.every
+        views, interval = self.context.views.at(step), (step - 1) // self.growing.every
         return validation_windows(views, self.options.views, self.options.window, "withheld", interval)
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
@@ -161,8 +161,8 @@ class Adaptive:
     ) -> tuple[float, float]:
         """(dB by which validation windows are better drawn with one table than with another, its standard error)."""
         windows = self.windows(step)
-        resolution, floor = self.context.resolution, rounding_in(windows)
-        form, compared = resolution.forming(step), resolution.compared
+        views, floor = self.context.views, rounding_in(windows)
+        form, compared = views.raster_for(step), views.match_photo
 
         def look() -> tuple[float, float]:
             both = (
@@ -170,7 +170,7 @@ class Adaptive:
             )
             return decibels(*(errors.cpu() + floor for errors in both))
 
-        return self.context.found_by_first(look)
+        return self.context.on_rank0(look)
 
     def without_idle_levels(self, model: Backbone[Any], step: int) -> dict[str, float]:
         """Remove the finest levels of detail while they gain less than the price; tell what all of them gain.

@@ -20,21 +20,21 @@ from gsx.backbones.capacity import Growing, growing_of, mark_newborn, without_ne
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
+from gsx.backbones.density import densification_statistics
 from gsx.backbones.growth import clamp_scales, eligible, fresh_statistics, observe, prune, reset_offsets
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import filter_named
+from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
-from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import Rendering, goes_compiled, touches
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
-from gsx.core.training.density import densification_statistics
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
 
 
@@ -87,10 +87,10 @@ class Anchors:
     ) -> None:
         scene, points = context.scene, context.points()
         self.options, self.representation, self.sh = options, representation, sh
-        self.network_rates, self.extent, self.resolution = network_rates, scene.extent, context.resolution
+        self.network_rates, self.extent, self.views = network_rates, scene.extent, context.views
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
-        self.views = {camera: number for number, camera in enumerate(self.cameras)}
+        self.numbers = {camera: number for number, camera in enumerate(self.cameras)}
         self.schedule = context.schedule(options.published_iterations)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.growing().stop)
         self.raster = self.filter.rules(context.raster)
@@ -124,10 +124,9 @@ class Anchors:
     def photograph_of(self, camera: Camera, step: int) -> int:
         """Which training view a camera is: as the scene has it, or as the step does, coarser or of a corrected pose;
         -1: none."""
-        if camera in self.views:
-            return self.views[camera]
-        resolution = self.resolution
-        seen = (resolution.poses.views(resolution.scene.train), resolution.views(step))
+        if camera in self.numbers:
+            return self.numbers[camera]
+        seen = (self.views.full_size, self.views.at(step))
         numbered = (pair for views in seen for pair in enumerate(views))
         return next((number for number, view in numbered if view.camera is camera), -1)
 

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.backbones.density import room_under
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import CAUTION, Backbone, BackboneContext
-from gsx.core.training.density import room_under
-from gsx.core.training.evidence import Removal, some_of, worth_of_rows
+from gsx.core.training.importance import Removal, some_of, worth_of_rows
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
 from gsx.core.training.schedule import Schedule
 
@@ -203,14 +203,14 @@ def error_exponent(price: float) -> float:
 
 def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int, looks: int = LOOKS) -> Removal:
     """What training views, at most so many of them, lose without each row."""
-    views = some_of(context.resolution.views(step), looks, context.generator)
-    background, form = context.scene.background.to(context.device), context.resolution.forming(step)
+    views = some_of(context.views.at(step), looks, context.generator)
+    background, form = context.scene.background.to(context.device), context.views.raster_for(step)
 
     def look() -> Removal:
-        compared = context.resolution.compared
+        compared = context.views.match_photo
         return worth_of_rows(model, views, form, background, step, context.generator, compared).to("cpu")
 
-    return context.found_by_first(look).to(context.device)
+    return context.on_rank0(look).to(context.device)
 
 
 def mark_newborn(table: ParameterTable, old: int) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsx.backbones.capacity import mark_newborn, without_newborn
 from gsx.backbones.cells import pooled_max
+from gsx.backbones.density import mean_gradient, withheld, within_room
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.growth_options import Quirks
 from gsx.backbones.gs3d_parts import Shown
@@ -26,7 +27,6 @@ from gsx.core.ranges import Range, Share, Weight
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.density import mean_gradient, withheld, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 
 logger = logging.getLogger(__name__)

@@ -7,13 +7,13 @@ import torch
 from torch.nn.functional import logsigmoid
 
 from gsx.backbones.capacity import Capacity, growing_of
+from gsx.backbones.density import zero_statistics
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
 from gsx.backbones.mip import Filter
 from gsx.backbones.sky import not_sky
 from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.core.training.density import zero_statistics
 from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column
 from gsx.core.training.schedule import Schedule
 

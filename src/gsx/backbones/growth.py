@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
+from gsx.backbones.density import mean_of, within_room
 from gsx.backbones.growth_options import GrowthOptions, Quirks
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.density import mean_of, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, keep_rows
 
 LARGEST_CELL = 2.0**53
@@ -47,7 +47,7 @@ def observe(
 
     `gradients` are 0 for Gaussians without a radius, as is `seen`, elsewhere the weight; `opacities` are summed over an
     anchor's offsets. All but gradients, which carry it already, are counted by the picture's weight in the step's loss
-    (see `core.training.density`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
+    (see `backbones.density`): what is judged in steps sums up to steps, whatever the batch and the augmenters.
     """
     table["opacity_sum"][rows] += weight * opacities.sum(1)
     table["visits"][rows] += weight

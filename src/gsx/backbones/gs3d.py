@@ -11,11 +11,14 @@ from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import LOOKS, growing_of
 from gsx.backbones.capacity_options import capacity_of
+from gsx.backbones.colour_fits import colour_fits
+from gsx.backbones.density import add_statistics, densification_statistics, gradient_statistics
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
+from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
@@ -23,7 +26,6 @@ from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.sky import far_away
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
-from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
@@ -31,9 +33,7 @@ from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
-from gsx.core.training.colour_fits import colour_fits
-from gsx.core.training.density import add_statistics, densification_statistics, gradient_statistics
-from gsx.core.training.evidence import some_of
+from gsx.core.training.importance import some_of
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
 from gsx.formats.splat_files import columns_of
@@ -220,15 +220,15 @@ class GS3D:
         if not highest:
             return {}
         other = sum(value[0].numel() for name, value in self.table.parameters.items() if not name.startswith("sh_"))
-        views = some_of(context.resolution.views(step), LOOKS, context.generator)
+        views = some_of(context.views.at(step), LOOKS, context.generator)
 
         def look() -> Judged:
-            form, background = context.resolution.forming(step), context.scene.background.to(context.device)
-            compared = context.resolution.compared
+            form, background = context.views.raster_for(step), context.scene.background.to(context.device)
+            compared = context.views.match_photo
             fits = colour_fits(self, views, form, background, step, context.generator, highest - 1, compared)
             return judged(fits, price, numbers_of(highest, other)).to("cpu")
 
-        return lower_degrees(self.table, context.found_by_first(look).to(context.device), step, price)
+        return lower_degrees(self.table, context.on_rank0(look).to(context.device), step, price)
 
     def means_rate_steps(self) -> int:
         """Step at which the learning rate of the means has come down."""

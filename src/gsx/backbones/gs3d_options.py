@@ -6,7 +6,7 @@ from typing import Annotated
 from gsx.backbones.capacity_options import CapacityOptions
 from gsx.backbones.mip import MipOptions, checked_filter
 from gsx.core.ranges import Gradient, Interval, Range, Rate, Share, Steps
-from gsx.core.training.occasions import WHEN
+from gsx.modules.occasions import WHEN
 
 
 @dataclass(frozen=True, kw_only=True)

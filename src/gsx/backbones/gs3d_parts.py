@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from gsx.backbones.density import mean_absolute, mean_gradient, withheld, within_room
 from gsx.backbones.gs3d_options import Density
 from gsx.backbones.mip import Filter
 from gsx.backbones.sampling import quantile, sampled_means
@@ -16,7 +17,6 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.density import mean_absolute, mean_gradient, withheld, within_room
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
 
 if TYPE_CHECKING:

@@ -168,7 +168,7 @@ class MipFilter:
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
-        points, options, resolution = means.detach(), self.options, self.context.resolution
+        points, options, resolution = means.detach(), self.options, self.context.views
         cameras = resolution.rendered_cameras(step + 1)
         sizes = filter_sizes(points, cameras, options)
         if options.views > 1:
@@ -189,7 +189,7 @@ class MipFilter:
 
     def narrows(self, step: int) -> bool:
         """Where renders become finer, and where pseudo views that count for it were made."""
-        resolution = self.context.resolution
+        resolution = self.context.views
         return resolution.changes_after(step) or (self.options.pseudo and bool(resolution.closer_after(step)))
 
     def smoothed(

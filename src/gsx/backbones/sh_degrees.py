@@ -2,7 +2,7 @@
 
 A Gaussian with colours of degree 3 is 59 numbers, 45 of them in three bands of which a matt surface needs none. Once,
 late in the run, the colours of every lower degree that come nearest to its own are found in training views; what these
-change by, squared and summed, is what the bands above are worth (`core.training.colour_fits`). Against it stands what
+change by, squared and summed, is what the bands above are worth (`backbones.colour_fits`). Against it stands what
 their numbers cost, by the price of a doubling of all numbers. The degree at which both together are least is kept.
 """
 
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import error_exponent
+from gsx.backbones.colour_fits import ColourFits, fitted, squared_change, take_coefficients
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.colour_fits import ColourFits, fitted, squared_change, take_coefficients
 from gsx.core.training.parameter_table import ParameterTable, edit
 
 logger = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.growth import nodes_of
-from gsx.core.gaussians.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
+from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.shapes import Float, Int
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_taken, whole
-from gsx.core.collector import loading
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
+from gsx.engine.collector import loading
 from gsx.formats.suffixes import META, READABLE, splat_file_at
 
 

@@ -15,7 +15,7 @@ from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, 
 from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
-from gsx.core.processes import processes
+from gsx.engine.processes import processes
 
 HELP = """\
 gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.train import verb_train
-from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import at_home
 from gsx.core.plugins import Plugins
+from gsx.engine.collector import loading
 
 logger = logging.getLogger("gsx.cli")
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, new_folder
-from gsx.core.collector import loading
 from gsx.core.errors import InputError, nearest
+from gsx.engine.collector import loading
 
 
 def verb_report(arguments: list[str]) -> int:

@@ -7,7 +7,7 @@ import select
 import sys
 
 from gsx.core.errors import GsxError
-from gsx.core.processes import say, speaks
+from gsx.engine.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from gsx.builtin import plugins
 from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
-from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Range
+from gsx.engine.collector import loading
 from gsx.experiments.runs.job import train
 from gsx.formats.axis_names import AUTO, CHOICES, SPECIFIED, TRAINED
 from gsx.formats.suffixes import READABLE, SPZ_VERSIONS, WRITTEN, splat_file_at, suffix_of

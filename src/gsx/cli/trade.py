@@ -18,9 +18,9 @@ from gsx.cli.arguments import (
     refuse_taken,
     whole,
 )
-from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.ranges import Range
+from gsx.engine.collector import loading
 from gsx.formats.suffixes import READABLE, splat_file_at
 
 logger = logging.getLogger("gsx.cli")

@@ -11,9 +11,9 @@ from typing import Any
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
 from gsx.cli.messages import complain, os_sentence, set_up_logging
-from gsx.core.collector import loading
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
-from gsx.core.processes import say, speaks
+from gsx.engine.collector import loading
+from gsx.engine.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
 
 logger = logging.getLogger("gsx.cli")

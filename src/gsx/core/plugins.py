@@ -18,7 +18,7 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
-    from gsx.core.training.run import Run, Step
+    from gsx.core.training.run import Run, StepResult
 
 GROUP = "gsx"
 """Entry-point group and pluggy project name."""
@@ -111,11 +111,11 @@ class Hooks:
         """The scene and backbone are built (and restored, when resuming); training is about to begin."""
 
     @hookspec(firstresult=True)
-    def gsx_gradients_ready(self, run: "Run", step: "Step") -> str | None:
+    def gsx_gradients_ready(self, run: "Run", step: "StepResult") -> str | None:
         """After the backward pass, before anything changes: return a reason to skip this step, else None."""
 
     @hookspec
-    def gsx_step_finished(self, run: "Run", step: "Step") -> None:
+    def gsx_step_finished(self, run: "Run", step: "StepResult") -> None:
         """One training step is done."""
 
     @hookspec

@@ -50,7 +50,7 @@ class SceneOptions:
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )
-    """What training photographs are made to suffer, for research (gsx.core.data.disturbed); 0: nothing."""
+    """What training photographs are made to suffer, for research (gsx.experiments.runs.degraded); 0: nothing."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)

@@ -10,9 +10,9 @@ from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.compiling import available
 from gsx.core.gaussians.bands import compiled_contraction
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
+from gsx.engine.compiling import available
 
 R3 = 1 / math.sqrt(3)
 HAND_WORKED = {

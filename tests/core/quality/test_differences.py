@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.quality.distractors import (
+from gsx.modules.captures import at_exposure, gains_between
+from gsx.modules.distractor_masks import (
     ALIKE,
     BLOCK,
     LEAST,
@@ -22,7 +23,6 @@ from gsx.core.quality.distractors import (
     with_their_colours,
     witnesses,
 )
-from gsx.core.training.captures import at_exposure, gains_between
 
 SIZE = 64, 48
 

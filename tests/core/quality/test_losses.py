@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from gsx.core.compiling import available
 from gsx.core.quality.losses import blur, moments_of, photometric, ssim_map
+from gsx.engine.compiling import available
 
 needs_compiler = pytest.mark.skipif(not available(), reason="no working compiler")
 OFFSET = np.arange(11) - 5

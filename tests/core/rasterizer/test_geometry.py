@@ -16,13 +16,13 @@ from raster_scenes import (
     truth_of,
 )
 
-from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.geometry import LEAST_SHARE, log_compensation
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
+from gsx.engine.compiling import available
 
 MIP = RasterSettings(cull="tight", dilation=0.1, compensate=True, unrolled=2)
 PATHS = ["eager", pytest.param("compiled", marks=pytest.mark.skipif(not available(), reason="no working compiler"))]

@@ -19,7 +19,6 @@ from raster_scenes import (
     truth_of,
 )
 
-from gsx.core.compiling import available
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.composite import composite, make_blocks, make_tables
@@ -27,6 +26,7 @@ from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import project
+from gsx.engine.compiling import available
 
 SEEDS = range(3)
 FORMS = ("squares", "direct", "expanded")

@@ -7,12 +7,12 @@ import pytest
 import torch
 from raster_scenes import changed, front_camera, random_splats
 
-from gsx.core.compiling import available
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, projection
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.selection import compiled_select, lens_of, select
+from gsx.engine.compiling import available
 
 RULES = [
     RasterSettings(),

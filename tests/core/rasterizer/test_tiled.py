@@ -11,9 +11,9 @@ from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize, rasterize_tiled, tiled
-from gsx.core.rasterizer.compiled import available
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.rasterizer.tiled import covering
+from gsx.engine.compiled import available
 
 
 @pytest.mark.parametrize("cull", ["published", "tight"])

@@ -7,11 +7,11 @@ import pytest
 import torch
 from raster_scenes import changed, errors_of, front_camera, random_splats, truth_of
 
-from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.projection import project
+from gsx.engine.compiling import available
 
 PATHS = ["eager", pytest.param("compiled", marks=pytest.mark.skipif(not available(), reason="no working compiler"))]
 PLAIN = RasterSettings(cull="tight", unrolled=2)

@@ -25,9 +25,9 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.guard import Agreement
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.build import placed, refuse_uneven
 
 COMMON = ("rasterizer=eager", "iterations=20", "training.batch=2", "training.checkpoint_every=8")
@@ -307,7 +307,7 @@ def test_ranks_that_disagree_are_stopped_where_checkpoints_are_due(tmp_path: Pat
         iterations=7,
         device=torch.device("cpu"),
         generator=torch.Generator(),
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
     step = train_step(run, load_plugins([], points=[]))

@@ -18,9 +18,9 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
-from gsx.core.training.resolution import Resolution
-from gsx.core.training.run import Run, Sampler, Step, TrainingOptions
+from gsx.core.training.run import Run, Sampler, StepResult, TrainingOptions
 from gsx.core.training.trainer import train, train_step
+from gsx.core.training.training_views import TrainingViews
 
 
 class Poisoned(GS3D):
@@ -60,7 +60,7 @@ def run_with(poison: dict[int, str], folder: Path, iterations: int = 8, points: 
         iterations=iterations,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
 
@@ -69,10 +69,10 @@ class Diary:
     """Listener: keeps every step."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
+        self.steps: list[StepResult] = []
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         self.steps.append(step)
 
 

@@ -12,12 +12,12 @@ from tiny import stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
+from gsx.backbones.density import mean_gradient
 from gsx.builtin import plugins
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, rasterize
-from gsx.core.training.density import mean_gradient
 from gsx.core.training.parameter_table import (
     gradients,
     named_parameters,

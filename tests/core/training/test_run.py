@@ -7,9 +7,9 @@ import pytest
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from gsx.core.kept_code import counted
 from gsx.core.training import trainer
 from gsx.core.training.run import Run, Sampler
+from gsx.engine.compile_cache import counted
 from gsx.experiments.runs.open import start
 
 

@@ -20,10 +20,9 @@ from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.plugins import hookimpl
 from gsx.core.quality.metrics import psnr
-from gsx.core.training import evidence
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.experiments.compact import compact as compacting
 from gsx.experiments.compact.compact import File, compact
 from gsx.experiments.compact.reduction import Reduction
@@ -95,7 +94,7 @@ def shrinking(prepared: Shrinking) -> Shrinking:
 @pytest.fixture
 def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
     """The share that goes is found to a quarter; what rows are worth by fewer signs."""
-    monkeypatch.setattr(evidence, "DRAWS", 6)
+    monkeypatch.setattr(importance, "DRAWS", 6)
     monkeypatch.setattr(compacting, "ShrinkOptions", partial(ShrinkOptions, tries=2))
 
 
@@ -107,7 +106,7 @@ def add_faint(run: Run) -> Tensor:
 
 
 def test_what_cannot_be_seen_is_worth_least(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evidence, "DRAWS", 6)
+    monkeypatch.setattr(importance, "DRAWS", 6)
     run = opened(folder)
     faint = add_faint(run)
     worth = worth_of(run, run.scene.train, generator())
@@ -189,16 +188,16 @@ def test_it_learns_on_from_the_views_that_are_not_judged_by(folder: Path) -> Non
 
     class Watching:
         @hookimpl
-        def gsx_gradients_ready(self, run: Run, step: Step) -> None:
+        def gsx_gradients_ready(self, run: Run, step: StepResult) -> None:
             seen.append(step.view.name)
 
     learnt, judged = judges(run)
-    loaded, resolution = plugins(), run.resolution
+    loaded, resolution = plugins(), run.views
     with loaded.listening([Watching()]):
         learn_on(run, learnt, 1, 2 * len(learnt), loaded)
     assert sorted(set(seen)) == sorted(view.name for view in learnt)
     assert not set(seen) & {view.name for view in judged}
-    assert run.resolution is resolution
+    assert run.views is resolution
 
 
 def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrinking) -> None:
@@ -213,7 +212,7 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrin
 
 def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
     run = opened(folder)
-    run.exposures.begin(torch.eye(3, 4).repeat(len(run.photographed), 1, 1))
+    run.exposures.begin(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
     tried = Shrinking(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
     drops = []
     for share in (0.25, 0.5, 0.25):
@@ -221,7 +220,7 @@ def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
         drops.append(tried.attempt(share, tried.untouched.degree, False).drop)
     assert drops[0] == drops[2]
     tried.take(tried.untouched)
-    assert torch.equal(run.exposures.tensors()["matrices"], torch.eye(3, 4).repeat(len(run.photographed), 1, 1))
+    assert torch.equal(run.exposures.tensors()["matrices"], torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
 
 
 def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,7 +386,7 @@ def test_an_error_leaves_no_folder(folder: Path, tmp_path: Path, monkeypatch: py
 
 
 def test_masked_pixels_make_no_row_worth_anything(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evidence, "DRAWS", 6)
+    monkeypatch.setattr(importance, "DRAWS", 6)
     run = opened(folder)
     assert float(worth_of(run, run.scene.train, generator()).max()) > 0
     monkeypatch.setattr(View, "counted", lambda view: torch.zeros(36, 48, dtype=torch.bool))

@@ -10,8 +10,8 @@ from torch.nn import Parameter
 from torch.nn.functional import logsigmoid
 
 from gsx.backbones.gs3d import GS3D
+from gsx.backbones.merging import surfaces
 from gsx.core.data.camera import Camera
-from gsx.core.gaussians.merging import surfaces
 from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.gaussians.smoothing import smoothed
 from gsx.core.quality.metrics import psnr

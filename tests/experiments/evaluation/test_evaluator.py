@@ -19,8 +19,8 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator, evenly
 from gsx.experiments.evaluation.lpips import LpipsOptions
 
@@ -96,7 +96,7 @@ def run_of(folder: Path, photograph: type[Grey] = Grey) -> Run:
         iterations=7,
         device=torch.device("cpu"),
         generator=torch.Generator(),
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
         sampler=Sampler(3, 0),
         step=7,
         seconds=3.0,

@@ -14,8 +14,6 @@ from torch.nn.functional import avg_pool2d
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.resize import to_uint8
-from gsx.core.quality.alignment import Motion, moved, rotation_by
-from gsx.core.quality.shifts import shift_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
@@ -24,6 +22,8 @@ from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.photographs import different, findings_of, lines
+from gsx.modules.alignment import Motion, moved, rotation_by
+from gsx.modules.shifts import shift_of
 
 PIXELS = 1 << 20
 

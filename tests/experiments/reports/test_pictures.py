@@ -23,8 +23,8 @@ from gsx.core.rasterizer import RasterSettings, Rendering, TiledRendering
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.render import render
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluator
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
@@ -124,7 +124,7 @@ def make_run(folder: Path, views: int = 3, finest: float = math.inf) -> Run:
         iterations=10,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=Resolution(scene=scene),
+        resolution=TrainingViews(scene=scene),
         sampler=Sampler(views, 0),
         step=10,
     )

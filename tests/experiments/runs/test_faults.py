@@ -22,12 +22,12 @@ from gsx.augmenters.redraw import Redrawer
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core import files
-from gsx.core.compiling import available
 from gsx.core.errors import CompilerError, TrainingError
 from gsx.core.files import remove_partial, replacing
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint, trainer
 from gsx.core.training.run import Run
+from gsx.engine.compiling import available
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs import execute as execution
 from gsx.experiments.runs import verified

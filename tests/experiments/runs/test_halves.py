@@ -20,9 +20,9 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
+from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import held_out_renders, without
 from gsx.experiments.runs.open import open_run
@@ -52,7 +52,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     grey = small_scene(spread(60), extent=4.0, views=views)
     scene = replace(grey, train=[replace(view, source=Told(n, seen)) for n, view in enumerate(grey.train)])
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: Resolution) -> Backbone:
+    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: TrainingViews) -> Backbone:
         return gs3d(
             published_options(),
             BackboneContext(
@@ -61,11 +61,11 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
                 device=torch.device("cpu"),
                 raster=RasterSettings(),
                 generator=generator,
-                resolution=resolution,
+                views=resolution,
             ),
         )
 
-    generator, resolution = torch.Generator().manual_seed(0), Resolution(scene=scene)
+    generator, resolution = torch.Generator().manual_seed(0), TrainingViews(scene=scene)
     run = Run(
         config={},
         folder=folder,
@@ -76,7 +76,7 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
         iterations=40,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=resolution,
+        views=resolution,
         sampler=Sampler(views, 0),
     )
     run.held_out = partial(held_out_renders, run, anew)
@@ -102,9 +102,9 @@ def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
     """What its backbone judges by knows the movements that its loss does."""
     run, _ = begun(tmp_path, steps=0)
     run.blur.movements = {"view1": (0.1, 0.0)}
-    asked = list[Resolution]()
+    asked = list[TrainingViews]()
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: Resolution) -> Backbone:
+    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: TrainingViews) -> Backbone:
         asked.append(resolution)
         return run.backbone
 

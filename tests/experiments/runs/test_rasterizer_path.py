@@ -19,11 +19,11 @@ from processes import Begin
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from gsx.core.compiling import available
 from gsx.core.data.scene import Scene
-from gsx.core.kept_code import FOLDER, Call, KeptFunction, file_of, recorded, recording
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.trainer import train_step
+from gsx.engine.compile_cache import FOLDER, Call, KeptFunction, file_of, recorded, recording
+from gsx.engine.compiling import available
 from gsx.experiments.runs import rasterizer_path
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import start
@@ -109,9 +109,9 @@ def files_of(calls: list[Call]) -> dict[str, Path]:
     ],
 )
 def test_no_step_needs_what_is_not_compiled_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str) -> None:
-    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
-    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
-    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+    monkeypatch.setattr("gsx.engine.path.available", lambda _: True)
+    monkeypatch.setattr("gsx.engine.compiled.available", lambda _: True)
+    monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / "functions")
     ahead = list[Call]()
     monkeypatch.setattr(rasterizer_path, "make_ahead", lambda calls, stopping: ahead.extend(calls))
     monkeypatch.setattr(rasterizer_path, "helper", lambda *_: nullcontext())
@@ -153,9 +153,9 @@ def test_the_helper_makes_from_the_other_end_what_no_backbone_changes_and_the_ot
 ) -> None:
     made, begun = [], list[Begun]()
     platform.processor()  # starts a process of its own the first time
-    monkeypatch.setattr("gsx.core.rasterizer.path.available", lambda _: True)
-    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: True)
-    monkeypatch.setattr("gsx.core.kept_code.place", lambda: tmp_path / "functions")
+    monkeypatch.setattr("gsx.engine.path.available", lambda _: True)
+    monkeypatch.setattr("gsx.engine.compiled.available", lambda _: True)
+    monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / "functions")
     monkeypatch.setattr(KeptFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
     monkeypatch.setattr("subprocess.Popen", lambda words, **_: begun.append(Begun(words, [])) or begun[-1])
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
@@ -304,7 +304,7 @@ def test_a_run_is_helped_from_before_its_scene_is_read_until_it_ends(
         return read(settings)
 
     monkeypatch.setattr("gsx.experiments.runs.open.load_scene", noted)
-    monkeypatch.setattr("gsx.core.rasterizer.compiled.available", lambda _: False)  # nor is anything compiled here
+    monkeypatch.setattr("gsx.engine.compiled.available", lambda _: False)  # nor is anything compiled here
     settings = tiny_settings(tmp_path / "run", "rasterizer=compiled")
     with ExitStack() as claims:
         start(settings, plugins(), claims)

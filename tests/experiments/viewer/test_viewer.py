@@ -181,10 +181,10 @@ def test_training_is_the_same_bits_with_somebody_looking(tmp_path: Path, monkeyp
     monkeypatch.setattr(training, "Viewer", Scripted)
     more = ["iterations=8", "rasterizer=eager", "training.test_points=2"]
     tiny_run(tmp_path / "alone", more)
-    tiny_run(tmp_path / "looked_at", [*more, "viewer=true", "viewer_share=1.0"])
+    tiny_run(tmp_path / "render_probe", [*more, "viewer=true", "viewer_share=1.0"])
     assert len(drawn) > 3
     assert drawn[-1] is None
-    expected, found = final_tensors(tmp_path / "alone"), final_tensors(tmp_path / "looked_at")
+    expected, found = final_tensors(tmp_path / "alone"), final_tensors(tmp_path / "render_probe")
     assert all(torch.equal(value, found[name]) for name, value in expected.items())
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import IN_VECTORS, WHOLE_LOOPS, compile_rows
 from gsx.core.shapes import Float
+from gsx.engine.compiling import IN_VECTORS, WHOLE_LOOPS, compile_rows
 
 BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
-from gsx.core.compiling import compiled_once, with_last
 from gsx.core.quality.similarity import (
     WINDOW,
     compiled_correlate,
@@ -21,6 +20,7 @@ from gsx.core.quality.similarity import (
     ssim_slopes,
 )
 from gsx.core.shapes import Float
+from gsx.engine.compiling import compiled_once, with_last
 
 PADDING = WINDOW // 2
 """With so many zeros around it the blurred picture has its size."""

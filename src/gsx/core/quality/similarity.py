@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from gsx.core.compiling import compile_rows, compiled_once, with_last
 from gsx.core.shapes import Float
+from gsx.engine.compiling import compile_rows, compiled_once, with_last
 
 WINDOW, SIGMA = 11, 1.5
 """SSIM window edge and standard deviation, px (Wang et al. 2004; 3D-GS, loss_utils.py)."""

@@ -4,12 +4,12 @@ import torch
 
 from gsx.core.rasterizer.batch import rasterize_batch
 from gsx.core.rasterizer.fixed_lists import FixedLists, ListSizes, Needed
-from gsx.core.rasterizer.path import goes_compiled
 from gsx.core.rasterizer.projection import checked_lens, dilations_of, drawable, repeat_rows, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize, rasterize_fixed
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import touches, undilated_radii
+from gsx.engine.path import goes_compiled
 
 __all__ = [
     "TILE_PIXELS",

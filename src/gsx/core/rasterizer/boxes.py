@@ -10,9 +10,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import IN_VECTORS, OWN_INDICES, ROWS_ALIKE, compile_rows, compiled_once, with_last
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
 from gsx.core.shapes import Float, Int
+from gsx.engine.compiling import IN_VECTORS, OWN_INDICES, ROWS_ALIKE, compile_rows, compiled_once, with_last
 
 FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import fused
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
@@ -19,11 +18,12 @@ from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
 from gsx.core.rasterizer.fixed_lists import FixedLists, owners
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.rasterizer.sorting import sorted_stably
 from gsx.core.shapes import Float, Int
+from gsx.engine.compiling import fused
+from gsx.engine.path import compiles
 
 WINDOW_REACH = 1.25
 """Px from its centre within which all light of a pixel lies where windows are kept: half a diagonal, and as much as a

@@ -9,17 +9,17 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import IN_VECTORS, compile_rows
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.bags import runs_added
 from gsx.core.rasterizer.geometry import geometry
-from gsx.core.rasterizer.path import compiles, goes_compiled
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
+from gsx.engine.compiling import IN_VECTORS, compile_rows
+from gsx.engine.path import compiles, goes_compiled
 
 FOCAL_LIMIT = 1e12
 """No camera has a focal length of so many px, or sees so many focal lengths off its axis."""

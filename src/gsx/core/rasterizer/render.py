@@ -8,15 +8,15 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
-from gsx.core.rasterizer.compiled import composite_compiled, takes
 from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
-from gsx.core.rasterizer.pixel_windows import composite_windows
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
+from gsx.engine.compiled import composite_compiled, takes
+from gsx.engine.pixel_windows import composite_windows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

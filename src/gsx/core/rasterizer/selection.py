@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsx.core.compiling import compile_rows
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
+from gsx.engine.compiling import compile_rows
 
 OPACITY_SLACK = 1e-3
 """ln of an opacity may exceed 0 by this, for rounding."""

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.shapes import Int
-from gsx.core.threads import GRAIN
+from gsx.engine.threads import GRAIN
 
 BY_DIGITS = GRAIN
 """Keys from which torch sorts by their digits on a CPU, in a fifth of the time that comparing them takes, as it does

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from gsx.augmenters.checked_regenerator import CheckedRegenerator
 from gsx.core.data.scene import Scene
-from gsx.core.training.checked_regenerator import CheckedRegenerator
 from gsx.core.training.run import Augmenter
 
 __all__ = ["Augmenter", "AugmenterContext", "Foretold", "Replacing"]

@@ -16,8 +16,8 @@ from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.schedule import Schedule
+from gsx.core.training.training_views import TrainingViews
 
 T = TypeVar("T")
 MOST_LOST, FEW = 0.01, 10
@@ -37,14 +37,14 @@ class BackboneContext:
     """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
-    resolution: Resolution
+    views: TrainingViews
     """How training views are seen and rendered at each step, and compared with renders."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     begins: bool = True
     """Whether the model starts from the scene; otherwise a checkpoint is to take the place of its table."""
 
-    def found_by_first(self, look: Callable[[], T]) -> T:
+    def on_rank0(self, look: Callable[[], T]) -> T:
         """What the first process finds, on all of them, so that all decide alike: renders of others may differ in a
         last bit. The generator goes on from there on all. Tensors are to be on the CPU."""
         found, state = self.ranks.broadcast(lambda: (look(), self.generator.get_state()))
@@ -124,7 +124,7 @@ class Backbone(Protocol[D]):
         """What density control learns from a render of what was drawn, after its backward pass.
 
         `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
-        photograph (`core.training.density`).
+        photograph (`backbones.density`).
         """
         ...
 

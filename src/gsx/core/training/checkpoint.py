@@ -15,13 +15,13 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, write_json
-from gsx.core.training.blur import Blur
-from gsx.core.training.distractors import Distractors
-from gsx.core.training.exposure import Exposures
 from gsx.core.training.parameter_table import restored_table, table_tensors
-from gsx.core.training.plateau import Plateau
-from gsx.core.training.poses import Poses
 from gsx.core.training.run import Run
+from gsx.modules.blur import Blur
+from gsx.modules.distractors import Distractors
+from gsx.modules.exposure import Exposures
+from gsx.modules.plateau import Plateau
+from gsx.modules.poses import Poses
 
 logger = logging.getLogger(__name__)
 

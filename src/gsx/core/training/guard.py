@@ -13,7 +13,7 @@ from gsx.core.errors import Disagreement, LostModel, TrainingError, command
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
 from gsx.core.training.recorded import loss_and_sums, told_of
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class Guard:
         self.in_a_row = 0
 
     @hookimpl
-    def gsx_gradients_ready(self, run: Run, step: Step) -> str | None:
+    def gsx_gradients_ready(self, run: Run, step: StepResult) -> str | None:
         """The reason to skip the step, if any.
 
         Raises:
@@ -48,7 +48,7 @@ class Guard:
         return reason
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """See that there is still a model.
 
         Raises:
@@ -61,7 +61,7 @@ class Guard:
             )
 
 
-def culprit(run: Run, step: Step) -> str | None:
+def culprit(run: Run, step: StepResult) -> str | None:
     """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
     found = gradients(run.backbone.table)
     loss, sums = step.told or told_of(loss_and_sums(step.loss, found).tolist(), found)
@@ -80,7 +80,7 @@ class Agreement:
     """Listener: at the steps of checkpoints all ranks must hold the same state."""
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Compare digests when due.
 
         Raises:

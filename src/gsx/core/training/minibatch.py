@@ -1,7 +1,7 @@
 """Several views in one step, on one process or on several: gradients, losses and observations become those of one.
 
 Every view's own loss is sent back, and the sums are divided in the end. An observation counts by its weight in the
-mean loss (`core.training.density`), so that published thresholds hold for any number of views.
+mean loss (`backbones.density`), so that published thresholds hold for any number of views.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 
-from gsx.core.training.checked_regenerator import added_accounts
+from gsx.augmenters.checked_regenerator import added_accounts
 from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 
 
 @contextmanager
-def taken_or_not(run: Run) -> Iterator[None]:
+def rollback_on_error(run: Run) -> Iterator[None]:
     """A step that fails has not been taken: a checkpoint written then begins with the same views and colours again."""
     colours = run.generator.get_state()
     try:
@@ -53,7 +53,7 @@ class Account:
     """What became of the pictures that its augmenters asked for."""
 
 
-def merge_gradients(run: Run, steps: Sequence[Step]) -> Step:
+def merge_gradients(run: Run, steps: Sequence[StepResult]) -> StepResult:
     """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
     own = Account(
         losses=[float(step.loss) for step in steps],

@@ -11,8 +11,8 @@ from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, TiledRendering, rasterize_tiled
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.finer_raster import finer_raster, times_as_fine
 from gsx.core.training.run import Run
-from gsx.core.training.supersampling import finer_raster, times_as_fine
 
 
 @torch.no_grad()
@@ -46,7 +46,7 @@ def render(
     `depth`: with that, as finely as it was rendered; where something stands behind the scene (`core.data.sky`), depth
     and alpha are those of the scene alone: what shines through a wall does not move it away.
     """
-    times = supersample or times_as_fine(camera, run.scene.train, run.resolution.supersample_at(run.model_step))
+    times = supersample or times_as_fine(camera, run.scene.train, run.views.supersample_at(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
     far = far_away(drawn.means, run.scene) if depth else None

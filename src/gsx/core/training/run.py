@@ -8,6 +8,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import Tally
 from gsx.core.data.scene import Scene, View
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
@@ -18,17 +19,16 @@ from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation, Settling
-from gsx.core.training.blur import Blur, BlurOptions
-from gsx.core.training.checked_regenerator import Tally
-from gsx.core.training.distractors import DistractorOptions, Distractors
 from gsx.core.training.distributed import Ranks
-from gsx.core.training.exposure import ExposureOptions, Exposures
 from gsx.core.training.photographs import Photographs
-from gsx.core.training.plateau import Plateau, PlateauOptions
-from gsx.core.training.poses import PoseOptions, Poses
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.recorded import Recorder, Told
-from gsx.core.training.resolution import Resolution
+from gsx.core.training.training_views import TrainingViews
+from gsx.modules.blur import Blur, BlurOptions
+from gsx.modules.distractors import DistractorOptions, Distractors
+from gsx.modules.exposure import ExposureOptions, Exposures
+from gsx.modules.plateau import Plateau, PlateauOptions
+from gsx.modules.poses import PoseOptions, Poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class TrainingOptions:
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
     supersample: Annotated[int, Range(1, 16)] = 1
     """Renders are so many times as fine as photographs, and are reduced as these were before they are compared
-    (`core.training.supersampling`); whoever looks at the model does the same. 1: published."""
+    (`core.training.finer_raster`); whoever looks at the model does the same. 1: published."""
     supersample_from: Share = 0.0
     """Share of the steps that are rendered at the photographs' resolution before that."""
 
@@ -76,10 +76,10 @@ class TrainingOptions:
         steps = self.cooldown * iterations
         return min(1.0, max(0.0, (iterations - step + 1) / steps)) if steps >= 1 else 1.0
 
-    def resolution(self, scene: Scene, iterations: int, device: torch.device) -> Resolution:
+    def resolution(self, scene: Scene, iterations: int, device: torch.device) -> TrainingViews:
         """Of the training views in a run of so many steps on a device."""
         names = [view.name for view in scene.train]
-        return Resolution(
+        return TrainingViews(
             scene=scene,
             coarse=self.coarse,
             coarse_until=round(self.coarse_until * iterations) if self.coarse > 1 else 0,
@@ -164,7 +164,7 @@ class Run:
     backbone: Backbone[Any]
     raster: RasterSettings
     training: TrainingOptions
-    resolution: Resolution
+    views: TrainingViews
     iterations: int
     device: torch.device
     generator: torch.Generator
@@ -206,27 +206,27 @@ class Run:
     @property
     def poses(self) -> Poses:
         """Of the training photographs."""
-        return self.resolution.poses
+        return self.views.poses
 
     @property
     def distractors(self) -> Distractors:
         """Of the training photographs."""
-        return self.resolution.distractors
+        return self.views.distractors
 
     @property
     def exposures(self) -> Exposures:
         """Of the training photographs."""
-        return self.resolution.exposures
+        return self.views.exposures
 
     @property
     def blur(self) -> Blur:
         """Of the training photographs."""
-        return self.resolution.blur
+        return self.views.blur
 
     @property
-    def photographed(self) -> Sequence[View]:
-        """The training views at their own resolution, by the poses of the moment, without distractors."""
-        return self.distractors.views(self.poses.views(self.scene.train))
+    def train_views(self) -> Sequence[View]:
+        """Training views at the photos' own resolution, with corrected poses and masks."""
+        return self.views.full_size
 
     @property
     def complete(self) -> bool:
@@ -235,7 +235,7 @@ class Run:
 
     def as_photographed(self, image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
         """A render as the photograph of a training view shows it, to be looked at."""
-        return self.resolution.as_photographed(image, view)
+        return self.views.as_photographed(image, view)
 
     def refuse_if_stopping(self) -> None:
         """To be called within long parts of a step that change nothing yet.
@@ -258,7 +258,7 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Step:
+class StepResult:
     """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first.
     Screen statistics of a recorded step last until the next step."""
 
@@ -274,7 +274,7 @@ class Step:
     """What density control learns from the renders of the batch, in its order."""
     dropped: int = 0
     """Splats that renders of training views left out because a value of theirs is not finite."""
-    others: Sequence["Step"] = ()
+    others: Sequence["StepResult"] = ()
     """This rank's other views, as steps of their own."""
     changes: dict[str, float] = field(default_factory=dict)
     """What density control did."""
@@ -302,8 +302,8 @@ def settled_after(run: Run) -> int:
         *run.poses.steps(),
         *run.blur.steps(),
         *run.distractors.steps(),
-        run.resolution.coarse_until,
-        run.resolution.finer_after,
+        run.views.coarse_until,
+        run.views.finer_after,
         *own,
     ]
     last = run.training.plateau.last_part(run.iterations)

@@ -15,26 +15,26 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
-from gsx.core.kept_code import waiting_counted
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
-from gsx.core.threads import yielding_cores
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
-from gsx.core.training.captures import judge_photographs
-from gsx.core.training.evidence import window_errors
-from gsx.core.training.minibatch import gradients_added, merge_gradients, taken_or_not
+from gsx.core.training.importance import window_errors
+from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.photographs import numbers_of
 from gsx.core.training.pseudo_views import PseudoView, Term, kept_out, pseudo_loss
 from gsx.core.training.recorded import ToLearn
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
+from gsx.engine.compile_cache import waiting_counted
+from gsx.engine.threads import relieve_oversubscription
+from gsx.modules.captures import judge_photographs
 
 logger = logging.getLogger(__name__)
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def train(run: Run, plugins: Plugins) -> None:
     """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
     plugins.emit.gsx_run_started(run=run)
@@ -53,12 +53,12 @@ def train(run: Run, plugins: Plugins) -> None:
     plugins.emit.gsx_training_finished(run=run)
 
 
-def train_step(run: Run, plugins: Plugins) -> Step:
+def train_step(run: Run, plugins: Plugins) -> StepResult:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
     judge_steps(run)
     told = run.plateau.told_at(run.step + 1)
     told |= judge_photographs(run)
-    with taken_or_not(run):
+    with rollback_on_error(run):
         step = backward(run)
         step.changes.update(told)
         reason = veto(run, step, plugins)
@@ -79,7 +79,7 @@ def train_step(run: Run, plugins: Plugins) -> Step:
 def judge_steps(run: Run) -> None:
     """Find whether the last steps have gained what steps are to gain, where that is due; if not, all up to the last
     part of the run are left out."""
-    plateau, done, views = run.plateau, run.step, run.resolution.views
+    plateau, done, views = run.plateau, run.step, run.views.at
     judged = plateau.windows(views(done), plateau.begun) if plateau.judged_after(done) else None
     begun = plateau.windows(views(done + 1), done) if plateau.begins_after(done) else None
     after, before = errors_in(run, judged or {}, done), errors_in(run, begun or {}, done + 1)  # then nothing can fail
@@ -96,7 +96,7 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     """Squared error in each validation window by the rules of a step, the same on all ranks."""
     if not windows:
         return torch.zeros(0, dtype=torch.float64)
-    model, form, compared = run.backbone, run.resolution.forming(step), run.resolution.compared
+    model, form, compared = run.backbone, run.views.raster_for(step), run.views.match_photo
 
     def look() -> Tensor:
         return window_errors(model, model.table, windows, form, run.background, run.model_step, compared).cpu()
@@ -104,7 +104,7 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     return run.ranks.broadcast(look)
 
 
-def veto(run: Run, step: Step, plugins: Plugins) -> str:
+def veto(run: Run, step: StepResult, plugins: Plugins) -> str:
     """A reason to skip the step, the same on all ranks: the first that has one gives it; empty: none."""
     removed = remove_lost(run, step) if step.dropped else ""
     reason = removed or plugins.emit.gsx_gradients_ready(run=run, step=step) or ""
@@ -112,9 +112,9 @@ def veto(run: Run, step: Step, plugins: Plugins) -> str:
     return reason if removed or not reason else "; ".join(filter(None, [reason, remove_lost(run, step)]))
 
 
-def remove_lost(run: Run, step: Step) -> str:
+def remove_lost(run: Run, step: StepResult) -> str:
     """Removes primitives that make no picture, the same on all ranks; a reason to skip the step if there were any."""
-    views = run.resolution.views(step.number)
+    views = run.views.at(step.number)
     cameras = [views[number].camera for number in run.sampler.taken]
     removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed:
@@ -125,14 +125,14 @@ def remove_lost(run: Run, step: Step) -> str:
     return f"removed {removed} primitives" if removed else ""
 
 
-def backward(run: Run) -> Step:
+def backward(run: Run) -> StepResult:
     """Render this rank's share of the next views and send their losses back; gradients are those of the mean loss."""
     number = run.step + 1
     batch = run.sampler.take()
     picked = run.ranks.share(batch)
     asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
-    views, steps = run.resolution.views(number), []
+    views, steps = run.views.at(number), []
     run.exposures.forget()
     run.photographs.see(views)
     for view, terms, colour in zip(picked, asked, colours, strict=True):
@@ -145,7 +145,7 @@ def backward(run: Run) -> Step:
     return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
 
 
-def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> Step:
+def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: Float[Tensor, "3"]) -> StepResult:
     """Render a view, and the pseudo views that go with it, and send the loss back.
 
     Pseudo views come first, and among them those that leave shared parameters alone: what these parameters have
@@ -165,7 +165,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = rendered(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
-    shown = run.resolution.compared(rendering.image, target, view, learning=True)
+    shown = run.views.match_photo(rendering.image, target, view, learning=True)
     moments = run.photographs.moments_of(view, target, compiled) if counted is None else None
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, moments)
     extra = run.backbone.regulariser(drawn)
@@ -181,7 +181,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     loss.backward()
     served = sum(weight for _, here in divided for _, weight in here)
     seen.append(observation(run, drawn, rendering, number, own + served))
-    return Step(
+    return StepResult(
         number=number,
         view=view,
         target=target,
@@ -201,10 +201,10 @@ def may_be_recorded(run: Run, number: int, view: View) -> bool:
         return False
     alone = run.training.batch == 1 and run.ranks.size == 1
     plain = run.exposures.matrices is None and view.name not in run.blur.movements
-    return alone and plain and run.resolution.supersample_at(number) == 1
+    return alone and plain and run.views.supersample_at(number) == 1
 
 
-def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> Step | None:
+def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> StepResult | None:
     """The step of a view, by recorded work; None where this one cannot be recorded.
 
     Raises:
@@ -217,7 +217,7 @@ def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"])
     )
     if learnt is None:
         return None
-    return Step(
+    return StepResult(
         number=number,
         view=view,
         target=numbers_of(photograph),
@@ -232,7 +232,7 @@ def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"])
 def withheld_windows(run: Run, view: View, number: int) -> list[Window]:
     """Windows of a view that are kept to judge by at a step: the backbone's own, and those that judge the steps."""
     withheld = [run.backbone.validation_window(view, number)] if isinstance(run.backbone, Validating) else []
-    withheld.append(run.plateau.window(run.resolution.views(number), view, number))
+    withheld.append(run.plateau.window(run.views.at(number), view, number))
     return [window for window in withheld if window is not None]
 
 
@@ -257,7 +257,7 @@ def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"
 def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
     """(what the backbone draws at this step, its render), to be learnt from; screen statistics are of the raster that
     was drawn, the picture is reduced from it (`training.supersample`)."""
-    raster, absolute = run.resolution.forming(number)(camera), run.backbone.absolute_gradient
+    raster, absolute = run.views.raster_for(number)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, number)
     rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
     image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))

@@ -10,7 +10,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
-from gsx.core.training.evidence import rounding_of
+from gsx.core.training.importance import rounding_of
 
 
 def validation_windows(

@@ -15,9 +15,9 @@ from gsx.core.errors import ConfigError, InputError, command, first_line
 from gsx.core.files import read_json, replace_file, write_json
 from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
-from gsx.core.threads import yielding_cores
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.compact.shrink import (
     Shrinking,
     ShrinkOptions,
@@ -58,7 +58,7 @@ NAME, COMPARED = "compact.json", "compared"
 """What was tried; folder of the page with the model before and after."""
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def compact(
     target: Path, to: Path, max_drop: float, steps: int | None, overrides: Sequence[str], plugins: Plugins
 ) -> Path:

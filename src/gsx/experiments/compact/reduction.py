@@ -1,7 +1,7 @@
 """In what order the rows of a model go: what pictures need least first, by itself or merged with a neighbour.
 
 Pictures lose what a row is worth where it goes. Where two become one they lose that share of what both are worth by
-which the field of both changes (`core.gaussians.merging`): little where they lie on each other and agree in colour,
+which the field of both changes (`backbones.merging`): little where they lie on each other and agree in colour,
 however much they are worth. Rows take part once in a round, of which none takes more than a quarter of what is left.
 A 3D filter is part of what is drawn: rows are merged with it, and it is taken off what they become.
 """
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.gaussians.merging import PARAMETERS, Rows, changes, densities, merged
-from gsx.core.gaussians.neighbours import nearest
+from gsx.backbones.merging import PARAMETERS, Rows, changes, densities, merged
+from gsx.backbones.neighbours import nearest
 from gsx.core.gaussians.smoothing import smoothed_raw, unsmoothed
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import (

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.backbones.colour_fits import colour_fits, fitted, take_coefficients
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
@@ -29,17 +30,16 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.colour_fits import colour_fits, fitted, take_coefficients
-from gsx.core.training.distractors import Distractors
-from gsx.core.training.evidence import ROUNDING, Forming, draws_of_each, looked_at, squared_changes
+from gsx.core.training.finer_raster import raster_at
 from gsx.core.training.guard import Guard
+from gsx.core.training.importance import ROUNDING, Forming, draws_of_each, render_probe, squared_changes
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
-from gsx.core.training.poses import Poses
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
-from gsx.core.training.supersampling import raster_at
 from gsx.core.training.trainer import train_step
 from gsx.experiments.compact.reduction import Reduction
+from gsx.modules.distractors import Distractors
+from gsx.modules.poses import Poses
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ class Try:
 
 def judges(run: Run) -> tuple[list[View], list[View]]:
     """(training views to learn from, training views to judge by), the latter spread over the order."""
-    views = run.photographed
+    views = run.train_views
     count = max(FEWEST, len(views) // ONE_IN)
     if len(views) <= count:
         return list(views), list(views)
@@ -144,7 +144,7 @@ def pictures_of(view: View) -> list[tuple[Camera, Bool[Tensor, "H W"] | None]]:
 
 def forming(run: Run) -> Forming:
     """How the run's pictures come about."""
-    return partial(raster_at, scene=run.scene, supersample=run.resolution.supersample_at(run.model_step))
+    return partial(raster_at, scene=run.scene, supersample=run.views.supersample_at(run.model_step))
 
 
 def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Float[Tensor, "N"]:
@@ -152,7 +152,7 @@ def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Flo
     worth, form = torch.zeros(len(run.backbone.table), device=run.device), forming(run)
     for view in views:
         for camera, counted in pictures_of(view):
-            drawn, seen = looked_at(run.backbone, camera, form, run.background, run.model_step)
+            drawn, seen = render_probe(run.backbone, camera, form, run.background, run.model_step)
             worth += squared_changes(drawn, seen, counted, len(worth), draws_of_each(views), generator)
     return worth
 
@@ -172,7 +172,7 @@ def colours_of_lower_degrees(
     highest, (model, step) = degree_of_run(run), (run.backbone, run.model_step)
     if highest < 1:
         return []
-    compared = run.resolution.compared
+    compared = run.views.match_photo
     fits = colour_fits(model, views, forming(run), run.background, step, generator, highest - 1, compared)
     return [fitted(fits, degree) for degree in range(highest)]
 
@@ -187,8 +187,8 @@ class Shrinking:
         self.run, self.options, self.plugins = run, options, plugins
         self.learnt, self.judging = judges(run)
         self.before = figures(run, self.judging, options.zooms)
-        self.worth = worth_of(run, run.photographed, generator)
-        self.colours = colours_of_lower_degrees(run, run.photographed, generator)
+        self.worth = worth_of(run, run.train_views, generator)
+        self.colours = colours_of_lower_degrees(run, run.train_views, generator)
         seen = seen_colours(run, self.colours)
         self.reductions = {
             way: Reduction(run.backbone.table, self.worth, seen if way else None) for way in (True, False)
@@ -319,7 +319,7 @@ class Shrinking:
         run = self.run
         self.cut(best.removed, best.degree, best.merging)
         if best.removed or best.degree < degree_of_run(run):
-            learn_on(run, run.photographed, best.degree, self.options.steps, self.plugins)
+            learn_on(run, run.train_views, best.degree, self.options.steps, self.plugins)
 
 
 def copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -356,7 +356,7 @@ def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
     before = {name: getattr(run, name) for name in names}
     run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
     run.iterations = run.step + steps
-    run.resolution = replace(run.resolution, scene=run.scene, coarse_views={}, poses=Poses(), distractors=Distractors())
+    run.views = replace(run.views, scene=run.scene, coarse_views={}, poses=Poses(), distractors=Distractors())
     run.training = replace(run.training, cooldown=steps / run.iterations)
     try:
         yield

@@ -22,20 +22,20 @@ from gsx.core.data.masks import blacked
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
-from gsx.core.quality.alignment import aligned
 from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 from gsx.core.ranges import Range
 from gsx.core.rasterizer import TiledRendering
-from gsx.core.rasterizer.compiled import path_of
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.exposure import best_matrix, transformed
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.engine.compiled import path_of
 from gsx.experiments.evaluation.detail import Details, details_of, explained
 from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered
 from gsx.experiments.run_folder.files import DETAIL_OF
+from gsx.modules.alignment import aligned
+from gsx.modules.exposure import best_matrix, transformed
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
 ALIGNED = 2
@@ -250,8 +250,8 @@ class Evaluator:
         """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
         renders is drawn as finely as it was trained."""
         times = self.options.supersample
-        if factor < 1 and not times and self.run.resolution.supersample_at(self.run.model_step) > 1:
-            times = math.ceil(self.run.resolution.supersample_at(self.run.model_step) / factor)
+        if factor < 1 and not times and self.run.views.supersample_at(self.run.model_step) > 1:
+            times = math.ceil(self.run.views.supersample_at(self.run.model_step) / factor)
         return render(self.run, self.drawn_from(view), self.options.tile_pixels, times)
 
     def view(self, view: View) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 
 from gsx.core.quality.sharpness import BLURRED
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.exposure import log_gains
+from gsx.modules.exposure import log_gains
 
 UNEVEN = 1 / 3
 """Stops from the middle from which on a photograph is named, and between its channels: the step of cameras' dials."""

@@ -4,9 +4,9 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from gsx.augmenters.checked_regenerator import added
 from gsx.core.plugins import hookimpl
-from gsx.core.training.checked_regenerator import added
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class CapNotice:
         self.said = any(line.get("withheld") for line in run.curves)
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Say it at the first step that adds fewer primitives than density control asks for."""
         count = step.changes.get("withheld", 0)
         if count and not self.said:

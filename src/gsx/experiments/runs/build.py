@@ -13,23 +13,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.allocator import keep_freed_memory
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
 from gsx.core.device import processor_kind
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
-from gsx.core.training.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.photographs import room_for_photographs
 from gsx.core.training.recorded import Recorder
 from gsx.core.training.regenerator import Regenerator
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.training_views import TrainingViews
+from gsx.engine.allocator import keep_freed_memory
+from gsx.engine.compiled import path_of
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
@@ -180,7 +180,7 @@ def build(
         backbone=backbone,
         raster=backbone.raster,
         training=settings.training,
-        resolution=own,
+        views=own,
         iterations=general.iterations,
         device=device,
         generator=generator,
@@ -210,7 +210,7 @@ def backbone_of(
     scene: Scene,
     iterations: int,
     generator: torch.Generator,
-    resolution: Resolution,
+    views: TrainingViews,
     ranks: Ranks = ALONE,
     begins: bool = True,
 ) -> Backbone:
@@ -221,7 +221,7 @@ def backbone_of(
         device=device,
         raster=raster,
         generator=generator,
-        resolution=resolution,
+        views=views,
         ranks=ranks,
         begins=begins,
     )

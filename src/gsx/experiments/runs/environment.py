@@ -17,9 +17,9 @@ from gsx.core.cache import source_revision
 from gsx.core.data.scene import View
 from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
-from gsx.core.rasterizer.compiled import path_of
 from gsx.core.training.backbone import CAUTION
 from gsx.core.training.run import Run
+from gsx.engine.compiled import path_of
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.build import plan_of
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
-from gsx.core.threads import yielding_cores
 from gsx.core.training.run import Run
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
 from gsx.experiments.reports.pictures import Pictures
@@ -21,7 +21,7 @@ from gsx.experiments.runs.settings import Settings
 logger = logging.getLogger(__name__)
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run."""
     options, begun = settings.evaluation, time.perf_counter()

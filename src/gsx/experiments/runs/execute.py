@@ -12,7 +12,7 @@ from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.guard import Agreement, Guard
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.core.training.trainer import train
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
@@ -33,7 +33,7 @@ class Checkpointer:
     """Listener: saves every `training.checkpoint_every` steps and when training ends, complete or not."""
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Save when due."""
         if run.step % run.training.checkpoint_every == 0 and not run.complete:
             checkpoint.save(run)
@@ -85,7 +85,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
             if run.complete:
                 finish(run, settings, plugins)
     except BaseException as error:
-        keep_what_there_is(run, error)
+        save_on_failure(run, error)
         raise
     finally:
         log.close()
@@ -135,7 +135,7 @@ def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
         shown.stop()
 
 
-def keep_what_there_is(run: Run, error: BaseException) -> None:
+def save_on_failure(run: Run, error: BaseException) -> None:
     """After an error: a checkpoint of the last step, where the model is that of a step, and a word on what happened.
 
     What cannot be written now is told in the log; the error itself is what matters.

@@ -19,10 +19,10 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE
 from gsx.core.shapes import Float
-from gsx.core.threads import yielding_cores
 from gsx.core.training.backbone import Bakeable, WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.coordinates import COMMENTED, log_coordinates, placement, refuse_too_far
@@ -56,7 +56,7 @@ class Exported:
     """They stand for a model that has others for every camera."""
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def export(
     run: Run, path: Path, camera: Camera | None = None, spz: SpzForm = SPZ_FORM, zoom: float = 0, local: bool = False
 ) -> Exported | None:
@@ -173,7 +173,7 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
 
 def supersampling_note(run: Run) -> list[str]:
     """How training saw the model, where that was through finer pixels."""
-    times = run.resolution.supersample_at(run.model_step)
+    times = run.views.supersample_at(run.model_step)
     filter_ = run.scene.reduction.filter
     return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
 
@@ -186,7 +186,7 @@ def render_mode(raster: RasterSettings) -> str:
     return "mip" if raster.compensate else "default"
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def losses(
     run: Run,
     settings: Settings,

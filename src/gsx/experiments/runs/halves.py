@@ -22,19 +22,19 @@ from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
-from gsx.core.training.blur import BlurOptions
-from gsx.core.training.distractors import DistractorOptions
 from gsx.core.training.guard import Guard
-from gsx.core.training.poses import PoseOptions
 from gsx.core.training.render import render
-from gsx.core.training.resolution import Resolution
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
+from gsx.core.training.training_views import TrainingViews
+from gsx.modules.blur import BlurOptions
+from gsx.modules.distractors import DistractorOptions
+from gsx.modules.poses import PoseOptions
 
 logger = logging.getLogger(__name__)
 
 HALVES = 2
-Anew: TypeAlias = Callable[[Scene, int, torch.Generator, Resolution], Backbone[Any]]
+Anew: TypeAlias = Callable[[Scene, int, torch.Generator, TrainingViews], Backbone[Any]]
 """(scene, steps, generator, how its views are seen) -> a backbone of the run's options at step 0."""
 
 
@@ -62,7 +62,7 @@ def held_out_renders(run: Run, anew: Anew, share: float, seed: int) -> list[Floa
 def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
     """The renders of both models."""
     logger.info("two models of half of the training views each are trained for %d steps", steps)
-    begun, views = time.perf_counter(), run.photographed
+    begun, views = time.perf_counter(), run.train_views
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
         model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
@@ -74,7 +74,7 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
 
 def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
-    views = [view for number, view in enumerate(run.photographed) if number % HALVES != half]
+    views = [view for number, view in enumerate(run.train_views) if number % HALVES != half]
     unasked = replace(run.training, poses=PoseOptions(), distractors=DistractorOptions(), blur=BlurOptions())
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
@@ -89,7 +89,7 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         backbone=backbone,
         raster=backbone.raster,
         training=unasked,
-        resolution=resolution,
+        views=resolution,
         iterations=steps,
         device=run.device,
         generator=generator,

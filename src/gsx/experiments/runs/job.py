@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from gsx.core.cache import in_use
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
-from gsx.core.processes import processes, say, speaks
-from gsx.core.signals import STOPPING, heeded
+from gsx.engine.processes import processes, say, speaks
+from gsx.engine.signals import STOPPING, handled_signals
 
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
@@ -74,7 +74,7 @@ def interruptible(run: "Run", onwards: str) -> Iterator[object]:
             give_back(*before)
 
     main = threading.current_thread() is threading.main_thread()
-    before = {int(number): signal.signal(number, stop) for number in (signal.SIGINT, *heeded()) if main}
+    before = {int(number): signal.signal(number, stop) for number in (signal.SIGINT, *handled_signals()) if main}
     try:
         yield UntilTrained()
     finally:

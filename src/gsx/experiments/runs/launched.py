@@ -14,7 +14,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from gsx.core.signals import heeded
+from gsx.engine.signals import handled_signals
 
 LAUNCHER = "GSX_LAUNCHER"
 """Environment variable: the process that waits for those of a launcher, which inherit it."""
@@ -50,7 +50,7 @@ def waiting_for_all(folder: Path) -> Iterator[None]:
             with suppress(ProcessLookupError):
                 os.kill(int(one.name), signal.SIGTERM)
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *heeded())}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *handled_signals())}
     forget(folder)
     os.environ[LAUNCHER] = str(os.getpid())
     try:
@@ -106,7 +106,7 @@ def ended_from_without(folder: Path) -> Iterator[None]:
         for number in heard:
             signal.signal(number, lambda number, frame: None)
 
-    heard, own = (signal.SIGINT, *heeded()), folder / WORKING / str(os.getpid())
+    heard, own = (signal.SIGINT, *handled_signals()), folder / WORKING / str(os.getpid())
     for number in heard:
         signal.signal(number, once)
     try:

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.disturbed import Disturbable, disturbed
 from gsx.core.data.filling import filled
 from gsx.core.data.scene import Fillable, InUnits, Scene, View
 from gsx.core.errors import ConfigError, InputError
@@ -15,6 +14,7 @@ from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
+from gsx.experiments.runs.degraded import Disturbable, disturbed
 from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin

@@ -9,7 +9,6 @@ from datetime import datetime
 from pathlib import Path
 
 from gsx.core.cache import source_revision
-from gsx.core.collector import collecting_nothing
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
 from gsx.core.files import keep_names, read_json, write_json
@@ -19,6 +18,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
+from gsx.engine.collector import gc_paused
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.run_folder.files import RunFiles, is_number, read_run
@@ -84,7 +84,7 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
     raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
-@collecting_nothing()
+@gc_paused()
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
 

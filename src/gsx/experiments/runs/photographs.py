@@ -16,11 +16,10 @@ from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.quality.sharpness import sharpness
-from gsx.core.quality.shifts import shift_of
 from gsx.core.shapes import Float
-from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
@@ -28,12 +27,13 @@ from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.rasterizer_path import warm
+from gsx.modules.shifts import shift_of
 
 FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
     """Findings on all training photographs of a run, worst first; its folder keeps them, with pictures of so many, and
     its report shows them.
@@ -56,7 +56,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Of every training photograph, worst first."""
-    views = different(run.photographed)
+    views = different(run.train_views)
     progress, known = Countdown("looking at photographs", len(views)), sharpness_of(run.scene.train)
     found = []
     for view in views:
@@ -107,7 +107,7 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
     place = Pictures(run.folder / FOLDER, run.step)
     place.folder.mkdir(parents=True, exist_ok=True)
     forget(place.folder)
-    views, shown = {view.name: view for view in run.photographed}, findings[:worst]
+    views, shown = {view.name: view for view in run.train_views}, findings[:worst]
     entries: list[dict[str, Any]] = [asdict(one) for one in findings]
     for entry, name in zip(entries, file_names([one.name for one in shown]), strict=False):
         view = views[entry["name"]]

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.experiments.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
 from gsx.experiments.run_folder.files import read_lines
 
@@ -102,7 +102,7 @@ class Progress:
         self.shown = run.seconds
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Show the line when it is time."""
         self.taken += 1
         if not self.output.due() and not run.complete:
@@ -155,7 +155,7 @@ class MetricsLog:
         self.stream = path.open("a")
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Write a line when due, or when something noteworthy happened."""
         points = run.training.test_points
         tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
@@ -170,7 +170,7 @@ class MetricsLog:
         self.stream.write(json.dumps(line) + "\n")
         self.stream.flush()
 
-    def entry(self, run: Run, step: Step) -> dict:
+    def entry(self, run: Run, step: StepResult) -> dict:
         """One line of metrics.jsonl."""
         memory = peak_memory_mb(run.device)
         line = {

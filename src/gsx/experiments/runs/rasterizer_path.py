@@ -17,16 +17,16 @@ from typing import IO
 import torch
 from torch.nn import Parameter
 
-from gsx.core.compiling import available
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import first_line
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.kept_code import Call, file_of, lacking, make_ahead, nothing_kept, recorded
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
-from gsx.core.rasterizer.path import compiles
 from gsx.core.training.run import Run
+from gsx.engine.compile_cache import Call, file_of, lacking, make_ahead, nothing_kept, recorded
+from gsx.engine.compiling import available
+from gsx.engine.path import compiles
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)

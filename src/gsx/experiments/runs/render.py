@@ -13,9 +13,9 @@ from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import remove_partial
 from gsx.core.shapes import Float
-from gsx.core.threads import yielding_cores
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
@@ -35,14 +35,14 @@ def view_named(run: Run, name: str) -> View:
     Raises:
         InputError: there is none; the nearest name is given.
     """
-    views = {view.name: view for view in [*run.scene.test, *run.photographed]}
+    views = {view.name: view for view in [*run.scene.test, *run.train_views]}
     if name not in views:
         known = nearest(name, list(views)) or f" The first are {', '.join(list(views)[:3])}."
         raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{known}")
     return views[name]
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
     """Write every test view at `zoom` times the training resolution as PNG.
 
@@ -62,7 +62,7 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     without_others(folder, "*.png", names, run.folder)
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
     """Animate a closed path around the scene."""
     remove_partial(path.parent, below=False)
@@ -97,7 +97,7 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
     return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def render_path(
     way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
 ) -> Path:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gsx.augmenters.checked_regenerator import Checks, WithChecks
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import at_home
 from gsx.core.options import fields_with
@@ -21,7 +22,6 @@ from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share, beyond_range
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import OF_BACKBONES
-from gsx.core.training.checked_regenerator import Checks, WithChecks
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions

@@ -13,7 +13,7 @@ import pluggy
 
 from gsx.core.errors import TrainingError, first_line
 from gsx.core.plugins import GROUP, Hooks, Plugins, hookimpl, refuse_unmarked
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.experiments.runs.settings import Chosen
 
 logger = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Tracking:
         self.tell("gsx_run_started", run)
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Pass on."""
         self.tell("gsx_step_finished", run, step=step)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.threads import yielding_cores
 from gsx.core.training import checkpoint
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.progress import read_curves
@@ -58,7 +58,7 @@ class Watched:
         return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Show a run until Ctrl-C.
 
@@ -75,7 +75,7 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
         viewer.stop()
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Show a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
     gaussians, origin = read_around(path, axes)

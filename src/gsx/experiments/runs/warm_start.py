@@ -28,7 +28,7 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.experiments.run_folder.run_key import scene_stamp, trained
 
 logger = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ class WarmStartKeeper:
         self.folder, self.gigabytes, self.steps = folder, gigabytes, steps
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
         where_variants_begin = (round(share * run.iterations) for share in SHARES)
         wanted = {*(self.steps or where_variants_begin), common_steps(run)}

@@ -100,7 +100,7 @@ class RunModel:
 
     def views(self) -> dict[str, View]:
         """Training and test views by name."""
-        return {view.name: view for view in (*self.run.scene.test, *self.run.photographed)}
+        return {view.name: view for view in (*self.run.scene.test, *self.run.train_views)}
 
 
 @dataclass(eq=False)

@@ -3,7 +3,7 @@
 import time
 
 from gsx.core.plugins import hookimpl
-from gsx.core.training.run import Run, Step
+from gsx.core.training.run import Run, StepResult
 from gsx.experiments.viewer.pictures import RunModel
 from gsx.experiments.viewer.server import Viewer
 
@@ -19,7 +19,7 @@ class TrainingViewer:
         self.share, self.credit, self.before = share, 0.0, time.monotonic()
 
     @hookimpl
-    def gsx_step_finished(self, run: Run, step: Step) -> None:
+    def gsx_step_finished(self, run: Run, step: StepResult) -> None:
         """Show pictures while there is time for them, or while training is paused."""
         viewer, frames = self.viewer, self.viewer.frames
         viewer.changed(told_of(run))

@@ -13,10 +13,10 @@ from gsx.core.device import clock
 from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.compiled import takes
-from gsx.core.rasterizer.path import compiles
 from gsx.core.rasterizer.reference import render_reference
 from gsx.core.shapes import Float
+from gsx.engine.compiled import takes
+from gsx.engine.path import compiles
 from gsx.experiments.runs.rasterizer_path import Learnt, compile_now
 from gsx.experiments.trade.rasterizer.knobs import Row, Trial, gradient_error, image_errors, pooled_psnr
 from gsx.experiments.trade.rasterizer.subject import Shot, Subject

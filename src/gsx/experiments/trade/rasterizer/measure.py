@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from gsx.core.compiling import available, complaint
 from gsx.core.errors import InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.threads import yielding_cores
+from gsx.engine.compiling import available, complaint
+from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.trade.rasterizer.bench import EXACT, Bench, Check, Times, check_truth, reason
 from gsx.experiments.trade.rasterizer.knobs import Row, Trial, combinations, ordered, single_changes
@@ -56,7 +56,7 @@ def resolved(base: RasterSettings) -> tuple[RasterSettings, list[str]]:
     ]
 
 
-@yielding_cores()
+@relieve_oversubscription()
 def sweep(
     subject: Subject,
     presets: Sequence[RasterSettings],

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from gsx.backbones.neighbours import mean_square_distance
 from gsx.core.data.camera import NEAR, Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.neighbours import mean_square_distance
 from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings

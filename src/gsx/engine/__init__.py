@@ -1,0 +1,1 @@
+"""How pixels are blended fast, and how compiled code is kept."""

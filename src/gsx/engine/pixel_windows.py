@@ -1,0 +1,365 @@
+"""Gaussian Blending: what light is left in a pixel is a uniform rectangle, its window (Koo, Jeong, Kim, AAAI 2026).
+
+Point samples blend as if every splat covered the whole pixel; two that cover different halves hide each other by half.
+Here each splat takes its integral over the window, and the window becomes the rectangle of the same light, mean and
+variances along the axes as what the splat has left. The integral is the pixel's filter: there is no dilation.
+
+State of a pixel: `light` left (1 at first), `x`, `y` the window's middle and `wide`, `high` its sides, px. Tiles walk
+their lists splat by splat, because each window comes from the one before. Formulas: docs/numerics.md.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from gsx.core.rasterizer.composite import sum_by_splat
+from gsx.core.rasterizer.grid import TileGrid, pixel_centres
+from gsx.core.rasterizer.intersections import TileIntersections
+from gsx.core.rasterizer.precision import Precision
+from gsx.core.rasterizer.projection import ScreenSplats
+from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.shapes import Float, Int
+from gsx.engine.compiling import compile_rows
+from gsx.engine.path import compiles
+
+NARROW = 0.1
+"""A window narrower than this many standard deviations sees one alpha, that of its middle (published)."""
+LEAST_WINDOW_VARIANCE = 1e-3
+"""Floor of a window's variance along each axis, px^2 (published)."""
+LEAST_SIGMA = 1e-6
+"""Floor of standard deviations, px."""
+BATCH_PIXELS = 1 << 15
+"""Pixels that walk their lists together."""
+
+PixelWindow: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""(light, x, y, wide, high), each [B, P]; positions relative to the middle of the tile."""
+Row: TypeAlias = tuple[Tensor, ...]
+"""(x, y, n1x, n1y, sigma1, sigma2, opacity) of one splat per tile, each [B, 1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """One axis of a splat, and a window's extent along it: exp(-x^2 / 2 sigma^2) over [low, high]."""
+
+    offset: Float[Tensor, "B P"]
+    """Of the window's middle from the splat's mean."""
+    side: Float[Tensor, "B P"]
+    sigma: Float[Tensor, "B 1"]
+
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """(low, high)."""
+        return self.offset - self.side / 2, self.offset + self.side / 2
+
+    @property
+    def heights(self) -> tuple[Tensor, Tensor]:
+        """The Gaussian at both ends."""
+        low, high = self.ends
+        return torch.exp(-0.5 * (low / self.sigma) ** 2), torch.exp(-0.5 * (high / self.sigma) ** 2)
+
+    @property
+    def moments(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Integrals of 1, x and x^2 times the Gaussian."""
+        (low, high), (at_low, at_high) = self.ends, self.heights
+        unit, variance = self.sigma * math.sqrt(2), self.sigma**2
+        zeroth = self.sigma * math.sqrt(math.pi / 2) * (torch.erf(high / unit) - torch.erf(low / unit))
+        return zeroth, variance * (at_low - at_high), variance * (zeroth + low * at_low - high * at_high)
+
+
+def axes(covariances: Float[Tensor, "M 3"], conic_factors: Float[Tensor, "M 3"]) -> Float[Tensor, "M 4"]:
+    """(n1x, n1y, sigma1, sigma2): direction of the longer axis, standard deviations along both, px.
+
+    The smaller eigenvalue is the determinant over the larger one: the difference cancels for needles.
+    """
+    xx, xy, yy = covariances.unbind(1)
+    longer = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    shorter = yy / longer / (2 * conic_factors[:, 0].square())
+    # in float32 torch's atan2 depends on where a number lies in memory, and crops have other lists of splats
+    angle = torch.atan2(2 * xy.double(), xx.double() - yy.double()).to(xy) / 2
+    sigmas = torch.stack([longer, shorter], 1).sqrt().clamp_min(LEAST_SIGMA)
+    return torch.cat([angle.cos()[:, None], angle.sin()[:, None], sigmas], 1)
+
+
+def along_axes(window: PixelWindow, row: Row) -> tuple[Axis, Axis, Tensor]:
+    """The window turned onto the axes of the splat, by at most 45 degrees; and whether its sides keep their order."""
+    _, x, y, wide, high = window
+    mean_x, mean_y, cos, sin, sigma1, sigma2, _ = row
+    dx, dy = x - mean_x, y - mean_y
+    kept = cos.abs() > sin.abs()
+    first, second = torch.where(kept, wide, high), torch.where(kept, high, wide)
+    return Axis(dx * cos + dy * sin, first, sigma1), Axis(dy * cos - dx * sin, second, sigma2), kept
+
+
+def is_narrow(u: Axis, v: Axis) -> Tensor:
+    """Where one alpha says it all."""
+    return (u.side < NARROW * u.sigma) | (v.side < NARROW * v.sigma)
+
+
+def alpha_of(u: Axis, v: Axis, integral: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor]:
+    """(mean alpha of the splat over the window, whether it is that of the middle), neither clamped nor cut; `integral`:
+    of its Gaussian."""
+    narrow = is_narrow(u, v)
+    middle = torch.exp(-0.5 * ((u.offset / u.sigma) ** 2 + (v.offset / v.sigma) ** 2))
+    area = integral / (u.side * v.side)
+    return opacity * torch.where(narrow, middle, area), narrow
+
+
+def remainder(
+    axis: Axis, moments: tuple[Tensor, Tensor, Tensor], across: Tensor, taken: Tensor, left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(middle, side) along an axis of the light that a splat leaves; `moments`: the axis' own, `across`: the integral
+    along the other; `taken`: the splat's opacity over the window's area."""
+    _, first, second = moments
+    mean = (axis.offset - taken * first * across) / left
+    square = (axis.offset**2 + axis.side**2 / 12 - taken * second * across) / left
+    return mean, (12 * (square - mean**2).clamp_min(LEAST_WINDOW_VARIANCE)).sqrt()
+
+
+def behind_splat(
+    light: Tensor,
+    x: Tensor,
+    y: Tensor,
+    wide: Tensor,
+    high: Tensor,
+    row: Float[Tensor, "B 7"],
+    alpha_min: float,
+    alpha_max: float,
+    stop: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """(alpha of one splat in front of each pixel's window, the window behind it: light, x, y, wide, high)."""
+    window, columns = (light, x, y, wide, high), tuple(row.unsqueeze(2).unbind(1))
+    u, v, kept = along_axes(window, columns)
+    mean_x, mean_y, cos, sin, _, _, opacity = columns
+    of_u, of_v = u.moments, v.moments
+    exact, narrow = alpha_of(u, v, of_u[0] * of_v[0], opacity)
+    alpha = torch.where((exact >= alpha_min) & (light >= stop), exact.clamp(max=alpha_max), 0.0)
+    taken = opacity * (alpha / exact.clamp_min(1e-30)) / (u.side * v.side)  # of a splat that is clamped: what it takes
+    mean_u, side_u = remainder(u, of_u, of_v[0], taken, 1 - alpha)
+    mean_v, side_v = remainder(v, of_v, of_u[0], taken, 1 - alpha)
+    moved = (alpha > 0) & ~narrow
+    new_wide, new_high = torch.where(kept, side_u, side_v), torch.where(kept, side_v, side_u)
+    return (
+        alpha,
+        light * (1 - alpha),
+        torch.where(moved, mean_x + mean_u * cos - mean_v * sin, x),
+        torch.where(moved, mean_y + mean_u * sin + mean_v * cos, y),
+        torch.where(moved, new_wide, wide),
+        torch.where(moved, new_high, high),
+    )
+
+
+@functools.lru_cache
+def compiled_step() -> Callable[..., tuple[Tensor, ...]]:
+    """`behind_splat` through torch.compile, for any number of tiles."""
+    return compile_rows(behind_splat)
+
+
+# -- the walk over all tiles ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lists:
+    """What the walk reads."""
+
+    rows: Float[Tensor, "M 7"]
+    """x, y on the frame, n1x, n1y, sigma1, sigma2, opacity."""
+    channels: Float[Tensor, "M C"]
+    """With one of ones, for coverage."""
+    intersections: TileIntersections
+    grid: TileGrid
+    settings: RasterSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """One splat in front of each of B tiles."""
+
+    tiles: Int[Tensor, "B"]
+    entries: Int[Tensor, "B"]
+    """Of the list of intersections."""
+    splats: Int[Tensor, "B"]
+    row: Float[Tensor, "B 7"]
+    """Positions relative to the middle of the tile."""
+    before: PixelWindow
+    alpha: Float[Tensor, "B P"]
+
+
+def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
+    """All splats of some tiles, longest list first, front to back, as their windows meet them."""
+    grid, settings, like = lists.grid, lists.settings, lists.rows
+    lengths, starts = lists.intersections.starts.diff()[tiles], lists.intersections.starts[tiles]
+    step = compiled_step() if compiles(settings, like.device.type) and len(tiles) > 1 else behind_splat
+    x, y, one = (column.expand(len(tiles), -1) for column in pixel_centres(grid.tile, like))
+    inside = grid.to_tiles(like.new_ones(1, grid.height, grid.width))[:, 0]
+    window: PixelWindow = (inside[tiles], x, y, one, one)
+    rules = settings.alpha_min, settings.alpha_max, settings.transmittance_stop
+    for number in range(int(lengths.max()) if len(tiles) else 0):
+        going = (lengths > number) & (window[0].amax(1) >= max(settings.transmittance_stop, 1e-30))
+        if not bool(going.all()):
+            tiles, lengths, starts = tiles[going], lengths[going], starts[going]
+            window = tuple(part[going] for part in window)  # type: ignore[assignment]
+        if not len(tiles):
+            return
+        splats = lists.intersections.splats[starts + number]
+        row = lists.rows[splats]
+        row = torch.cat([row[:, :2] - grid.centres(tiles, like), row[:, 2:]], 1)
+        alpha, *behind = step(*window, row, *rules)
+        yield Met(tiles, starts + number, splats, row, window, alpha)
+        window = tuple(behind)  # type: ignore[assignment]
+
+
+def batches(lists: Lists) -> Iterator[Int[Tensor, "B"]]:
+    """Tiles that have a list, longest first."""
+    lengths = lists.intersections.starts.diff()
+    order = torch.argsort(lengths, descending=True, stable=True)[: int((lengths > 0).sum())]
+    yield from order.split(max(1, BATCH_PIXELS // lists.grid.tile**2))
+
+
+def blend_windows(lists: Lists, max_weights: Float[Tensor, "E"] | None) -> Float[Tensor, "T P C"]:
+    """Blended channels of every tile; `max_weights`, where given, receives each intersection's largest weight."""
+    pixels = lists.grid.tile**2
+    tiles = len(lists.intersections.starts) - 1
+    pictures = lists.channels.new_zeros(tiles, pixels, lists.channels.shape[1])
+    for batch in batches(lists):
+        for met in walk(lists, batch):
+            weight = met.before[0] * met.alpha
+            pictures.index_add_(0, met.tiles, weight[..., None] * lists.channels[met.splats][:, None])
+            if max_weights is not None:
+                max_weights[met.entries] = weight.amax(1)
+    return pictures
+
+
+# -- gradients, as published: a splat's own, in the window that it met -----------------------------------------------
+
+
+def slopes(u: Axis, v: Axis, opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Derivatives of the mean alpha, not clamped: by the opacity, by the offsets along both axes, by both variances and
+    by the off-diagonal entry in the frame of the axes. By the heat equation that of a variance is half the second
+    derivative by the offset, so that nothing is singular where both axes are alike."""
+    area, unit = u.side * v.side, opacity
+    (u0, _, u2), (v0, _, v2) = u.moments, v.moments
+    (u_low, u_high), (v_low, v_high) = u.heights, v.heights
+    wide = (
+        u0 * v0 / area,
+        unit * v0 * (u_high - u_low) / area,
+        unit * u0 * (v_high - v_low) / area,
+        unit * v0 * u2 / (2 * u.sigma**4 * area),
+        unit * u0 * v2 / (2 * v.sigma**4 * area),
+        unit * (u_high - u_low) * (v_high - v_low) / area,
+    )
+    a, b = u.offset / u.sigma, v.offset / v.sigma
+    middle = torch.exp(-0.5 * (a**2 + b**2))
+    point = (
+        middle,
+        -unit * middle * a / u.sigma,
+        -unit * middle * b / v.sigma,
+        unit * middle * a**2 / (2 * u.sigma**2),
+        unit * middle * b**2 / (2 * v.sigma**2),
+        unit * middle * a * b / (u.sigma * v.sigma),
+    )
+    narrow = is_narrow(u, v)
+    by_opacity, by_u, by_v, by_uu, by_vv, by_uv = (torch.where(narrow, p, w) for p, w in zip(point, wide, strict=True))
+    return by_opacity, by_u, by_v, by_uu, by_vv, by_uv
+
+
+def splat_gradients(met: Met, weight: Float[Tensor, "B P"]) -> Float[Tensor, "B P 6"]:
+    """`weight` times the derivatives of alpha by mean x, y, covariance xx, xy, yy and ln opacity, pixel by pixel."""
+    columns = tuple(met.row.unsqueeze(2).unbind(1))
+    u, v, _ = along_axes(met.before, columns)
+    _, _, cos, sin, _, _, opacity = columns
+    by_opacity, by_u, by_v, by_uu, by_vv, by_uv = (weight * slope for slope in slopes(u, v, opacity))
+    return torch.stack(
+        [
+            -(by_u * cos - by_v * sin),
+            -(by_u * sin + by_v * cos),
+            by_uu * cos**2 + by_vv * sin**2 - by_uv * cos * sin,
+            2 * (by_uu - by_vv) * cos * sin + by_uv * (cos**2 - sin**2),
+            by_uu * sin**2 + by_vv * cos**2 + by_uv * cos * sin,
+            by_opacity * opacity,
+        ],
+        -1,
+    )
+
+
+def gradients_of_lists(
+    lists: Lists, pictures: Float[Tensor, "T P C"], gradient: Float[Tensor, "T P C"]
+) -> tuple[Float[Tensor, "E 8"], Float[Tensor, "E C"]]:
+    """Of every intersection: gradients of mean, covariance and ln opacity, then the sums over pixels of the mean's
+    absolute gradients; and gradients of its channels. Windows are met again from the front."""
+    count = len(lists.intersections.splats)
+    own, channels = lists.rows.new_zeros(count, 8), lists.rows.new_zeros(count, lists.channels.shape[1])
+    passed = torch.zeros_like(pictures)
+    for batch in batches(lists):
+        for met in walk(lists, batch):
+            colour, seen = lists.channels[met.splats][:, None], gradient[met.tiles]
+            weight = met.before[0] * met.alpha
+            passed[met.tiles] += weight[..., None] * colour
+            rest = (passed[met.tiles] - pictures[met.tiles]) / (1 - met.alpha)[..., None]
+            of_alpha = ((met.before[0][..., None] * colour + rest) * seen).sum(2) * (met.alpha > 0)
+            parts = splat_gradients(met, of_alpha)
+            own[met.entries] = torch.cat([parts.sum(1), parts[..., :2].abs().sum(1)], 1)
+            channels[met.entries] = (weight[..., None] * seen).sum(1)
+    return own, channels
+
+
+class WindowComposite(torch.autograd.Function):
+    """See `composite_windows`."""
+
+    @staticmethod
+    def forward(
+        ctx, means, covariances, log_opacities, channels, absgrad, factors, intersections, grid, settings, most
+    ):
+        ones = torch.ones_like(means[:, :1])
+        rows = torch.cat([means, axes(covariances, factors), log_opacities.exp()[:, None]], 1)
+        lists = Lists(
+            rows=rows,
+            channels=torch.cat([channels, ones], 1),
+            intersections=intersections,
+            grid=grid,
+            settings=settings,
+        )
+        pictures = blend_windows(lists, most)
+        ctx.kept = lists, pictures, absgrad is not None
+        return grid.to_raster(pictures)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        lists, pictures, absolute = ctx.kept
+        seen = lists.grid.to_tiles(gradient).permute(0, 2, 1)
+        own, channels = gradients_of_lists(lists, pictures, seen)
+        values = torch.cat([own, channels[:, :-1]], 1)
+        total = sum_by_splat(values, lists.intersections.splats, len(lists.rows))
+        absgrad = total[:, 6:8] if absolute else None
+        return total[:, :2], total[:, 2:5], total[:, 5], total[:, 8:], absgrad, None, None, None, None, None
+
+
+def composite_windows(
+    screen: ScreenSplats,
+    means: Float[Tensor, "M 2"],
+    channels: Float[Tensor, "M C"],
+    intersections: TileIntersections,
+    grid: TileGrid,
+    settings: RasterSettings,
+    *,
+    absgrad: Float[Tensor, "M 2"] | None = None,
+    max_weight: bool = False,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+    """Blended channels, then coverage, as `composite` has them; and largest weights where they are asked for.
+
+    The gradient is the published one: that a splat moves the windows of those behind it is left out, which the paper's
+    training does as well.
+    """
+    exact = Precision.of(settings, means.dtype).exact
+    most = means.new_zeros(len(intersections.splats), dtype=exact) if max_weight else None
+    given = means, screen.covariances, screen.log_opacities, channels, absgrad, screen.conic_factors.detach()
+    in_format = [None if values is None else values.to(exact) for values in given]
+    blended = WindowComposite.apply(*in_format, intersections, grid, settings, most).to(means.dtype)
+    if most is None:
+        return blended, None
+    largest = most.new_zeros(len(means)).scatter_reduce_(0, intersections.splats, most, "amax")
+    return blended, largest.to(means.dtype)

@@ -1,0 +1,11 @@
+"""Signals that end a process which trains."""
+
+import signal
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2", "SIGHUP") if hasattr(signal, name))
+"""Signals of the end of a job: preempted or requeued; out of time (submitit asks Slurm for it); its terminal closed."""
+
+
+def handled_signals() -> list[signal.Signals]:
+    """Signals of STOPPING that end training; `nohup` has the terminal's end ignored, and it stays so."""
+    return [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]

@@ -1,0 +1,256 @@
+"""Distractors in runs: found when they are due, left out of the loss, kept and resumed; no change where none are."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_scene import Grey, small_scene, spread
+from tiny import final_tensors, tiny_run
+from torch import Tensor
+
+from gsx.builtin import plugins
+from gsx.core.data.camera import Camera
+from gsx.core.data.coarser import coarser
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import View
+from gsx.core.errors import Stopped
+from gsx.experiments.evaluation.remarks import gathered, remarks_of
+from gsx.experiments.runs.degraded import patch_of
+from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.open import open_run
+from gsx.modules.captures import differences, forget, judge_distractors, showing_distractors
+from gsx.modules.distractors import DistractorOptions, Distractors, Obstructed, obstructed, without_marked
+
+
+def views(count: int = 4) -> list[View]:
+    """Of 24 x 16 px."""
+    return list(small_scene(spread(5), views=count).train)
+
+
+def marks(count: int = 4) -> list[Tensor]:
+    """The first photograph has a distractor at its upper left, in blocks of 4 px."""
+    marked = [torch.zeros(4, 6, dtype=torch.bool) for _ in range(count)]
+    marked[0][1, :2] = True
+    return marked
+
+
+def test_they_are_judged_once_and_found_again_only_where_there_are_any() -> None:
+    own = Distractors(DistractorOptions(when="auto", start=0.1, until=0.4, times=3), 1000)
+    assert [number for number in range(1, 1001) if own.due(number)] == [101]
+    own.mark(marks(), 101)
+    assert [number for number in range(1, 1001) if own.due(number)] == [201, 401]
+    assert not any(Distractors(DistractorOptions(), 1000).due(number) for number in range(1, 1001))
+
+
+def test_auto_asks_for_more_than_the_share_and_always_for_nothing() -> None:
+    auto, always = (Distractors(DistractorOptions(when=when, share=0.03), 10) for when in ("auto", "always"))
+    assert [auto.needed(value) for value in (0.02, 0.04)] == [False, True]
+    assert always.needed(0.0)
+
+
+# -- pixels ----------------------------------------------------------------------------------------------------------
+
+
+def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> None:
+    view = obstructed(views()[0], marks()[0])
+    expected = torch.ones(16, 24, dtype=torch.bool)
+    expected[4:8, :8] = False
+    assert torch.equal(view.counted(), expected)
+    finer = replace(view, camera=view.camera.zoom(2))
+    assert torch.equal(finer.counted(), expected.repeat_interleave(2, 0).repeat_interleave(2, 1))
+    cut = replace(view, camera=view.camera.crop(6, 3, 10, 8))
+    assert torch.equal(cut.counted(), expected[3:11, 6:16])
+    assert torch.equal(view.image(), views()[0].image())
+    assert obstructed(views()[1], marks()[1]).counted() is None
+
+
+@pytest.mark.parametrize("times", [2, 4, 8, 16])
+def test_a_coarse_pixel_counts_where_nothing_of_it_is_marked(times: int) -> None:
+    """Also where it is larger than a block, of 4 px; of pictures that it does not divide."""
+    view = View("a", views()[0].camera.resize(650, 523), Grey())
+    marked = torch.zeros(523 // 4, 650 // 4, dtype=torch.bool)
+    marked[40:60, 60:81] = True  # rows 160 to 240, columns 240 to 324
+    coarse = coarser(view, Reduction(), times)
+    assert coarse.camera.size == (650 // times, 523 // times)
+    found, picture = obstructed(coarse, marked), coarse.source.image(coarse.camera)
+    expected = torch.ones(523 // times, 650 // times, dtype=torch.bool)
+    expected[160 // times : 240 // times, 240 // times : -(-324 // times)] = False
+    assert torch.equal(found.counted(), expected)
+    assert found.source.image(found.camera) is picture, "it is made once"
+    assert coarse.counted() is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(67, 71), (131, 97)])
+def test_blocks_are_whole_pixels_and_the_last_take_the_rest(width: int, height: int) -> None:
+    """Of pictures that blocks of 4 px do not divide."""
+    camera = views()[0].camera.resize(width, height)
+    view = View("a", camera, Grey())
+    marked = torch.zeros(height // 4, width // 4, dtype=torch.bool)
+    marked[-2:, 3] = marked[2, -1] = True
+    expected = torch.ones(height, width, dtype=torch.bool)
+    expected[(height // 4 - 2) * 4 :, 12:16] = False
+    expected[8:12, (width // 4 - 1) * 4 :] = False
+    assert torch.equal(obstructed(view, marked).counted(), expected)
+
+
+class CutOutGrey(Grey):
+    """Transparent everywhere."""
+
+    def transparent(self, camera: Camera) -> Tensor:
+        return torch.ones(camera.height, camera.width, dtype=torch.bool)
+
+
+def test_what_is_transparent_stays_so() -> None:
+    view = replace(views()[0], source=CutOutGrey())
+    assert bool(obstructed(view, marks()[0]).transparent().all())
+    assert obstructed(views()[0], marks()[0]).transparent() is None
+
+
+class HalfMasked(Grey):
+    """Of which the left half does not count."""
+
+    def counted(self, camera: Camera) -> Tensor:
+        return (torch.arange(camera.width) >= camera.width // 2).expand(camera.height, -1)
+
+
+def test_masks_of_the_scene_hold_beside_them() -> None:
+    source, marked = HalfMasked(), torch.zeros(4, 6, dtype=torch.bool)
+    marked[0] = True
+    counted = Obstructed(source=source, marked=marked, size=(24, 16)).counted(views()[0].camera)
+    expected = torch.zeros(16, 24, dtype=torch.bool)
+    expected[4:, 12:] = True
+    assert torch.equal(counted, expected)
+
+
+def test_views_are_the_same_until_others_are_found() -> None:
+    own, given = Distractors(DistractorOptions(), 10), views()
+    assert own.views(given) is given
+    assert own.mark(marks(), 5) == pytest.approx(2 / 24 / 4)
+    made = own.views(given)
+    assert own.views(given) is made
+    assert made[1] is given[1]
+    again = Distractors(DistractorOptions(), 10)
+    again.restore(own.tensors())
+    assert again.looked == 5
+    assert torch.equal(again.views(given)[0].counted(), made[0].counted())
+    own.restore({})
+    assert own.views(given) is given
+
+
+# -- runs ------------------------------------------------------------------------------------------------------------
+
+BEFORE_IT = (
+    "scene.disturb.covered=0.1",
+    "training.distractors.when=always",
+    "training.distractors.start=0.6",
+    "training.distractors.until=0.8",
+    "training.distractors.times=3",
+    "iterations=40",
+    "backbone.rates.shortened=0.4",
+    "backbone.max_primitives=1200",
+    "scene.points=900",
+    "eval.zoom=[1]",
+)
+
+
+def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photographs(tmp_path: Path) -> None:
+    """Of what covers them most is found; not much of the rest."""
+    whole = tiny_run(tmp_path / "whole", BEFORE_IT)
+    tiny_run(tmp_path / "stopped", BEFORE_IT, stop_after=26)
+    run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
+    assert run.distractors.marked is not None
+    execute(run, settings, plugins())
+    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
+    assert a.keys() == b.keys()
+    assert "distractors.0" in a
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    told = [line for line in whole.curves if "distractor_seconds" in line]
+    assert [line["step"] for line in told] == run.distractors.steps()
+    assert sum(line["forgotten"] for line in told) > 0
+    found, covered, others = 0, 0, 0
+    for view, own in zip(whole.train_views, whole.scene.train, strict=True):
+        patch, counted = patch_of(view.name, 0.1), view.counted()
+        black = torch.zeros(3, view.camera.height, view.camera.width, dtype=torch.uint8)
+        there = (patch.over(black, own.camera) != patch.over(black + 255, own.camera)).logical_not().all(0)
+        out = torch.zeros_like(there) if counted is None else ~counted
+        found, covered = found + int((out & there).sum()), covered + int(there.sum())
+        others += int((out & ~there).sum())
+    assert found > 0.4 * covered
+    assert others < found / 3
+
+
+def test_a_stop_between_finding_and_the_step_is_told_as_far_as_it_is_known() -> None:
+    lines = [{"step": 7, "distractors": 0.05, "distractor_seconds": 1.0}, {"step": 9, "loss": 1.0}]
+    assert gathered(lines)["distractors"] == {"step": 7, "share": None, "marked": [0.05], "seconds": 1.0}
+    assert "5.0% of the pixels" in " ".join(remarks_of(gathered(lines)))
+    poses = gathered([{"step": 7, "poses": 6, "pose_motion": 0.2, "pose_seconds": 1.0}])
+    assert "corrected" in " ".join(remarks_of(poses))
+
+
+def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Movements are shares of a view's sides: those of the smaller view that was rendered."""
+    run, seen = (
+        tiny_run(tmp_path, ["iterations=1", "eval.zoom=[1]", "scene.width=80", "scene.height=64"]),
+        list[tuple[object, ...]](),
+    )
+
+    def applied(image: Tensor, view: View) -> Tensor:
+        seen.append(((image.shape[2], image.shape[1]), view.camera.size))
+        return image
+
+    monkeypatch.setattr(run.blur, "applied", applied)
+    differences(run, run.scene.train[:2])
+    assert len(seen) == 2
+    assert all(rendered == size for rendered, size in seen)
+
+
+def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path: Path) -> None:
+    short = ["iterations=6", "eval.zoom=[1]"]
+    plain = tiny_run(tmp_path / "plain", short)
+    asked = ["training.distractors.when=auto", "training.distractors.share=0.9"]
+    judged = tiny_run(tmp_path / "judged", [*short, *asked])
+    assert plain.distractors.marked is None
+    assert judged.distractors.marked is None
+    assert [line["distractors"] for line in judged.curves if "distractor_share" in line] == [0]
+    a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_path: Path) -> None:
+    """All but the first photograph count whole, and of that the left half does not."""
+    run = tiny_run(tmp_path, ["iterations=4", "eval.zoom=[1]"])
+    blocks = [torch.zeros(9, 12, dtype=torch.bool) for _ in run.scene.train]
+    blocks[0][:, :6] = True
+    before = run.backbone.table["means"].clone()
+    gone = forget(run, showing_distractors(run, without_marked(run.scene.train, blocks)))
+    left = {tuple(mean) for mean in run.backbone.table["means"].tolist()}
+    removed = torch.tensor([mean for mean in before.tolist() if tuple(mean) not in left])
+    assert 0 < gone == len(removed) < len(before) / 4
+    sees = torch.stack([view.camera.sees(removed) for view in run.scene.train]).sum(0)
+    assert float(sees.float().mean()) < 3  # of six: others would show them where they count
+    pixels, _ = run.scene.train[0].camera.project(removed)
+    assert float((pixels[:, 0] < 24).float().mean()) > 0.9
+    nothing = without_marked(run.scene.train, [torch.ones_like(one) for one in blocks])
+    assert forget(run, showing_distractors(run, nothing)) == 0  # a model of nothing is none
+
+
+def test_a_stop_while_distractors_are_found_leaves_all_to_be_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Marks without what they tell to remove would stay so."""
+    run = tiny_run(tmp_path, ["iterations=4", "eval.zoom=[1]", "training.distractors.when=always"])
+    before = run.distractors.marked, run.distractors.looked
+
+    def stop(*_: object) -> None:
+        raise Stopped
+
+    blocks = [torch.ones(9, 12, dtype=torch.bool) for _ in run.scene.train]
+    monkeypatch.setattr("gsx.modules.captures.distractors_in", lambda _: blocks)
+    monkeypatch.setattr("gsx.modules.captures.shown_weights", stop)
+    with pytest.raises(Stopped):
+        judge_distractors(run)
+    assert (run.distractors.marked, run.distractors.looked) == before
