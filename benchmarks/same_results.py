@@ -22,6 +22,7 @@ from safetensors.numpy import load_file
 
 from gsx.core.files import read_json, write_json
 
+LANCZOS, WARN = "regenerator/upscale=lanczos", "augmenter.upscale.checks.agreement.action=warn"
 TINY = (
     "scene.width=48",
     "scene.height=36",
@@ -36,6 +37,26 @@ TINY = (
     "device=cpu",
     "eval.zoom=[1,2]",
 )
+CORRECTED = (
+    "scene.width=96",
+    "scene.height=72",
+    "scene.train_views=12",
+    "scene.points=600",
+    "scene.disturb={exposure:0.3,pose:2,blur:3,covered:0.1,some:0.5}",
+    "training.exposure.when=always",
+    "training.exposure.grid=always",
+    "training.poses.when=always",
+    "training.blur.when=always",
+    "training.distractors.when=always",
+    "training.coarse=4",
+    "training.coarse_until=0.3",
+    "training.supersample=2",
+    "training.supersample_from=0.6",
+    "training.plateau.price=90",
+    "training.plateau.to=0.9",
+    "iterations=120",
+)
+"""Everything that corrects photos, and every schedule of the loop, on disturbed photos."""
 RUNS: Mapping[str, tuple[str, ...]] = {
     "gs3d": ("backbone=gs3d",),
     "mip_splatting": ("backbone=mip_splatting",),
@@ -53,6 +74,14 @@ RUNS: Mapping[str, tuple[str, ...]] = {
         "regenerator/restore=scene_restorer_brief",
     ),
     "octree_ub": ("variant=octree_ub", "dataset=demo", "budget=smoke"),
+    "corrected": ("backbone=gs3d", *CORRECTED),
+    "corrected_mip": ("backbone=mip_splatting", *CORRECTED, "training.batch=2", "augmenter=[upscale]", LANCZOS, WARN),
+    "corrected_anchors": ("backbone=octree_scaffold", *CORRECTED),
+    "adaptive": ("backbone=gs3d_zoom", "backbone.capacity=adaptive", "backbone.sh_judged=0.5", "backbone.sh_every=10"),
+    "budget": ("backbone=octree_gs3d", "backbone.capacity=budget", "backbone.budget.primitives=900"),
+    "closer": ("backbone=gs3d_zoom", "backbone.mip.pseudo=true", "augmenter=[upscale]", LANCZOS, WARN),
+    "compiled": ("backbone=gs3d", "rasterizer=compiled"),
+    "compiled_corrected": ("backbone=octree_scaffold", "rasterizer=compiled", *CORRECTED),
     "batch": ("backbone=octree_scaffold", "training.batch=2", "augmenter=[upscale]", "regenerator/upscale=lanczos"),
 }
 CLOCKS = ("time", "seconds", "fps", "per_second", "memory_mb")
@@ -99,6 +128,17 @@ def resumed(folder: Path) -> None:
     gsx(folder, "resume", str(run))
 
 
+def corrected_resumed(folder: Path) -> None:
+    """A corrected run that goes on from its state at step 60."""
+    if (folder / "corrected_resumed").exists():
+        return
+    run = train(folder, "corrected_resumed", *RUNS["corrected"])
+    for path in run.glob("checkpoints/*"):
+        if int(path.stem.removeprefix("step_")) > 60:
+            path.unlink()
+    gsx(folder, "resume", str(run))
+
+
 def branched(folder: Path) -> None:
     """A run with an augmenter that begins with the state of one without."""
     train(folder, "unbranched", "init=warm_start")
@@ -114,7 +154,7 @@ def evaluated(folder: Path) -> None:
     gsx(folder, "render", str(run))
 
 
-FURTHER: Sequence[Callable[[Path], None]] = (two_processes, resumed, branched, evaluated)
+FURTHER: Sequence[Callable[[Path], None]] = (two_processes, resumed, corrected_resumed, branched, evaluated)
 
 
 def digests(run: Path) -> dict[str, str]:

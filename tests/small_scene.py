@@ -61,7 +61,7 @@ def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **mor
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
-        resolution=TrainingViews(scene=scene, **more),
+        views=TrainingViews(scene=scene, **more),
     )
 
 

@@ -54,7 +54,7 @@ def small_anchors(
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(seed),
-        resolution=TrainingViews(scene=scene or small_scene(spread(60))),
+        views=TrainingViews(scene=scene or small_scene(spread(60))),
     )
     return chosen.component.factory(chosen.options, context)
 

@@ -69,7 +69,7 @@ def small_octree(*overrides: str, scene: Scene | None = None, iterations: int = 
         device=torch.device("cpu"),
         raster=RasterSettings(),
         generator=torch.Generator().manual_seed(0),
-        resolution=TrainingViews(scene=scene or deep_scene()),
+        views=TrainingViews(scene=scene or deep_scene()),
     )
     backbone = free_gaussians(options, context)
     visibility = visibility_of(backbone)

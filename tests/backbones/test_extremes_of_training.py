@@ -48,7 +48,7 @@ def built(name: str, scene: Scene, iterations: int = 30) -> Backbone:
         device=torch.device("cpu"),
         raster=settings.raster,
         generator=torch.Generator().manual_seed(0),
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
     )
     return settings.backbone.component.factory(settings.backbone.options, context)
 

@@ -45,7 +45,7 @@ def run_of(name: str, folder: Path) -> Run:
         iterations=30,
         device=torch.device("cpu"),
         generator=torch.Generator().manual_seed(0),
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
 

@@ -20,12 +20,11 @@ from gsx.core.rasterizer import (
     RasterSettings,
     Rendering,
     checked_lens,
-    compiled,
-    lanes,
     rasterize,
     rasterize_fixed,
 )
 from gsx.core.rasterizer.intersections import raster_numbers
+from gsx.engine import compiled, lanes
 from gsx.engine.compile_cache import TRACING, file_of, recorded
 from gsx.engine.compiled import Chunks, Rows, Stage, available, room_for_gradients, takes
 from gsx.engine.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS

@@ -307,7 +307,7 @@ def test_ranks_that_disagree_are_stopped_where_checkpoints_are_due(tmp_path: Pat
         iterations=7,
         device=torch.device("cpu"),
         generator=torch.Generator(),
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
     step = train_step(run, load_plugins([], points=[]))

@@ -60,7 +60,7 @@ def run_with(poison: dict[int, str], folder: Path, iterations: int = 8, points: 
         iterations=iterations,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),
     )
 

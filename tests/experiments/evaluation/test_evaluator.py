@@ -96,7 +96,7 @@ def run_of(folder: Path, photograph: type[Grey] = Grey) -> Run:
         iterations=7,
         device=torch.device("cpu"),
         generator=torch.Generator(),
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
         sampler=Sampler(3, 0),
         step=7,
         seconds=3.0,

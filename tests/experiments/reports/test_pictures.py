@@ -124,7 +124,7 @@ def make_run(folder: Path, views: int = 3, finest: float = math.inf) -> Run:
         iterations=10,
         device=torch.device("cpu"),
         generator=generator,
-        resolution=TrainingViews(scene=scene),
+        views=TrainingViews(scene=scene),
         sampler=Sampler(views, 0),
         step=10,
     )
