@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 import gsx
-from gsx.core.device import device_name
+from gsx.engine.machine import device_name
 
 ROOT = Path(__file__).parents[2]
 BUSY = 0.3

@@ -21,9 +21,9 @@ from torch import Tensor
 from torch._inductor.output_code import CompiledFxGraph
 
 from gsx.core.errors import CompilerError
-from gsx.core.locks import made_by_one
 from gsx.core.quality.similarity import compiled_correlate, correlate
 from gsx.engine import compile_cache
+from gsx.engine.cache import made_by_one
 from gsx.engine.compile_cache import (
     FOLDER,
     KeptFunction,

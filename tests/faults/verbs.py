@@ -12,7 +12,7 @@ from tiny import OVERRIDES, tiny_run
 
 from faults.children import in_child, preload, run_in_child
 from gsx.cli.dispatch import main
-from gsx.core.cache import IN_USE, released
+from gsx.engine.cache import IN_USE, released
 
 EVENT = [f"augmenter.upscale.timing.{key}=10000" for key in ("start", "every", "span")]
 """Pseudo views once, at step 2 of 6 or 8."""

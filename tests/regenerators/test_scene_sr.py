@@ -12,9 +12,9 @@ from gsx.augmenters.checked_regenerator import strayed, unusable
 from gsx.core.data.reduction import Reduction, box_average, projected
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
-from gsx.core.device import multiplies_bfloat16
 from gsx.core.errors import ConfigError
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext
+from gsx.engine.machine import multiplies_bfloat16
 from gsx.regenerators import scene_sr
 from gsx.regenerators.scene_sr import Enlarger, SceneSR, SceneSROptions, crop, kept_at, pairs
 

@@ -16,12 +16,12 @@ import torch
 from synthetic_colmap import HEIGHT, WIDTH, colmap_options, synthesize, write_photos, write_scene
 from torch import Tensor
 
-from gsx.core.cache import enlist
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import read_image, write_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
+from gsx.engine.cache import enlist
 from gsx.scenes import splits
 from gsx.scenes.colmap import load
 from gsx.scenes.colmap_folders import count_images

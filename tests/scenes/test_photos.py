@@ -17,10 +17,10 @@ from photo_files import write_pixels, write_webp_with_exif
 from synthetic_colmap import shipped
 from torch import Tensor
 
-from gsx.core.cache import enlist
 from gsx.core.data.images import image_size, read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
+from gsx.engine.cache import enlist
 from gsx.experiments.runs.settings import typed
 from gsx.scenes import photos, sfm
 from gsx.scenes.orientation import AFTER_MIRROR, oriented, oriented_camera

@@ -184,7 +184,7 @@ def verb_resume(arguments: list[str]) -> int:
     words = [word for word in arguments if word not in RESUME_FLAGS]
     folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
     with loading():
-        from gsx.core.cache import in_use
+        from gsx.engine.cache import in_use
         from gsx.experiments.run_folder.claims import claimed
         from gsx.experiments.run_folder.files import read_run, reported, state_of
         from gsx.experiments.runs.history import go_on

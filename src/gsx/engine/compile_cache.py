@@ -28,11 +28,10 @@ from typing import Any, TypeAlias, cast
 import torch
 from torch import Tensor
 
-from gsx.core.cache import content_key, file_stamp
-from gsx.core.device import processor_kind
 from gsx.core.errors import first_line
 from gsx.core.files import replacing
-from gsx.core.locks import made_by_one
+from gsx.engine.cache import content_key, file_stamp, made_by_one
+from gsx.engine.machine import processor_kind
 
 logger = logging.getLogger(__name__)
 

@@ -18,16 +18,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from gsx.core.cache import cache_folder, content_key, enlist, whole
 from gsx.core.data.reduction import Reduction, projected
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.device import machine_stamp, multiplies_bfloat16
 from gsx.core.errors import ConfigError
 from gsx.core.files import replace_file
 from gsx.core.ranges import Interval, Range, Rate, Seconds
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
+from gsx.engine.cache import cache_folder, content_key, enlist, whole
+from gsx.engine.machine import machine_stamp, multiplies_bfloat16
 
 logger = logging.getLogger(__name__)
 

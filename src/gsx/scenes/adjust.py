@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
+from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.origin import Origin, chosen_origin
 from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model, reconstruction_of
 from gsx.scenes.kept_models import kept_model

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import enlist, listed, make_folder, whole
 from gsx.core.files import own_mark
+from gsx.engine.cache import enlist, listed, make_folder, whole
 
 
 def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:

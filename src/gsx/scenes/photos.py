@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from gsx.core.cache import cache_folder, content_key, file_stamp
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import at_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
+from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
 from gsx.scenes.colmap_model import Model, error_told, read_model

@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsx.core.cache import content_key
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.shapes import Float
+from gsx.engine.cache import content_key
 from gsx.scenes.demo import textures
 from gsx.scenes.demo.noise import blend
 from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsx.core.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.core.data.camera import Camera
-from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
+from gsx.engine.cache import cache_folder, content_key, file_stamp, make_folder
+from gsx.engine.kept_images import keep_image, kept_image
 from gsx.scenes.lens_folds import Cut, cut_where_folded, shows_truly
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height

@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from gsx.core.device import device_name
+from filelock import FileLock
+
 from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import read_json, write_json
-from gsx.core.locks import lock
 from gsx.core.options import flattened
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Seconds
 from gsx.core.training.run import Run
+from gsx.engine.machine import device_name
 from gsx.trackers.figures import evaluation_figures, line_figures
 
 logger = logging.getLogger(__name__)
@@ -197,8 +198,7 @@ def client_of(uri: str) -> Any:
         return MlflowClient(uri)
     folder = folder_of(uri)
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".mlflow.lock").open("w") as stream:
-        lock(stream, wait=True)
+    with FileLock(folder / ".mlflow.lock"):
         client = MlflowClient(uri)
     quoted = Path(uri.removeprefix(SQLITE)).parent
     if quoted != folder:  # MLflow makes that folder as well, and leaves it empty

@@ -9,7 +9,6 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
-from typing import IO
 
 import pytest
 from processes import Begin
@@ -76,16 +75,16 @@ def test_the_new_lock_file_is_taken_where_the_old_one_was_removed_before_it_was_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its holder lets go and removes it between our opening and our locking, and another process makes a new one."""
-    locked = list[str]()
+    locked = list[int]()
 
-    def lock(stream: IO[str]) -> bool:
+    def lock(descriptor: int, blocking: bool) -> bool:
         if not locked:
             (tmp_path / LOCK).unlink()
             (tmp_path / LOCK).write_text("")
-        locked.append(stream.name)
+        locked.append(descriptor)
         return True
 
-    monkeypatch.setattr(claims, "lock", lock)
+    monkeypatch.setattr(claims, "lock_descriptor", lock)
     with claims.taken(tmp_path / LOCK, tmp_path, needed=True) as stream:
         assert len(locked) == 2
         assert same_file(stream, tmp_path / LOCK)
@@ -133,10 +132,10 @@ def test_a_lock_of_another_user_has_a_sentence_of_its_own(tmp_path: Path, monkey
 def test_without_locks_a_run_goes_on_and_says_so_and_a_shared_name_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def no_locks(stream: object) -> bool:
+    def no_locks(descriptor: int, blocking: bool) -> bool:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(claims, "lock", no_locks)
+    monkeypatch.setattr(claims, "lock_descriptor", no_locks)
     with caplog.at_level("WARNING", logger="gsx"), claimed(tmp_path):
         assert "file system without locks: see that no other process trains in it" in caplog.text
     with pytest.raises(InputError, match="No locks available"), claimed_name(tmp_path / "run"):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsx.core.cache import MANIFEST, trim
+from gsx.engine.cache import MANIFEST, trim
 from gsx.experiments.runs.build import convolve_exactly, keep_compiled_code, plan_of
 from gsx.experiments.runs.environment import in_words
 

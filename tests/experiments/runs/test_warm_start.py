@@ -9,7 +9,7 @@ import torch
 from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
-from gsx.core.cache import in_use
+from gsx.engine.cache import in_use
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from tiny import leave_results
 
-from gsx.core.cache import source_revision
+from gsx.engine.cache import source_revision
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published

@@ -11,8 +11,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO
 
+from filelock import lock_descriptor
+
 from gsx.core.errors import InputError
-from gsx.core.locks import lock
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +81,7 @@ def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
     for _ in range(TRIES):
         stream = opened(path, folder)
         try:
-            if not lock(stream):
+            if not lock_descriptor(stream.fileno(), blocking=False):
                 raise InputError(f"{folder} is in use by {holder(stream)}: wait for it, or stop it")
             if same_file(stream, path):
                 return stream

@@ -5,9 +5,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import content_key, file_stamp
 from gsx.core.files import at_home
 from gsx.core.options import fields_with, flattened
+from gsx.engine.cache import content_key, file_stamp
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.run_folder.stamps import tree_stamp

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from gsx.core.cache import KEY_LETTERS, content_key
+from gsx.engine.cache import KEY_LETTERS, content_key
 
 READ = 1 << 20
 """Bytes up to which files are known by content: poses, cameras, smaller photographs; larger ones are by their time."""

@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from gsx.augmenters.checked_regenerator import CheckedRegenerator, Tally, WithChecks
-from gsx.core.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.core.data.scene import Scene
-from gsx.core.device import processor_kind
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
@@ -29,7 +27,9 @@ from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
+from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.engine.compiled import path_of
+from gsx.engine.machine import processor_kind
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide

@@ -13,13 +13,13 @@ from typing import Any
 import torch
 
 from gsx import __version__
-from gsx.core.cache import source_revision
 from gsx.core.data.scene import View
-from gsx.core.device import device_name
 from gsx.core.plugins import Plugins
 from gsx.core.training.backbone import CAUTION
 from gsx.core.training.run import Run
+from gsx.engine.cache import source_revision
 from gsx.engine.compiled import path_of
+from gsx.engine.machine import device_name
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.build import plan_of
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from gsx.core.cache import cache_root, trim
 from gsx.core.errors import CompilerError, LostModel, TrainingError, first_line
 from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
@@ -14,6 +13,7 @@ from gsx.core.training import checkpoint
 from gsx.core.training.guard import Agreement, Guard
 from gsx.core.training.run import Run, StepResult
 from gsx.core.training.trainer import train
+from gsx.engine.cache import cache_root, trim
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import SPLATS

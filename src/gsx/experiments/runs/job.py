@@ -8,9 +8,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsx.core.cache import in_use
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
+from gsx.engine.cache import in_use
 from gsx.engine.processes import processes, say, speaks
 from gsx.engine.signals import STOPPING, handled_signals
 

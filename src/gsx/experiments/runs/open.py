@@ -8,7 +8,6 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from gsx.core.cache import source_revision
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
 from gsx.core.files import keep_names, read_json, write_json
@@ -18,6 +17,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
+from gsx.engine.cache import source_revision
 from gsx.engine.collector import gc_paused
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.run_folder.claims import LOCK, claimed

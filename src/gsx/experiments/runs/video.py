@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsx.core.cache import content_key, file_stamp
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
-from gsx.core.locks import made_by_one
 from gsx.core.packages import require
 from gsx.core.shapes import Float, UInt8
+from gsx.engine.cache import content_key, file_stamp, made_by_one
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import (
+from gsx.core.data.scene import FromFile
+from gsx.core.errors import CheckpointError, InputError
+from gsx.core.files import read_json, replace_file, replace_text, write_json
+from gsx.core.plugins import hookimpl
+from gsx.core.training import checkpoint
+from gsx.core.training.run import Run, StepResult
+from gsx.engine.cache import (
     cache_folder,
     content_key,
     enlist,
@@ -22,13 +28,7 @@ from gsx.core.cache import (
     trim,
     whole,
 )
-from gsx.core.data.scene import FromFile
-from gsx.core.device import machine_stamp
-from gsx.core.errors import CheckpointError, InputError
-from gsx.core.files import read_json, replace_file, replace_text, write_json
-from gsx.core.plugins import hookimpl
-from gsx.core.training import checkpoint
-from gsx.core.training.run import Run, StepResult
+from gsx.engine.machine import machine_stamp
 from gsx.experiments.run_folder.run_key import scene_stamp, trained
 
 logger = logging.getLogger(__name__)

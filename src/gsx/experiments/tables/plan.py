@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from gsx.core.cache import content_key
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.ranges import LARGEST_SEED, Range
 from gsx.core.training.augmenter import Foretold
+from gsx.engine.cache import content_key
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
 from gsx.experiments.runs.settings import Settings

@@ -6,10 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import content_key, in_use
 from gsx.core.errors import ConfigError, InputError, command, first_line, nearest
 from gsx.core.files import remove_partial, replace_text
 from gsx.core.plugins import Plugins
+from gsx.engine.cache import content_key, in_use
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed_name, left_behind
 from gsx.experiments.run_folder.files import reported

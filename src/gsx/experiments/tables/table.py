@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gsx.core.cache import source_revision
 from gsx.core.files import read_json
+from gsx.engine.cache import source_revision
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
 from gsx.experiments.reports.baselines import spread
 from gsx.experiments.run_folder.files import (

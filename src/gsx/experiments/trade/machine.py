@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.device import device_name
+from gsx.engine.machine import device_name
 
 
 def machine(device: torch.device) -> dict[str, Any]:

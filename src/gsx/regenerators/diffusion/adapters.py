@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from gsx.core.cache import enlist, make_folder, whole
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file
+from gsx.engine.cache import enlist, make_folder, whole
 from gsx.regenerators.diffusion.options import TuningOptions
 
 logger = logging.getLogger(__name__)

@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from gsx.core.cache import content_key, source_digest
 from gsx.core.errors import InputError, TrainingError, first_line
 from gsx.core.files import at_home
+from gsx.engine.cache import content_key, source_digest
 from gsx.regenerators.diffusion.model_specs import ModelSpec
 from gsx.regenerators.diffusion.options import DiffusionOptions
 

@@ -11,16 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key
-from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.device import machine_stamp
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.packages import require
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
+from gsx.engine.cache import cache_folder, content_key
+from gsx.engine.kept_images import keep_image, kept_image
+from gsx.engine.machine import machine_stamp
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, spec_of
 from gsx.regenerators.diffusion.models import (

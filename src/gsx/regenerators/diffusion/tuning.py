@@ -18,13 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key
 from gsx.core.data.window import Window
-from gsx.core.device import machine_stamp
 from gsx.core.errors import TrainingError
 from gsx.core.files import replace_file, write_json
 from gsx.core.shapes import Float, Int
 from gsx.core.training.regenerator import RegeneratorContext
+from gsx.engine.cache import cache_folder, content_key
+from gsx.engine.machine import machine_stamp
 from gsx.regenerators.diffusion.adapters import (
     ADAPTERS,
     FACTS,

@@ -11,15 +11,15 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.core.cache import cache_folder, content_key
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import ImageCache
-from gsx.core.data.kept_images import keep_image, kept_image
 from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError
 from gsx.core.ranges import Points, Range, Seed
 from gsx.core.shapes import Float, UInt8
+from gsx.engine.cache import cache_folder, content_key
+from gsx.engine.kept_images import keep_image, kept_image
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, render, seen_at

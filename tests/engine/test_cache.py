@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from gsx.core.cache import (
+from gsx.core.errors import InputError
+from gsx.engine.cache import (
     IN_USE,
     MANIFEST,
     cache_folder,
@@ -23,7 +24,6 @@ from gsx.core.cache import (
     trim,
     whole,
 )
-from gsx.core.errors import InputError
 
 
 def test_own_variable_comes_before_xdg_before_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +142,7 @@ def test_what_a_process_at_work_has_used_stays(cache: Path) -> None:
     now = time.time()
     before, since = entry("a1", now - 100), entry("a2", now - 100)
     program = (
-        "import sys; from gsx.core.cache import in_use\nwith in_use(): print('in', flush=True); sys.stdin.readline()"
+        "import sys; from gsx.engine.cache import in_use\nwith in_use(): print('in', flush=True); sys.stdin.readline()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -166,7 +166,7 @@ def test_what_is_used_while_others_are_removed_stays(cache: Path, monkeypatch: p
         os.utime(made / MANIFEST, (200, 200))
         return found
 
-    monkeypatch.setattr("gsx.core.cache.entries", overtaken)
+    monkeypatch.setattr("gsx.engine.cache.entries", overtaken)
     assert trim(0) == []
     assert whole(made / "state")
 

@@ -1,6 +1,6 @@
-"""Where results that are dear to compute live between runs: undistorted photos, reconstructions, networks, states.
+"""The cache: results that are expensive to compute, kept between runs: photos, reconstructions, networks, states.
 
-An entry is a folder <kind>/<key> with a manifest of its files. Whatever is not as the manifest says is made again.
+An entry is a folder <kind>/<key> with a manifest of its files. Whatever differs from the manifest is made again.
 """
 
 import hashlib
@@ -15,10 +15,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from filelock import lock_descriptor
+
 import gsx
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, own_mark
-from gsx.core.locks import lock
 
 logger = logging.getLogger(__name__)
 
@@ -31,34 +32,33 @@ KEY_LETTERS = 16  # 64 bits of the digest: collisions are out of reach for any n
 
 
 def cache_root() -> Path:
-    """$GSX_CACHE, else $XDG_CACHE_HOME/gsx, else ~/.cache/gsx (XDG base directories).
+    """Returns $GSX_CACHE, else $XDG_CACHE_HOME/gsx, else ~/.cache/gsx (XDG base directories).
 
     Raises:
-        InputError: there is no home folder to find it in.
+        InputError: there is no home folder.
     """
-    below = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    given = os.environ.get("GSX_CACHE") or f"{below}/gsx"
-    found = at_home(given)
-    if str(found).startswith("~"):
+    name = os.environ.get("GSX_CACHE") or f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/gsx"
+    root = at_home(name)
+    if str(root).startswith("~"):
         raise InputError(
-            f"the cache would be {given}, and there is no such home folder: let GSX_CACHE name a folder that can be "
+            f"the cache would be {name}, and there is no such home folder: let GSX_CACHE name a folder that can be "
             "written"
         )
-    return found
+    return root
 
 
 def cache_folder(kind: str, key: str) -> Path:
-    """The folder of the results of one `kind` and `key`; it is not created."""
+    """Returns the folder of the results of one `kind` and `key`, without creating it."""
     return cache_root() / kind / key
 
 
 def content_key(*parts: object) -> str:
-    """A short hexadecimal digest of `parts`; parts whose `repr` differs, or is split otherwise, differ in key."""
+    """Digests `parts` into a short hexadecimal key; parts whose `repr` differs, or is split otherwise, differ."""
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:KEY_LETTERS]
 
 
 def source_digest(folder: Path) -> str:
-    """A digest of the Python files below a folder: other code may give other results."""
+    """Digests the Python files below a folder: other code may give other results."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -66,31 +66,31 @@ def source_digest(folder: Path) -> str:
 
 
 def source_revision() -> str:
-    """A short digest of gsx's own source: of another revision results may be others."""
+    """Digests the source of gsx: another revision may give other results."""
     return source_digest(Path(gsx.__file__).parent)[:KEY_LETTERS]
 
 
 def file_stamp(path: Path) -> tuple[str, int, int]:
-    """Name, size in bytes and modification time in ns: enough to notice that a file was replaced.
+    """Returns name, size in bytes and modification time in ns: enough to notice that a file was replaced.
 
     Raises:
-        OSError: the file cannot be looked at.
+        OSError: the file cannot be read.
     """
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
 
 
 def make_folder(folder: Path) -> Path:
-    """Create a folder of the cache, with its parents.
+    """Creates a folder of the cache, with its parents.
 
     Raises:
         InputError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
+    except OSError as error:
         raise InputError(
-            f"Cannot create the cache folder {folder} ({problem.strerror}): let GSX_CACHE name a folder that can be "
+            f"Cannot create the cache folder {folder} ({error.strerror}): let GSX_CACHE name a folder that can be "
             "written to."
         ) from None
     return folder
@@ -100,7 +100,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def enlist(*files: Path) -> None:
-    """Note in the manifest of an entry, the folder in which they lie, that these files are whole: size and digest.
+    """Notes size and digest of files in the manifest of their entry, the folder in which they lie.
 
     Raises:
         OSError: the manifest cannot be written.
@@ -111,27 +111,24 @@ def enlist(*files: Path) -> None:
 
 
 def fingerprint(content: bytes) -> dict[str, Any]:
-    """By which a file is known."""
+    """Returns size and digest of a file's content."""
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def listed(entry: Path, name: str = "") -> dict[str, dict[str, Any]]:
-    """Fingerprints in the manifest of an entry, at least that of the file named; damaged lines are no notes."""
-    found, named = {}, json.dumps(name).strip('"')
+    """Reads fingerprints from the manifest of an entry, at least that of the named file; skips damaged lines."""
+    notes, quoted = {}, json.dumps(name).strip('"')
     with suppress(OSError):
         for line in (entry / MANIFEST).read_text(encoding="utf-8", errors="replace").splitlines():
             with suppress(ValueError, TypeError, KeyError, AttributeError):
-                if named in line:  # a manifest may have thousands of lines
+                if quoted in line:  # a manifest may have thousands of lines
                     note = json.loads(line)
-                    found[str(note.pop("file"))] = note
-    return found
+                    notes[str(note.pop("file"))] = note
+    return notes
 
 
 def whole(file: Path) -> bool:
-    """Whether a file of an entry is as it was written; the entry then counts as used now.
-
-    A damaged one is told, and its user makes it again.
-    """
+    """Checks that a file of an entry is as it was written, and marks the entry as used now; warns of a damaged file."""
     try:
         content = file.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -147,19 +144,42 @@ def whole(file: Path) -> bool:
 
 
 def touch(entry: Path) -> None:
-    """An entry is used now."""
+    """Marks an entry as used now."""
     with suppress(OSError):
         os.utime(entry / MANIFEST)
 
 
-# -- room --------------------------------------------------------------------------------------------------------------
+# -- locks -------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
+    """Locks the making of a file; yields whether this process has the lock. Where nothing can be locked, all have it.
+
+    `wait`: until the other process has finished. The lock of a killed process is free.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        stream = file.with_suffix(".lock").open("w")
+    except OSError:
+        yield True
+        return
+    with stream:
+        try:
+            alone = lock_descriptor(stream.fileno(), blocking=False)
+            if wait and not alone:
+                logger.info("waiting for another process, which is making %s ...", file.name.partition("-")[0])
+                alone = lock_descriptor(stream.fileno())
+        except OSError:
+            alone = True
+        yield alone
 
 
 @contextmanager
 def in_use() -> Iterator[None]:
-    """As long as the context lasts, nobody who needs room removes what this process uses of the cache from now on.
+    """Keeps `trim` of other processes from removing what this process uses of the cache from now on.
 
-    A killed process holds nothing. Where nothing can be written or locked, nothing is kept from removal.
+    A killed process keeps nothing. Where nothing can be written or locked, nothing is kept.
     """
     stream = use_lock()
     try:
@@ -172,15 +192,15 @@ def in_use() -> Iterator[None]:
 
 
 def use_lock() -> IO[str] | None:
-    """A locked file in IN_USE, which gets the name that others look for once it is locked."""
+    """Opens and locks a file in IN_USE; renames it to what others look for once it is locked."""
     stream = None
     try:
         folder = make_folder(cache_root() / IN_USE)
         stream = (folder / f".use.{own_mark()}-{secrets.token_hex(4)}.partial").open("w")
-        lock(stream)
+        lock_descriptor(stream.fileno(), blocking=False)
         os.replace(stream.name, Path(stream.name).with_suffix(".lock"))
     except (OSError, InputError) as error:
-        logger.info("nobody is told that the cache is used: %s", error)
+        logger.info("other processes cannot know that this one uses the cache: %s", error)
         if stream is not None:
             stream.close()
             with suppress(OSError):
@@ -190,30 +210,33 @@ def use_lock() -> IO[str] | None:
 
 
 def used_since() -> float:
-    """When the longest at work of all processes that use the cache began, seconds since 1970; infinite if none does."""
-    begun = []
+    """Returns when the oldest process that uses the cache began, seconds since 1970; infinite if there is none."""
+    starts = []
     for path in (cache_root() / IN_USE).glob(".use.*.lock"):
         with suppress(OSError):
             if released(path):
                 path.unlink()
             else:
-                begun.append(path.stat().st_mtime)
-    return min(begun, default=math.inf)
+                starts.append(path.stat().st_mtime)
+    return min(starts, default=math.inf)
 
 
 def released(path: Path) -> bool:
-    """Whether the process that locked a file has ended; where that cannot be told it counts as at work."""
+    """Checks whether the process that locked a file has ended; assumes that it runs where nobody can know."""
     try:
         with path.open("r+") as stream:  # some network file systems lock nothing that is open for reading alone
-            return lock(stream)
-    except (OSError, InputError):
+            return lock_descriptor(stream.fileno(), blocking=False)
+    except OSError:
         return False
 
 
-def trim(gigabytes: float) -> list[Path]:
-    """Remove entries that were used longest ago until all hold so many 10^9 bytes; never what a process at work uses.
+# -- space -------------------------------------------------------------------------------------------------------------
 
-    Returns what was removed. What has no manifest is nothing of gsx's, and stays; so does what cannot be removed.
+
+def trim(gigabytes: float) -> list[Path]:
+    """Removes the entries used longest ago until the rest fit into so many 10^9 bytes; returns what it removed.
+
+    Entries that a running process uses stay, and so does what has no manifest, since it is not gsx's.
     """
     since, removed = used_since(), []
     used, sizes = entries()
@@ -229,9 +252,9 @@ def trim(gigabytes: float) -> list[Path]:
 
 
 def entries() -> tuple[dict[Path, float], dict[Path, int]]:
-    """When each entry of the cache was last used, seconds since 1970, and its bytes."""
+    """Returns when each entry of the cache was last used, seconds since 1970, and its bytes."""
     used, sizes, manifests = {}, {}, list[Path]()
-    with suppress(OSError):  # somebody removes the cache meanwhile
+    with suppress(OSError):  # another process may remove the cache meanwhile
         manifests += cache_root().glob(f"*/*/{MANIFEST}")
     for manifest in manifests:
         with suppress(OSError):  # or this entry
@@ -241,7 +264,7 @@ def entries() -> tuple[dict[Path, float], dict[Path, int]]:
 
 
 def remove_entry(entry: Path, used: float) -> bool:
-    """Remove an entry that was not used since; its manifest last, so that what is left of it is still one."""
+    """Removes an entry that was not used since; its manifest last, so that what is left of it is still an entry."""
     try:
         if (entry / MANIFEST).stat().st_mtime != used:
             return False

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from gsx.core.cache import enlist, make_folder, whole
 from gsx.core.data.images import read_image, write_image
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
+from gsx.engine.cache import enlist, make_folder, whole
 
 logger = logging.getLogger(__name__)
 

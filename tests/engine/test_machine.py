@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsx.core import device
-from gsx.core.device import device_name, machine_stamp, processor_kind
+from gsx.engine import machine
+from gsx.engine.machine import device_name, machine_stamp, processor_kind
 from gsx.experiments.runs.build import keep_compiled_code
 
 OLD = """processor\t: 0
@@ -27,18 +27,18 @@ BUSY = OLD.replace("2399.998", "3100.000")
 
 @pytest.fixture(autouse=True)
 def asked_anew() -> Iterator[None]:
-    device.told_of_processor.cache_clear()
+    machine.processor_fields.cache_clear()
     yield
-    device.told_of_processor.cache_clear()
+    machine.processor_fields.cache_clear()
 
 
 def on(told: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
     """The kind of a processor of which a system tells so."""
-    monkeypatch.setattr(device, "PROCESSORS", tmp_path / "cpuinfo")
+    monkeypatch.setattr(machine, "PROCESSORS", tmp_path / "cpuinfo")
     (tmp_path / "cpuinfo").unlink(missing_ok=True)
     if told is not None:
         (tmp_path / "cpuinfo").write_text(told)
-    device.told_of_processor.cache_clear()
+    machine.processor_fields.cache_clear()
     return processor_kind()
 
 
