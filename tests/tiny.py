@@ -84,7 +84,7 @@ def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = No
     settings, loaded = tiny_settings(folder, *more), plugins()
     run = start(settings, loaded)
     with loaded.listening([StopAfter(stop_after)] if stop_after is not None else []):
-        execute(run, settings, loaded)
+        execute(run, settings, loaded, keep_states=True)
     return run
 
 

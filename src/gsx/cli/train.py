@@ -202,7 +202,7 @@ def verb_resume(arguments: list[str]) -> int:
             remedy = "give iterations=N with N above that to lengthen it"
             raise InputError(f"{folder} is complete at step {run.step}: {remedy}")
         if run.ranks.first:
-            go_on(run, loaded, changed="--changed" in arguments)
+            go_on(run, settings, loaded, changed="--changed" in arguments)
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
         return tell_report(carry_out(run, settings, loaded), folder)

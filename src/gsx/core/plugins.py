@@ -24,7 +24,7 @@ GROUP = "gsx"
 """Entry-point group and pluggy project name."""
 BLOCK = "GSX_NO_PLUGINS"
 """Environment variable: when set and not empty, only built-ins are loaded."""
-KINDS = ("scene", "backbone", "augmenter", "regenerator", "tracker")
+KINDS = ("scene", "backbone", "augmenter", "regenerator", "tracker", "module")
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -83,6 +83,10 @@ class Registry:
     def names(self, kind: str) -> list[str]:
         """Names of a kind, sorted."""
         return sorted(name for k, name in self.components if k == kind)
+
+    def of(self, kind: str) -> dict[str, Component]:
+        """Components of a kind by name, in the order in which they were registered."""
+        return {name: component for (k, name), component in self.components.items() if k == kind}
 
     def find(self, kind: str, name: str) -> Component:
         """The component, or ConfigError with the nearest name."""

@@ -48,8 +48,8 @@ def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def resumed(run: Path, *overrides: str, changed: bool = False) -> None:
     """What `gsx resume` does before the first step."""
-    opened, _ = open_run(run, plugins(), overrides, training=True)
-    go_on(opened, plugins(), changed)
+    opened, settings = open_run(run, plugins(), overrides, training=True)
+    go_on(opened, settings, plugins(), changed)
 
 
 def test_nothing_changed_nothing_said(run: Path, caplog: pytest.LogCaptureFixture) -> None:

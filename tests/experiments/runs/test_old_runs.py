@@ -15,7 +15,6 @@ from gsx.builtin import plugins
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.trainer import train
 from gsx.experiments.run_folder.files import read_run
-from gsx.experiments.run_folder.renamed import renamed
 from gsx.experiments.run_folder.run_key import composition_key, evaluation_settings, finished
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.evaluate import evaluate
@@ -60,7 +59,6 @@ def test_keys_of_an_old_run_have_their_new_names_wherever_it_is_read(folder: Pat
         assert found["backbone"]["clone_split"]["rates"]["sh_dc"] == 0.0025
         assert not {"trunk_at", "trunk_gb", "sh_constant"} & found.keys()
     assert settings.general.disk_cache_gb == 20
-    assert renamed({"init": "trunk", "backbone": None}) == {"init": "warm_start", "backbone": None}
 
 
 def test_an_old_run_without_a_form_of_densification_is_one_on_anchors(folder: Path) -> None:
@@ -71,16 +69,6 @@ def test_an_old_run_without_a_form_of_densification_is_one_on_anchors(folder: Pa
     run, _ = open_run(folder, plugins())
     assert len(run.backbone.table) == 31
     assert run.backbone.options.densification == "anchors"
-
-
-def test_diffusion_models_once_said_by_a_size_whether_results_are_kept() -> None:
-    model = {"offload": "none", "batch_pixels": 1, "cache_gb": 0}
-    nested = {"name": "sd_by_scale", "x2": model, "x4": model | {"cache_gb": 5.0}}
-    foreign = {"name": "mine", "cache_gb": 3.0}
-    found = renamed({"regenerator": {"upscale": nested, "restore": foreign}})["regenerator"]
-    assert found["upscale"]["x2"] == {"offload": "none", "batch_pixels": 1, "cached": False}
-    assert found["upscale"]["x4"]["cached"] is True
-    assert found["restore"] == foreign
 
 
 def test_a_configuration_that_was_read_back_is_the_same_composition(tmp_path: Path) -> None:

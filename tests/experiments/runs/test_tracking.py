@@ -237,12 +237,12 @@ def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Trac
 def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
     settings = tiny_settings(tmp_path / "run", "iterations=2")
     run = start(settings, plugins())
-    folder = warm_start_folder(run, {})
+    folder = warm_start_folder(run, settings.idle, {})
     key, config = key_of(read_run(run.folder)), comparable(run.config)
     write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *BOTH).resolved)
     run.config = compose(words(run.folder, "iterations=2", *BOTH), plugins()).resolved
     assert "mlflow" in run.config["tracker"]
-    assert warm_start_folder(run, {}) == folder
+    assert warm_start_folder(run, settings.idle, {}) == folder
     assert key_of(read_run(run.folder)) == key
     assert comparable(run.config) == config
 

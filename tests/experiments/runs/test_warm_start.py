@@ -9,9 +9,11 @@ import torch
 from tiny import final_tensors, tiny_run
 
 from gsx.builtin import plugins
+from gsx.core.training.run import Run
 from gsx.engine.cache import in_use
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.settings import read_config
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
@@ -37,6 +39,11 @@ def assert_same(a: Path, b: Path) -> None:
     first, second = final_tensors(a), final_tensors(b)
     assert first.keys() == second.keys()
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def states_of(run: Run) -> Path:
+    """Where the states of a run are kept."""
+    return warm_start_folder(run, read_config(run.folder / "config.yaml", plugins()).idle, plugins().versions)
 
 
 def lines(folder: Path) -> list[dict]:
@@ -81,7 +88,7 @@ def test_a_branch_that_is_killed_while_it_begins_leaves_a_whole_checkpoint_or_no
 def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> None:
     """upscale leaves its states up to 22; bootstrap, which begins at 20, must not take that of 22."""
     run = tiny_run(tmp_path / "upscale", (*RUN, *augmented("upscale"), "init=warm_start"))
-    assert sorted(path.stem for path in warm_start_folder(run, plugins().versions).glob("step_*.json")) == [
+    assert sorted(path.stem for path in states_of(run).glob("step_*.json")) == [
         f"step_{step:07d}" for step in (10, 15, 20, 22)
     ]
     tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=warm_start"))
@@ -121,13 +128,13 @@ def test_resumed_runs_leave_nothing_behind(tmp_path: Path, caplog: pytest.LogCap
 def test_a_damaged_state_gives_way_to_an_older_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     run = tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=16)
-    (warm_start_folder(run, plugins().versions) / "step_0000015.safetensors").write_bytes(b"cut short")
+    (states_of(run) / "step_0000015.safetensors").write_bytes(b"cut short")
     tiny_run(tmp_path / "second", (*RUN, "init=warm_start"), stop_after=17)
     assert "truncated or altered" in caplog.text
     assert "branching at step 10" in caplog.text
     tiny_run(tmp_path / "third", (*RUN, "init=warm_start"), stop_after=17)
     assert "branching at step 15" in caplog.text, "it was kept again"
-    (warm_start_folder(run, plugins().versions) / "lines_step_0000015.json").write_text("{}")
+    (states_of(run) / "lines_step_0000015.json").write_text("{}")
     caplog.clear()
     tiny_run(tmp_path / "fourth", (*RUN, "init=warm_start"), stop_after=17)
     assert "branching at step 10" in caplog.text, "what it would have told of its beginning is damaged"
@@ -149,7 +156,7 @@ def test_states_are_kept_within_a_budget(tmp_path: Path, monkeypatch: pytest.Mon
     first = tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
     with in_use():
         second = tiny_run(tmp_path / "second", (*RUN, "seed=1", "init=warm_start", "disk_cache_gb=0"), stop_after=12)
-    folders = [warm_start_folder(run, plugins().versions) for run in (first, second)]
+    folders = [states_of(run) for run in (first, second)]
     assert [folder.is_dir() for folder in folders] == [False, True]
 
 

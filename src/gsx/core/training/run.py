@@ -175,14 +175,10 @@ class Run:
     augmenters: Sequence[Augmenter] = ()
     tallies: Sequence[Tally] = ()
     """What has become of the pictures that each augmenter asked for."""
-    idle: frozenset[str] = frozenset()
-    """Dotted keys of the configuration that change nothing of what is trained."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     step: int = 0
     """Steps done."""
-    warm_starts: Path | None = None
-    """Where states are kept that other runs may branch from; None: nowhere, as for all runs that were resumed."""
     seconds: float = 0.0
     """Time spent in training steps, without evaluation, files and waiting for code to be compiled."""
     stopping: bool = False

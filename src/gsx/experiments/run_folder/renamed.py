@@ -1,46 +1,70 @@
-"""Keys of configurations that were once called otherwise: run folders hold the old names, people type them."""
+"""Keys of configurations that were renamed, moved or removed: run folders hold the old ones, people type them."""
 
 import copy
+from collections.abc import Mapping
+from dataclasses import MISSING
 from typing import Any
 
+from gsx.core.options import flattened
+
+MOVED = {
+    "training.coarse": "training.coarse_to_fine.factor",
+    "training.coarse_until": "training.coarse_to_fine.until",
+    "training.supersample": "training.supersampling.factor",
+    "training.supersample_from": "training.supersampling.start",
+}
+"""New dotted keys by the old ones, of which digests of compositions are still made (`run_key`)."""
 RENAMED = {
     "trunk_at": "warm_start_at",
-    "trunk_gb": "disk_cache_gb",
-    "warm_start_gb": "disk_cache_gb",
     "backbone.rates.sh_constant": "backbone.rates.sh_dc",
     "backbone.clone_split.rates.sh_constant": "backbone.clone_split.rates.sh_dc",
 }
-"""New dotted names by old ones, in the same place."""
+"""New dotted keys by old ones."""
+REMOVED: dict[str, Any] = {
+    "trunk_gb": None,
+}
+"""Keys without a successor, each with the value by which gsx still trains; None: the key changed no result."""
 
 
 def renamed(config: dict[str, Any]) -> dict[str, Any]:
-    """A copy with the new names, in the same order; `init: trunk` is `init: warm_start`.
+    """Returns a copy with today's keys; a removed one stays where its value is not what gsx trains by."""
+    config, values = copy.deepcopy(config), flattened(config)
+    for key, value in REMOVED.items():
+        if value is None or values.get(key, MISSING) == value:
+            take(config, key)
+    return moved(config, RENAMED)
 
-    A budget of states alone is dropped: it would be that of the whole cache.
-    """
+
+def moved(config: dict[str, Any], places: Mapping[str, str]) -> dict[str, Any]:
+    """Returns a copy with values at other dotted keys, by the keys where they are."""
     config = copy.deepcopy(config)
-    for key in ("trunk_gb", "warm_start_gb"):
-        config.pop(key, None)
-    say_what_is_cached(config.get("regenerator"))
-    if config.get("init") == "trunk":
-        config["init"] = "warm_start"
-    for old, new in RENAMED.items():
-        *outer, key = old.split(".")
-        node: Any = config
-        for name in outer:
-            node = node.get(name) if isinstance(node, dict) else None
-        if isinstance(node, dict) and key in node:
-            items = [(new.rpartition(".")[2] if name == key else name, value) for name, value in node.items()]
-            node.clear()
-            node.update(items)
+    for old, new in places.items():
+        if (value := take(config, old)) is not MISSING:
+            put(config, new, value)
     return config
 
 
-def say_what_is_cached(node: Any) -> None:
-    """In options of diffusion models, which other options lie around: a size of the cache once said whether to keep."""
-    if not isinstance(node, dict):
-        return
-    if {"offload", "batch_pixels", "cache_gb"} <= node.keys() and "cached" not in node:
-        node["cached"] = node.pop("cache_gb") != 0
-    for inner in node.values():
-        say_what_is_cached(inner)
+def take(config: dict[str, Any], key: str) -> Any:
+    """Removes a dotted key and the mappings that it leaves empty; returns its value, MISSING if there is none."""
+    name, _, inner = key.partition(".")
+    if not inner or not isinstance(config.get(name), dict):
+        return MISSING if inner else config.pop(name, MISSING)
+    value = take(config[name], inner)
+    if value is not MISSING and not config[name]:
+        del config[name]
+    return value
+
+
+def put(config: dict[str, Any], key: str, value: Any) -> None:
+    """Sets the value of a dotted key, and makes the mappings that it lies in."""
+    *outer, last = key.split(".")
+    for name in outer:
+        config = config.setdefault(name, {})
+    config[last] = value
+
+
+def advice(key: str) -> str:
+    """Returns what to do about a key of older versions: ` It is now called 'x'.`; empty for other keys."""
+    if key in RENAMED:
+        return f" It is now called '{RENAMED[key]}'."
+    return " It has been removed: leave it out." if key in REMOVED else ""

@@ -10,6 +10,7 @@ from gsx.core.options import fields_with, flattened
 from gsx.engine.cache import content_key, file_stamp
 from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
+from gsx.experiments.run_folder.renamed import MOVED, REMOVED, moved, put
 from gsx.experiments.run_folder.stamps import tree_stamp
 from gsx.formats.axis_names import AUTO
 from gsx.formats.suffixes import META
@@ -116,7 +117,16 @@ def other_revision(files: RunFiles, this: str) -> str:
 
 def composition_key(config: dict[str, Any], stamp: str, idle: Collection[str]) -> str:
     """A short digest: compositions that train the same have the same; `stamp`: of the scene (`scene_stamp`)."""
-    return content_key(sorted_items(trained(config, idle)), stamp)
+    return content_key(sorted_items(by_older_keys(trained(config, idle))), stamp)
+
+
+def by_older_keys(config: dict[str, Any]) -> dict[str, Any]:
+    """Returns a composition with the keys of the first digests, so that runs of before keep their names."""
+    config = moved(config, {new: old for old, new in MOVED.items()})
+    for key, value in REMOVED.items():
+        if value is not None and key.partition(".")[0] in config:
+            put(config, key, value)
+    return config
 
 
 def sorted_items(value: Any) -> Any:

@@ -189,7 +189,6 @@ def build(
         recorder=recorder_of(backbone, settings.training, device) if training else None,
         augmenters=[augmenter for augmenter, _ in augmenters],
         tallies=[tally for _, tally in augmenters],
-        idle=settings.idle,
         ranks=ranks,
     )
     itself = weakref.ref(run)  # a circle would keep a finished run's tensors for a while

@@ -263,7 +263,7 @@ def check_groups(overrides: Sequence[str]) -> None:
             raise ConfigError("hydra.launcher.n_jobs is 0; give how many processes, or -1 for as many as cores")
         if override.key_or_group == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
-        if override.key_or_group in groups:
+        if override.key_or_group in (*groups, "module"):
             check_choices(override.key_or_group, override.value(), groups)
 
 
@@ -272,7 +272,7 @@ def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
     options = listed(group)
     if not options:
         inner = ", ".join(one for one in groups if one.startswith(f"{group}/"))
-        raise ConfigError(f"{group} is chosen by role: {inner}")
+        raise ConfigError(f"{group} is chosen by role: {inner}" if inner else f"no installed plugin has a {group}")
     names = [str(name) for name in (value if isinstance(value, list) else [value])]
     for number, name in enumerate(names):
         if name not in options:

@@ -5,7 +5,7 @@ import logging
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -30,8 +30,8 @@ POSE_DIGITS = 6
 """Digits of camera values that count, of the largest of its kind: what other machines compute differs behind them."""
 
 
-def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
-    """Machine, versions and the rescaled schedule, for environment.json."""
+def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, Any]:
+    """Returns machine, versions and the rescaled schedule for environment.json; `idle`: keys that change no result."""
     return {
         "gsx": __version__,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
@@ -45,7 +45,7 @@ def environment(run: Run, plugins: Plugins) -> dict[str, Any]:
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
-        "options": composition_key(run.config, "", run.idle),
+        "options": composition_key(run.config, "", idle),
         "plan": plan_of(run),
         "training_focal": max(view.camera.focal for view in run.scene.train),
         "scene": {

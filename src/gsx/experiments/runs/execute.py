@@ -49,10 +49,11 @@ def status(run: Run, state: str, reason: str = "") -> None:
     write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
 
 
-def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
-    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint.
+def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = False) -> None:
+    """Trains from the current step on; when complete, evaluates and reports. Interrupted runs keep a checkpoint.
 
-    All ranks but the first only train.
+    All ranks but the first only train. keep_states: for other runs to branch from, with `init=warm_start`; not of a run
+    whose first steps may have followed other settings.
     """
     if not run.ranks.first:
         follow(run, settings, plugins)
@@ -71,9 +72,10 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         Checkpointer(),
         Progress(),
     ]  # trackers read the log
-    if run.warm_starts is not None:
-        general = settings.general
-        listeners.append(warm_start.WarmStartKeeper(run.warm_starts, general.disk_cache_gb, general.warm_start_at))
+    general = settings.general
+    if keep_states and general.init == "warm_start":
+        states = warm_start.warm_start_folder(run, settings.idle, plugins.versions)
+        listeners.append(warm_start.WarmStartKeeper(states, general.disk_cache_gb, general.warm_start_at))
     try:
         warm_or_eager(run, settings)
         with (
@@ -89,7 +91,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins) -> None:
         raise
     finally:
         log.close()
-        trim(settings.general.disk_cache_gb)
+        trim(general.disk_cache_gb)
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)

@@ -10,12 +10,12 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
-from gsx.core.errors import ConfigError, nearest
+from gsx.core.errors import ConfigError
 from gsx.core.plugins import Plugins
 from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import Compositions, Source
-from gsx.experiments.runs.settings import Settings, dotted
+from gsx.experiments.runs.settings import Settings, dotted, right_key
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
 WIDTH = 110
@@ -57,7 +57,7 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
         values, groups = compositions.values(overrides), compositions.groups()
         known = dict.fromkeys([*dotted(values), *groups])
         if key not in known:
-            raise ConfigError(f"'{key}' is no configuration key.{nearest(key, known)} `gsx --cfg job` lists all keys")
+            raise ConfigError(f"'{key}' is no configuration key.{right_key(key, known)} `gsx --cfg job` lists all keys")
         settings, files = compositions.settings(overrides), parsed(compositions.sources(overrides))
         dotted_key = key.replace("/", ".")  # where what a nested group holds is
         lines = [headline(key, values), *indented(kind_of(key, settings))]
@@ -196,16 +196,17 @@ def head_of(file: Path) -> str:
 
 def kind_of(key: str, settings: Settings) -> str:
     """What a value may be, in words; empty where the options of its component do not say."""
-    for prefix, schema in schemas(settings).items():
+    for prefix, schema in sorted(schemas(settings).items(), reverse=True):  # those below others first
         if key.startswith(prefix):
             return kind_in(schema, key.removeprefix(prefix).split("."))
     return ""
 
 
 def schemas(settings: Settings) -> dict[str, type]:
-    """Dataclasses of options by the beginning of their keys; that of general options last, which has none."""
+    """Dataclasses of options by the beginning of their keys; general options have none."""
     single = {"training": settings.training, "eval": settings.evaluation, "rasterizer": settings.raster}
     chosen = {"scene": settings.scene, "backbone": settings.backbone}
+    chosen |= {f"training.{name}": one for name, one in settings.modules.items()}
     chosen |= {f"augmenter.{name}": one for name, one in settings.augmenters.items()}
     chosen |= {f"regenerator.{role}": one for role, one in settings.regenerators.items()}
     chosen |= {f"tracker.{name}": one for name, one in settings.trackers.items()}
@@ -256,14 +257,16 @@ def reference(plugins: Plugins) -> list[str]:
         lines += ["", "## Of a run", "", *keys_table("", [], compositions, groups)]
         for group in filter(LISTED.__contains__, groups):
             for option in compositions.choices(group):
-                word = f"{group}=[{option}]" if group in ("augmenter", "tracker") else f"{group}={option}"
+                word = f"{group}=[{option}]" if group in SEVERAL else f"{group}={option}"
                 lines += ["", f"## {word}", "", head_of(compositions.file(f"{group}/{option}")) + ".", ""]
-                prefix = f"{group}.{option}" if group in ("augmenter", "tracker") else group.replace("/", ".")
+                prefix = f"{SEVERAL[group]}.{option}" if group in SEVERAL else group.replace("/", ".")
                 lines += keys_table(prefix, [word], compositions, groups)
     return [*lines, ""]
 
 
-LISTED = ("scene", "backbone", "augmenter", "regenerator/upscale", "regenerator/restore", "rasterizer", "tracker")
+SEVERAL = {"augmenter": "augmenter", "tracker": "tracker", "module": "training"}
+"""Where options lie of groups of which several are chosen."""
+LISTED = ("scene", "backbone", *SEVERAL, "regenerator/upscale", "regenerator/restore", "rasterizer")
 """Groups whose options have keys of their own; presets and variants set those of others."""
 
 

@@ -18,7 +18,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import RunFiles, part, read_run
 from gsx.experiments.run_folder.run_key import composition_key, trained
 from gsx.experiments.runs.environment import environment
-from gsx.experiments.runs.settings import read_config
+from gsx.experiments.runs.settings import Settings, read_config
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:
     return last
 
 
-def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
+def go_on(run: Run, settings: Settings, plugins: Plugins, changed: bool = False) -> None:
     """Tell and record what a run that goes on finds changed; its folder still has the config.yaml it was left with.
 
     What its former process left half-written is removed.
@@ -58,18 +58,18 @@ def go_on(run: Run, plugins: Plugins, changed: bool = False) -> None:
     remove_partial(run.folder)
     files = read_run(run.folder)
     if not files.environment:
-        write_anew(run, plugins, files.problems.get(FACTS, f"{FACTS} is missing"))
+        write_anew(run, settings, plugins, files.problems.get(FACTS, f"{FACTS} is missing"))
         return
-    before, now = circumstances(files.environment), circumstances(environment(run, plugins))
+    before, now = circumstances(files.environment), circumstances(environment(run, plugins, settings.idle))
     differing = {key: pair for key, pair in changes(before, now).items() if can_be_compared(key, before, now)}
     known = known_options(files.environment)
-    edited = bool(known) and composition_key(files.config, "", run.idle) not in known
-    others = [options_told(run, files, plugins, "source" in differing)] if edited else []
+    edited = bool(known) and composition_key(files.config, "", settings.idle) not in known
+    others = [options_told(files, settings, plugins, "source" in differing)] if edited else []
     if not changed:
         refuse_another(run, [*([CAMERAS] if "scene.cameras" in differing else []), *others])
     for words in others:
         logger.warning("the run goes on with other %s", words)
-    asked = changes(trained(files.config, run.idle), trained(run.config, run.idle)) if files.config else {}
+    asked = changes(trained(files.config, settings.idle), trained(run.config, settings.idle)) if files.config else {}
     for key, (then, value) in (differing | asked).items():
         if key != "options":
             logger.warning("%s", told(key, then, value))
@@ -96,17 +96,17 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tupl
     return {key: (then.get(key), later.get(key)) for key in keys if then.get(key) != later.get(key)}
 
 
-def options_told(run: Run, files: RunFiles, plugins: Plugins, other_source: bool) -> str:
+def options_told(files: RunFiles, settings: Settings, plugins: Plugins, other_source: bool) -> str:
     """Options that are not those of the run, in words: by another source they may be the same, and read otherwise."""
     if not other_source:
         return EDITED
-    read = read_config(run.folder / "config.yaml", plugins).resolved
-    otherwise = ", ".join(changes(trained(files.config, run.idle), trained(read, run.idle)))
+    read = read_config(files.folder / "config.yaml", plugins).resolved
+    otherwise = ", ".join(changes(trained(files.config, settings.idle), trained(read, settings.idle)))
     named = f"; this one reads otherwise: {otherwise}" if otherwise else ""
     return f"options (config.yaml was edited, or another revision of gsx's source told them apart otherwise{named})"
 
 
-def write_anew(run: Run, plugins: Plugins, problem: str) -> None:
+def write_anew(run: Run, settings: Settings, plugins: Plugins, problem: str) -> None:
     """Tell and record that nobody knows what the run began with; what is there of a damaged file is kept beside it.
 
     Raises:
@@ -123,7 +123,7 @@ def write_anew(run: Run, plugins: Plugins, problem: str) -> None:
         run.folder,
         problem,
     )
-    facts = environment(run, plugins)
+    facts = environment(run, plugins, settings.idle)
     facts["source"] = f"{UNKNOWN}+{facts['source']}"
     write_json(path, facts | {"history": [entry_of(run, {FACTS: (problem, "written anew")})]})
 

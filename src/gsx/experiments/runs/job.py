@@ -98,7 +98,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with in_use(), ExitStack() as claims:
         run = start(settings, loaded, claims)
         folders.append(run.folder)
-        return carry_out(run, settings, loaded)
+        return carry_out(run, settings, loaded, keep_states=True)
 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
@@ -117,7 +117,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
         if run is None:
             tidied(folder)
             return 0
-        return carry_out(run, settings, loaded)
+        return carry_out(run, settings, loaded, keep_states=True)
 
 
 def tidied(folder: Path) -> None:
@@ -135,14 +135,14 @@ def tidied(folder: Path) -> None:
             write_report(folder)
 
 
-def carry_out(run: "Run", settings: "Settings", loaded: "Plugins") -> int:
-    """Train to the end or to Ctrl-C, and say then how to go on."""
+def carry_out(run: "Run", settings: "Settings", loaded: "Plugins", keep_states: bool = False) -> int:
+    """Trains to the end or to Ctrl-C, and says then how to go on; `keep_states`: see `execute`."""
     from gsx.experiments.runs.execute import execute
 
     onwards = way_on(run, settings)
     try:
         with interruptible(run, onwards) as listener, loaded.listening([listener]), logged_to(run.folder):
-            execute(run, settings, loaded)
+            execute(run, settings, loaded, keep_states)
     except KeyboardInterrupt:
         say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
         return INTERRUPTED

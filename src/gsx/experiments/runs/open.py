@@ -122,10 +122,12 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
         refuse_used(settings.general.folder)  # by another process that was faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
-        write_json(run.folder / "environment.json", environment(run, plugins) | ({"start": doubts} if doubts else {}))
+        write_json(
+            run.folder / "environment.json",
+            environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {}),
+        )
         if settings.general.init == "warm_start":
-            run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
-            warm_start.adopt(run, run.warm_starts)
+            warm_start.adopt(run, warm_start.warm_start_folder(run, settings.idle, plugins.versions))
             run.curves = read_curves(run.folder)
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
@@ -235,10 +237,8 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
         set_aside(folder, str(error))
         return folder, start(at_hand, plugins, claims)
     logger.info("going on with %s at step %d", folder, run.step)
-    go_on(run, plugins, changed=True)
+    go_on(run, settings, plugins, changed=True)
     write_config(folder / "config.yaml", settings.resolved)
-    if settings.general.init == "warm_start":
-        run.warm_starts = warm_start.warm_start_folder(run, plugins.versions)
     return folder, run
 
 

@@ -28,7 +28,7 @@ from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
-from gsx.experiments.run_folder.renamed import RENAMED, renamed
+from gsx.experiments.run_folder.renamed import advice, renamed
 from gsx.formats.suffixes import splat_file_at, suffix_of
 
 COMPONENT_KINDS = ("scene", "backbone")
@@ -98,6 +98,8 @@ class Settings:
     dataset: Dataset | None
     trackers: dict[str, Chosen]
     """By name, in the order of the command line."""
+    modules: dict[str, Chosen]
+    """Training modules below `training`, by name, in the order in which they are registered."""
     resolved: dict[str, Any]
     """The same as plain values, for config.yaml."""
     idle: frozenset[str]
@@ -143,12 +145,14 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     parts |= {key: group_of(values.pop(key, {}), key) for key in GROUPS}
     evaluation = parts["eval"] | {"lpips": parts["metrics"].get("lpips", {})}
     single = {kind: chosen(kind, parts[kind], plugins) for kind in COMPONENT_KINDS}
+    loop, modules = training_parts(parts["training"], plugins)
     redrawing = {role: chosen("regenerator", node, plugins, role) for role, node in regenerators.items()}
     found = {name: chosen("augmenter", node, plugins, name) for name, node in augmenters.items()}
     unused = () if any(not isinstance(one.options, WithChecks) for one in found.values()) else ("checks",)
     return Settings(
         general=typed(GeneralOptions, values, ""),
-        training=typed(TrainingOptions, parts["training"], "training"),
+        training=typed(TrainingOptions, loop, "training"),
+        modules=modules,
         evaluation=typed(EvalOptions, evaluation, "eval"),
         raster=typed(RasterSettings, parts["rasterizer"], "rasterizer"),
         scene=single["scene"],
@@ -161,11 +165,34 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         resolved={key: value for key, value in raw.items() if key not in ("experiment", *unused)},  # type: ignore[misc]
         idle=idle_keys(
             {"training": TrainingOptions}
+            | {f"training.{name}": one.component.options for name, one in modules.items()}
             | {kind: one.component.options for kind, one in single.items()}
             | {f"augmenter.{name}": one.component.options for name, one in found.items()}
             | {f"regenerator.{role}": one.component.options for role, one in redrawing.items()}
         ),
     )
+
+
+def training_parts(node: dict[str, Any], plugins: Plugins) -> tuple[dict[str, Any], dict[str, Chosen]]:
+    """Splits the group `training` into options of the loop and the modules that it configures.
+
+    Raises:
+        ConfigError: a key is neither an option nor a module, or a module is given a value of its own.
+    """
+    options = {entry.name for entry in dataclasses.fields(TrainingOptions)}
+    registered = plugins.registry.of("module")
+    for name, value in node.items():
+        if name not in options and name not in registered:
+            known = [*schema_keys(TrainingOptions, "training."), *(f"training.{module}" for module in registered)]
+            missing = ", and no installed plugin has a module of that name" if isinstance(value, dict) else ""
+            key = f"training.{name}"
+            raise ConfigError(f"'{key}' is no configuration key{missing}.{right_key(key, known)}")
+    chosen = {
+        name: Chosen(component=one, options=typed(one.options, group_of(node[name], path), path))
+        for name, one in registered.items()
+        if name in node and (path := f"training.{name}")
+    }
+    return {name: value for name, value in node.items() if name in options}, chosen
 
 
 def idle_keys(options: dict[str, type]) -> frozenset[str]:
@@ -323,7 +350,7 @@ def key_of_type(schema: type, name: str, prefix: str = "") -> str:
 
 def right_key(key: str, known: Iterable[str]) -> str:
     """` It is now called 'x'.` for a key of older versions, else ` Did you mean 'x'?` or nothing."""
-    return f" It is now called '{RENAMED[key]}'." if key in RENAMED else nearest(key, known)
+    return advice(key) or nearest(key, known)
 
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
@@ -382,6 +409,7 @@ def newer_keys(config: Any, plugins: Plugins) -> Iterator[str]:
         nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(config, kind).items() if isinstance(node, dict)}
     for key, (kind, node) in nodes.items():
         schemas[key] = plugins.registry.find(kind, str(node.get("name", ""))).options
+    schemas |= {f"training.{name}": one.options for name, one in plugins.registry.of("module").items()}
     yield from schema_keys(GeneralOptions)
     for key, schema in schemas.items():
         yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith("eval.lpips"))

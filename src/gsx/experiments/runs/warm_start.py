@@ -46,11 +46,11 @@ def common_steps(run: Run) -> int:
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
 
 
-def warm_start_folder(run: Run, plugins: Mapping[str, str]) -> Path:
-    """Where states of runs like this one are kept; `plugins`: versions of those installed."""
+def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str]) -> Path:
+    """Returns where states of such runs are kept; `idle`: keys that change no result; `plugins`: versions."""
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
-        json.dumps(trained(without_augmenters(run.config), run.idle), sort_keys=True, default=str),
+        json.dumps(trained(without_augmenters(run.config), idle), sort_keys=True, default=str),
         scene_stamp(run.config),  # test views are among the lines that are kept with a state
         seen_by(run),
         source_revision(),
