@@ -27,7 +27,7 @@ from typing import Any
 
 from gsx.builtin import plugins
 from gsx.core.files import read_json
-from gsx.experiments.runs.degraded import chosen, turn_of
+from gsx.experiments.runs.degraded import choose, pair_of
 from gsx.experiments.runs.photographs import judge_photographs
 from measuring.wrong_models import wrong_model
 from zoom import (
@@ -211,7 +211,7 @@ def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[
     folder = trained(scene, seed, given, [*OWN, *disturbances, f"iterations={steps}"], f"fault {fault}")
     judge_photographs(folder, plugins(), worst=10)
     found = read_json(folder / "photographs" / "index.json")["views"]
-    bad = chosen([view["name"] for view in found], FEW) if word else set()
+    bad = choose([view["name"] for view in found], FEW) if word else set()
     by_name = {view["name"]: view["remarks"] for view in found}
     return {
         "bad": len(bad),
@@ -225,7 +225,7 @@ def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[
 
 def error_of(view: Mapping[str, Any]) -> float:
     """How far the shift that was told is from the one that was made, px: a picture lies where its camera really was."""
-    made = turn_of(view["name"], TURNED)
+    made = pair_of("pose", view["name"], TURNED)
     return math.hypot(*(told + own for told, own in zip(view["shift"] or (0, 0), made, strict=True)))
 
 

@@ -17,7 +17,7 @@ from gsx.core.quality.sharpness import fineness
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import view_loss
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
-from gsx.experiments.runs.degraded import movement_of
+from gsx.experiments.runs.degraded import pair_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import made
 from gsx.experiments.runs.open import open_run
@@ -133,7 +133,7 @@ def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     assert f"moved in {len(run.blur.movements)} training photographs" in " ".join(remarks_of(gathered(run.curves)))
     size, far = torch.tensor([80.0, 64.0], dtype=torch.float64), 0
     for view in run.scene.train:
-        made = torch.tensor(movement_of(view.name, 8.0), dtype=torch.float64)
+        made = torch.tensor(pair_of("blur", view.name, 8.0), dtype=torch.float64)
         found = size * torch.tensor(run.blur.movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
         far += min(float((found - sign * made).norm()) for sign in (1, -1)) > 0.25 * float(made.norm()) + 1
     assert far <= 1

@@ -20,7 +20,7 @@ from gsx.experiments.runs.degraded import patch_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
 from gsx.modules.captures import differences, forget, judge_distractors, showing_distractors
-from gsx.modules.distractors import DistractorOptions, Distractors, Obstructed, obstructed, without_marked
+from gsx.modules.distractors import DistractorOptions, Distractors, MaskedSource, mask_view, without_marked
 
 
 def views(count: int = 4) -> list[View]:
@@ -53,7 +53,7 @@ def test_auto_asks_for_more_than_the_share_and_always_for_nothing() -> None:
 
 
 def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> None:
-    view = obstructed(views()[0], marks()[0])
+    view = mask_view(views()[0], marks()[0])
     expected = torch.ones(16, 24, dtype=torch.bool)
     expected[4:8, :8] = False
     assert torch.equal(view.counted(), expected)
@@ -62,7 +62,7 @@ def test_pixels_of_marked_blocks_do_not_count_at_any_size_and_in_any_crop() -> N
     cut = replace(view, camera=view.camera.crop(6, 3, 10, 8))
     assert torch.equal(cut.counted(), expected[3:11, 6:16])
     assert torch.equal(view.image(), views()[0].image())
-    assert obstructed(views()[1], marks()[1]).counted() is None
+    assert mask_view(views()[1], marks()[1]).counted() is None
 
 
 @pytest.mark.parametrize("times", [2, 4, 8, 16])
@@ -73,7 +73,7 @@ def test_a_coarse_pixel_counts_where_nothing_of_it_is_marked(times: int) -> None
     marked[40:60, 60:81] = True  # rows 160 to 240, columns 240 to 324
     coarse = coarser(view, Reduction(), times)
     assert coarse.camera.size == (650 // times, 523 // times)
-    found, picture = obstructed(coarse, marked), coarse.source.image(coarse.camera)
+    found, picture = mask_view(coarse, marked), coarse.source.image(coarse.camera)
     expected = torch.ones(523 // times, 650 // times, dtype=torch.bool)
     expected[160 // times : 240 // times, 240 // times : -(-324 // times)] = False
     assert torch.equal(found.counted(), expected)
@@ -91,7 +91,7 @@ def test_blocks_are_whole_pixels_and_the_last_take_the_rest(width: int, height: 
     expected = torch.ones(height, width, dtype=torch.bool)
     expected[(height // 4 - 2) * 4 :, 12:16] = False
     expected[8:12, (width // 4 - 1) * 4 :] = False
-    assert torch.equal(obstructed(view, marked).counted(), expected)
+    assert torch.equal(mask_view(view, marked).counted(), expected)
 
 
 class CutOutGrey(Grey):
@@ -103,8 +103,8 @@ class CutOutGrey(Grey):
 
 def test_what_is_transparent_stays_so() -> None:
     view = replace(views()[0], source=CutOutGrey())
-    assert bool(obstructed(view, marks()[0]).transparent().all())
-    assert obstructed(views()[0], marks()[0]).transparent() is None
+    assert bool(mask_view(view, marks()[0]).transparent().all())
+    assert mask_view(views()[0], marks()[0]).transparent() is None
 
 
 class HalfMasked(Grey):
@@ -117,7 +117,7 @@ class HalfMasked(Grey):
 def test_masks_of_the_scene_hold_beside_them() -> None:
     source, marked = HalfMasked(), torch.zeros(4, 6, dtype=torch.bool)
     marked[0] = True
-    counted = Obstructed(source=source, marked=marked, size=(24, 16)).counted(views()[0].camera)
+    counted = MaskedSource(source=source, marked=marked, size=(24, 16)).counted(views()[0].camera)
     expected = torch.zeros(16, 24, dtype=torch.bool)
     expected[4:, 12:] = True
     assert torch.equal(counted, expected)

@@ -8,7 +8,6 @@ photographs play no part.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -16,9 +15,9 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.coarser import CoarseSource
-from gsx.core.data.scene import CutOut, FromFile, ImageSource, Masked, View
+from gsx.core.data.scene import CutOut, DerivedSource, View
 from gsx.core.ranges import Range, Share
-from gsx.core.shapes import Bool, Int, UInt8
+from gsx.core.shapes import Bool, Int
 from gsx.modules.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
 
 
@@ -44,46 +43,25 @@ class DistractorOptions:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Obstructed:
-    """A source of a photograph of which some parts show a distractor."""
+class MaskedSource(DerivedSource):
+    """A photograph of which the blocks that show a distractor do not count."""
 
-    source: ImageSource
     marked: Bool[Tensor, "h w"]
-    """Which, in blocks of whole pixels of the photograph; the last ones take what is left over."""
+    """Blocks of whole pixels of the photograph that show one; the last row and column take what is left over."""
     size: tuple[int, int]
-    """(width, height) of that, px."""
+    """(width, height) of the photograph, px."""
 
-    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """That of the source."""
-        return self.source.image(camera)
-
-    def max_zoom(self, camera: Camera) -> float:
-        """That of the source."""
-        return self.source.max_zoom(camera)
-
-    def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """What counts of the source, and shows no distractor."""
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"]:
+        """Return which pixels count in the other source and show no distractor."""
         (height, width), frame = self.marked.shape, camera.frame
         down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
         across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
-        left = ~self.marked[down[:, None], across]
-        own = self.source.counted(camera) if isinstance(self.source, Masked) else None
-        return left if own is None else left & own
+        free, counted = ~self.marked[down[:, None], across], super().counted(camera)
+        return free if counted is None else free & counted
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """What the source shows of the background alone."""
+        """Return which pixels of the other source show the background alone."""
         return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ObstructedFile(Obstructed):
-    """The same of a source that reads a file."""
-
-    @property
-    def path(self) -> Path:
-        """The file that the source reads."""
-        assert isinstance(self.source, FromFile)
-        return self.source.path
 
 
 def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
@@ -95,18 +73,17 @@ def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[
 
 def without_marked(views: Sequence[View], marked: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
     """Views without what is marked in their photographs."""
-    return [obstructed(view, one) for view, one in zip(views, marked, strict=True)]
+    return [mask_view(view, one) for view, one in zip(views, marked, strict=True)]
 
 
-def obstructed(view: View, marked: Bool[Tensor, "h w"]) -> View:
+def mask_view(view: View, marked: Bool[Tensor, "h w"]) -> View:
     """The view without what is marked in its photograph; itself where nothing is. Of a coarse pixel nothing may be."""
     if not bool(marked.any()):
         return view
     if isinstance(view.source, CoarseSource):
-        return replace(view, source=view.source.of(obstructed(view.source.view, marked)))
+        return replace(view, source=view.source.of(mask_view(view.source.view, marked)))
     frame = view.camera.frame
-    kind = ObstructedFile if isinstance(view.source, FromFile) else Obstructed
-    return replace(view, source=kind(source=view.source, marked=marked, size=(frame.width, frame.height)))
+    return replace(view, source=MaskedSource(source=view.source, marked=marked, size=(frame.width, frame.height)))
 
 
 @dataclass(eq=False)

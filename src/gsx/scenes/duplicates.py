@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 
-from gsx.core.data.scene import FromFile, View
+from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 
 BLOCK = 1 << 16
@@ -45,7 +45,7 @@ def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> N
 
 def photos_of(views: Iterable[View]) -> list[Path]:
     """The files that views are read from, each once."""
-    return list(dict.fromkeys(view.source.path for view in views if isinstance(view.source, FromFile)))
+    return list(dict.fromkeys(view.file for view in views if view.file is not None))
 
 
 def alike(candidates: Sides, key: Callable[[Path], Hashable]) -> list[Sides]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import FromFile, Scene, View
+from gsx.core.data.scene import Scene, View
 from gsx.core.shapes import Float
 from gsx.formats.origin import NO_ORIGIN, Origin, chosen_origin, in_words, rounding_at, stored_in_single
 
@@ -18,7 +18,7 @@ def origin_of(scene: Scene) -> Origin:
     Views that are computed from their cameras, not read from files, cannot be moved.
     """
     views = [*scene.train, *scene.test]
-    if not all(isinstance(view.source, FromFile) for view in views):
+    if any(view.file is None for view in views):
         return NO_ORIGIN
     cameras = [view.camera for view in views]
     return origin_of_cameras(cameras, depth_of(scene.points.positions, cameras[0].centre))

@@ -8,9 +8,9 @@ import torch
 from small_scene import Grey, small_scene, spread
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import FromFile, Masked, View
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
-from gsx.experiments.runs.degraded import disturbed, gains_of, movement_of, slopes_of, turn_of
+from gsx.experiments.runs.degraded import degrade, gains_of, pair_of
 from gsx.modules.movement import motion_blurred
 
 
@@ -26,14 +26,14 @@ class GreyFile(Grey):
 def test_training_photographs_have_the_gains_of_their_names_and_test_photographs_none() -> None:
     scene = small_scene(spread(5))
     scene = replace(scene, test=[scene.train[0]])
-    worse = disturbed(scene, {"exposure": 0.2})
+    worse = degrade(scene, {"exposure": 0.2})
     for view in worse.train:
         expected = (128 * gains_of(view.name, 0.2)).round().clamp(0, 255).to(torch.uint8)
         assert torch.equal(view.source.image(view.camera)[:, 0, 0], expected)
     assert worse.test == scene.test
     assert worse.provenance["disturbed"] == {"exposure": 0.2}
     assert len({tuple(gains_of(str(number), 0.2).tolist()) for number in range(50)}) == 50
-    assert disturbed(scene, {"exposure": 0.0}) is disturbed(scene, {}) is scene
+    assert degrade(scene, {"exposure": 0.0}) is degrade(scene, {}) is scene
 
 
 def test_gains_are_spread_as_asked() -> None:
@@ -44,8 +44,8 @@ def test_gains_are_spread_as_asked() -> None:
 
 def test_a_shaded_photograph_gets_brighter_towards_a_side_at_every_size_and_in_crops() -> None:
     scene = small_scene(spread(5))
-    [worse] = disturbed(replace(scene, train=scene.train[:1]), {"shade": 0.2}).train
-    right, down = slopes_of(worse.name, 0.2)
+    [worse] = degrade(replace(scene, train=scene.train[:1]), {"shade": 0.2}).train
+    right, down = pair_of("shade", worse.name, 0.2)
     for camera in (worse.camera, worse.camera.zoom(4)):
         x, y = (2 * torch.arange(camera.width) + 1) / camera.width - 1, (2 * torch.arange(camera.height) + 1)
         light = (right * x + down * (y / camera.height - 1)[:, None]).exp()
@@ -53,30 +53,28 @@ def test_a_shaded_photograph_gets_brighter_towards_a_side_at_every_size_and_in_c
         assert torch.equal(worse.source.image(camera)[1], expected)
     part = worse.camera.zoom(4).crop(50, 30, 20, 10)
     assert torch.equal(worse.source.image(part)[1], expected[30:40, 50:70])
-    drawn = torch.tensor([slopes_of(str(number), 0.2) for number in range(2000)])
+    drawn = torch.tensor([pair_of("shade", str(number), 0.2) for number in range(2000)])
     assert (drawn.std(0) - 0.2).abs().max() < 0.01
 
 
 def test_what_photographs_have_in_common_of_their_light_is_taken_from_them() -> None:
     scene = small_scene(spread(5))
-    worse = [view.source for view in disturbed(scene, {"shade": 0.2}).train]
-    drawn = torch.tensor([slopes_of(view.name, 0.2) for view in scene.train])
+    worse = [view.source for view in degrade(scene, {"shade": 0.2}).train]
+    drawn = torch.tensor([pair_of("shade", view.name, 0.2) for view in scene.train])
     found = torch.tensor([source.slopes for source in worse])
     assert found.mean(0).abs().max() < 1e-6
     torch.testing.assert_close(found[1:] - found[0], drawn[1:] - drawn[0])
-    assert disturbed(replace(scene, train=[]), {"exposure": 0.2}).train == []
+    assert degrade(replace(scene, train=[]), {"exposure": 0.2}).train == []
 
 
 def test_values_saturate_and_files_and_masks_stay_those_of_the_source() -> None:
     scene = small_scene(spread(5))
     one = View("bright", scene.train[0].camera, GreyFile())
-    [worse] = disturbed(replace(scene, train=[one]), {"exposure": 2}).train
-    assert isinstance(worse.source, FromFile)
-    assert worse.source.path == Path("grey.png")
-    assert isinstance(worse.source, Masked)
+    [worse] = degrade(replace(scene, train=[one]), {"exposure": 2}).train
+    assert worse.file == Path("grey.png")
     assert not worse.counted().any()
-    [plain] = disturbed(replace(scene, train=scene.train[:1]), {"exposure": 2}).train
-    assert not isinstance(plain.source, FromFile)
+    [plain] = degrade(replace(scene, train=scene.train[:1]), {"exposure": 2}).train
+    assert plain.file is None
     assert plain.counted() is None
     assert plain.zoom(2) is None
     assert worse.source.image(worse.camera).dtype == torch.uint8
@@ -93,10 +91,10 @@ class Asked(Grey):
 def test_a_wrong_pose_moves_the_picture_and_the_photograph_stays_where_it_was_taken() -> None:
     scene, source = small_scene(spread(5)), Asked()
     own = View("a", scene.train[0].camera, source)
-    [worse] = disturbed(replace(scene, train=[own]), {"pose": 3.0}).train
+    [worse] = degrade(replace(scene, train=[own]), {"pose": 3.0}).train
     far = torch.tensor([[0.0, 0.0, 1000.0]]).double() @ own.camera.rotation + own.camera.centre  # what its middle shows
     (before, _), (after, _) = own.camera.project(far), worse.camera.project(far)
-    moved = torch.tensor(turn_of("a", 3.0), dtype=torch.float64)
+    moved = torch.tensor(pair_of("pose", "a", 3.0), dtype=torch.float64)
     torch.testing.assert_close(after - before, moved[None], atol=0.02 * 3, rtol=0)
     torch.testing.assert_close(worse.camera.centre, own.camera.centre, atol=1e-6, rtol=0)
     assert worse.image().shape == (3, 16, 24)
@@ -108,7 +106,7 @@ def test_a_wrong_pose_moves_the_picture_and_the_photograph_stays_where_it_was_ta
 
 def test_what_stands_before_a_photograph_covers_its_share_at_every_size() -> None:
     scene = small_scene(spread(5))
-    [one] = disturbed(replace(scene, train=scene.train[:1]), {"covered": 0.25}).train
+    [one] = degrade(replace(scene, train=scene.train[:1]), {"covered": 0.25}).train
     for camera in (one.camera.zoom(8), one.camera.zoom(16)):
         covered = (one.source.image(camera) != 128).any(0)
         assert abs(float(covered.float().mean()) - 0.25) < 0.01
@@ -127,8 +125,8 @@ class Stripes(Grey):
 def test_a_camera_that_moves_blurs_its_photograph_at_every_size_and_in_crops() -> None:
     scene = small_scene(spread(5))
     own = View("blurred", scene.train[0].camera.zoom(8), Stripes())
-    [worse] = disturbed(replace(scene, train=[own]), {"blur": 3.0}).train
-    across, down = movement_of("blurred", 3.0)
+    [worse] = degrade(replace(scene, train=[own]), {"blur": 3.0}).train
+    across, down = pair_of("blur", "blurred", 3.0)
     expected = motion_blurred(own.source.image(own.camera).float(), across, down).round()
     assert torch.equal(worse.source.image(own.camera), expected.byte())
     finer = own.camera.zoom(2)
@@ -136,12 +134,12 @@ def test_a_camera_that_moves_blurs_its_photograph_at_every_size_and_in_crops() -
     assert torch.equal(worse.source.image(finer), twice.byte())
     part = own.camera.crop(50, 30, 60, 40)
     assert torch.equal(worse.source.image(part), expected.byte()[:, 30:70, 50:110])
-    drawn = torch.tensor([movement_of(str(number), 3.0) for number in range(2000)])
+    drawn = torch.tensor([pair_of("blur", str(number), 3.0) for number in range(2000)])
     assert (drawn.std(0) - 3).abs().max() < 0.15
 
 
 def test_turns_are_spread_as_asked() -> None:
-    drawn = torch.tensor([turn_of(str(number), 3.0) for number in range(2000)])
+    drawn = torch.tensor([pair_of("pose", str(number), 3.0) for number in range(2000)])
     assert (drawn.std(0) - 3).abs().max() < 0.15
     assert drawn.mean(0).abs().max() < 0.2
 
@@ -149,16 +147,16 @@ def test_turns_are_spread_as_asked() -> None:
 def test_some_photographs_suffer_the_same_in_every_run() -> None:
     scene = small_scene(spread(5), views=10)
     by = {"exposure": 0.5, "some": 0.3}
-    first, again = (disturbed(scene, by).train for _ in range(2))
+    first, again = (degrade(scene, by).train for _ in range(2))
     suffering = [view.source is not own.source for view, own in zip(first, scene.train, strict=True)]
     assert sum(suffering) == 3
     assert suffering == [view.source is not own.source for view, own in zip(again, scene.train, strict=True)]
-    assert disturbed(scene, by).notes[-1] == "disturbed: 3 of 10 training photographs (scene.disturb: exposure 0.5)"
-    assert disturbed(scene, {"some": 0.5}) is scene
+    assert degrade(scene, by).notes[-1] == "disturbed: 3 of 10 training photographs (scene.disturb: exposure 0.5)"
+    assert degrade(scene, {"some": 0.5}) is scene
 
 
 def test_what_cannot_be_disturbed_is_named() -> None:
     with pytest.raises(ConfigError, match=r"scene\.disturb\.rain"):
-        disturbed(small_scene(spread(5)), {"rain": 1.0})
+        degrade(small_scene(spread(5)), {"rain": 1.0})
     with pytest.raises(ConfigError, match=r"scene\.disturb\.covered is 1; give at most 0.9"):
-        disturbed(small_scene(spread(5)), {"covered": 1.0})
+        degrade(small_scene(spread(5)), {"covered": 1.0})

@@ -16,7 +16,7 @@ from gsx.core.shapes import Bool, Float, UInt8
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """Where the truth of one view comes from: a photograph, or an analytic scene."""
+    """Where the truth of one view comes from: a photograph, whose file `path` names, or an analytic scene."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """The truth as `camera` sees it; `camera` is the view's own camera at any zoom, or a crop of that."""
@@ -24,16 +24,6 @@ class ImageSource(Protocol):
 
     def max_zoom(self, camera: Camera) -> float:
         """The largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
-        ...
-
-
-@runtime_checkable
-class FromFile(Protocol):
-    """A source that reads a file."""
-
-    @property
-    def path(self) -> Path:
-        """Which one; its size and time tell whether it is still the same."""
         ...
 
 
@@ -55,6 +45,36 @@ class CutOut(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DerivedSource:
+    """The picture, file and mask of another source; subclasses change some of them."""
+
+    source: ImageSource
+
+    @property
+    def path(self) -> Path | None:
+        """The file that the other source reads, if any."""
+        return file_of(self.source)
+
+    def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
+        """Return the other source's picture."""
+        return self.source.image(camera)
+
+    def max_zoom(self, camera: Camera) -> float:
+        """Return the other source's largest zoom."""
+        return self.source.max_zoom(camera)
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """Return which pixels of the other source count; None: all."""
+        return self.source.counted(camera) if isinstance(self.source, Masked) else None
+
+
+def file_of(source: ImageSource) -> Path | None:
+    """Return the file that a source reads, its `path`; None: it computes its pictures."""
+    path = getattr(source, "path", None)
+    return None if path is None else Path(path)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A camera and the image it took. Images are decoded when asked for and kept as uint8."""
@@ -64,6 +84,11 @@ class View:
     source: ImageSource
     group: str = ""
     """Name of the group the view is reported under, for example a BungeeNeRF scale; empty: none."""
+
+    @property
+    def file(self) -> Path | None:
+        """The photograph's file; None: the picture is computed."""
+        return file_of(self.source)
 
     def image(self) -> Float[Tensor, "3 H W"]:
         """The truth at the camera's resolution, display values in [0, 1]."""
@@ -131,26 +156,6 @@ class Scene:
     """Subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
-
-
-@runtime_checkable
-class InUnits(Protocol):
-    """Options of a scene whose positions are multiplied when it is loaded."""
-
-    @property
-    def unit(self) -> float:
-        """By how much."""
-        ...
-
-
-@runtime_checkable
-class Fillable(Protocol):
-    """Options of a scene whose points may be added to."""
-
-    @property
-    def fill(self) -> int:
-        """By how many."""
-        ...
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:

@@ -8,13 +8,13 @@ import torch
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.filling import filled
-from gsx.core.data.scene import Fillable, InUnits, Scene, View
+from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
-from gsx.experiments.runs.degraded import Disturbable, disturbed
+from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
@@ -36,8 +36,8 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     options = settings.scene.options
     loaded = checked(settings.scene.component.factory(options), settings.scene.component.name)
     loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
-    unit = options.unit if isinstance(options, InUnits) else 1.0
-    scene = warned_of_units(measured(placed(loaded, checked_unit(unit), origin)))
+    unit = checked_unit(getattr(options, "unit", 1.0))
+    scene = warned_of_units(measured(placed(loaded, unit, origin)))
     if not scene.test:
         scene = held_out_none(scene, getattr(options, "split", ""))
     if not scene.extent > 0:
@@ -45,9 +45,8 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
             "elsewhere, which gives no depth and no scale: use photos from different places"
         )
-    if isinstance(options, Fillable):
-        scene = with_more_points(scene, options.fill, settings.general.seed)
-    return disturbed(scene, options.disturb) if isinstance(options, Disturbable) else scene
+    scene = with_more_points(scene, getattr(options, "fill", 0), settings.general.seed)
+    return degrade(scene, getattr(options, "disturb", {}))
 
 
 def held_out_none(scene: Scene, rule: str) -> Scene:

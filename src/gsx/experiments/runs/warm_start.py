@@ -12,7 +12,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsx.core.data.scene import FromFile
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
@@ -73,7 +72,7 @@ def seen_by(run: Run) -> str:
         camera = view.camera
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
-        digest.update(repr(file_stamp(Path(view.source.path)) if isinstance(view.source, FromFile) else "").encode())
+        digest.update(repr("" if view.file is None else file_stamp(view.file)).encode())
     return digest.hexdigest()
 
 
