@@ -28,11 +28,11 @@ from typing import Any
 import torch
 
 from gsx.api import train as train_here
-from gsx.backbones import adaptive, capacity, long_axis
 from gsx.backbones.sh_degrees import numbers_of
 from gsx.core.data.camera import look_at
 from gsx.core.data.images import write_image
 from gsx.core.files import read_json, write_json
+from gsx.core.training.importance import Probe
 from gsx.experiments.runs.progress import read_curves
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
@@ -395,9 +395,9 @@ def flat_rows(backbone: str, given: argparse.Namespace) -> list[dict[str, Any]]:
 # -- what the evidence costs -------------------------------------------------------------------------------------------
 
 EVIDENCE = {
-    "windows": (adaptive, "window_errors"),
-    "removals": (capacity, "worth_of_rows"),
-    "errors": (long_axis, "drawn_errors"),
+    "windows": (Probe, "window_errors"),
+    "removals": (Probe, "removal"),
+    "errors": (Probe, "row_errors"),
 }
 """What adaptive growth finds out, and where it asks for it."""
 EVIDENCE_COLUMNS = [

@@ -26,7 +26,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.distributed import Ranks
-from gsx.core.training.importance import Removal
+from gsx.core.training.importance import Probe, Removal
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
@@ -273,9 +273,8 @@ def test_all_processes_do_what_the_first_has_found(name: str, monkeypatch: pytes
         options = options_of(name, budget=BudgetOptions(primitives=20 * (name == "budget")))
         context = replace(small_context(scene), ranks=Told(rank=rank, size=2, said=said))
         if rank:
-            monkeypatch.setattr("gsx.backbones.capacity.worth_of_rows", None)
-            monkeypatch.setattr("gsx.backbones.adaptive.window_errors", None)
-            monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", None)
+            for method in ("removal", "window_errors", "row_errors"):
+                monkeypatch.setattr(Probe, method, None)
         model = gs3d(options, context)
         for step in (600, 700, 14900):
             model.table.statistics |= {key: torch.ones(len(model.table)) for key in ("absolute", "count")}
@@ -381,33 +380,6 @@ def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: st
     assert found[1].error_share < 2 * found[1].rounding_share
 
 
-def test_all_that_judges_by_photographs_takes_them_for_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = small_scene(spread(40), views=12)
-    model = small_gs3d(scene, options=options_of("adaptive"))
-    for name in ("gradient", "count", "absolute"):
-        model.table.statistics[name] = torch.ones(40)
-    seen = list[object]()
-
-    def errors(model: GS3D, *more: object) -> Tensor:
-        seen.append(more[-1])
-        return torch.ones(len(model.table))
-
-    def fits(*more: object) -> None:
-        seen.append(more[-1])
-        raise Found
-
-    monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", errors)
-    monkeypatch.setattr("gsx.backbones.gs3d.colour_fits", fits)
-    model.densify_and_prune(3000)
-    with pytest.raises(Found):
-        model.judge_degrees(3000)
-    assert seen == [model.context.views.match_photo] * 2
-
-
-class Found(Exception):
-    """What was looked for."""
-
-
 def half_of_it_faint() -> tuple[Scene, GS3D]:
     """40 Gaussians before a grey background, of which half are too faint to be seen."""
     scene = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=128 / 255)
@@ -432,7 +404,7 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
 
 def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an error, a share of it would be a price that nothing is below."""
-    monkeypatch.setattr("gsx.core.training.importance.difference", lambda image, *_: torch.zeros_like(image))
+    monkeypatch.setattr(Probe, "difference", lambda probe, image, *_: torch.zeros_like(image))
     scene, model = half_of_it_faint()
     assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())
@@ -441,7 +413,7 @@ def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: 
 def worth(*squares: float) -> Removal:
     """Of rows that a view shows, whose error is so large that none is worth it."""
     worths = torch.tensor(squares)
-    return Removal(squares=worths, shown=torch.ones_like(worths), error_share=1e9, rounding_share=0.0)
+    return Removal(squares=worths, views=torch.ones_like(worths), error_share=1e9, rounding_share=0.0)
 
 
 def test_unjudged_growth_is_published_growth_of_which_goes_what_no_picture_needs() -> None:

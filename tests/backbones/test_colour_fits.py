@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gsx.backbones.colour_fits import (
     ColourFits,
+    coefficients_of,
     colour_fits,
     fitted,
-    own_coefficients,
     squared_change,
     take_coefficients,
 )
@@ -21,6 +21,8 @@ from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import View
 from gsx.core.rasterizer import rasterize
+from gsx.core.training import importance
+from gsx.core.training.importance import Probe
 
 STEP = 30000
 """All bands have been learnt."""
@@ -46,9 +48,8 @@ ONE_SIDE = [0.05 * i for i in range(12)]
 
 def fits_of(model: GS3D, degree: int = 2) -> ColourFits:
     context = model.context
-    form, generator = context.views.raster_for(STEP), torch.Generator().manual_seed(0)
-    compared = context.views.match_photo
-    return colour_fits(model, context.scene.train, form, context.scene.background, STEP, generator, degree, compared)
+    probe = Probe(model=model, views=context.views, step=STEP)
+    return colour_fits(probe, context.scene.train, torch.Generator().manual_seed(0), degree)
 
 
 def pictures(model: GS3D) -> Tensor:
@@ -86,7 +87,7 @@ def test_colours_of_that_degree_are_kept(degree: int) -> None:
     with torch.no_grad():
         model.table["sh_rest"][:, (degree + 1) ** 2 - 1 :] = 0
     fits = fits_of(model)
-    torch.testing.assert_close(fitted(fits, degree), own_coefficients(model.table, degree), atol=1e-5, rtol=0)
+    torch.testing.assert_close(fitted(fits, degree), coefficients_of(model.table, degree), atol=1e-5, rtol=0)
     assert float(squared_change(fits, fitted(fits, degree)).max()) < 1e-7
 
 
@@ -94,7 +95,7 @@ def test_colours_of_that_degree_are_kept(degree: int) -> None:
 def test_the_change_told_is_that_of_pictures(degree: int, alone: tuple[GS3D, ColourFits, Tensor]) -> None:
     """Of one Gaussian: for the fit, and for bands cut off."""
     model, fits, before = alone
-    for coefficients in (fitted(fits, degree), own_coefficients(model.table, degree)):
+    for coefficients in (fitted(fits, degree), coefficients_of(model.table, degree)):
         actual = change_with(model, coefficients, before)
         assert actual > 1e-3
         assert float(squared_change(fits, coefficients)) == pytest.approx(actual, rel=0.1)
@@ -117,7 +118,7 @@ def test_what_bands_are_in_the_mean_is_not_lost() -> None:
     """Seen from one side, bands do what a constant colour can do: cutting them off costs most of what they are."""
     model = model_seen_from(ONE_SIDE, rows=3)
     fits, before = fits_of(model), pictures(model)
-    cut, fit = (change_with(model, one, before) for one in (own_coefficients(model.table, 0), fitted(fits, 0)))
+    cut, fit = (change_with(model, one, before) for one in (coefficients_of(model.table, 0), fitted(fits, 0)))
     assert fit < 0.25 * cut
     assert change_with(model, fitted(fits, 1), before) < 0.1 * fit
 
@@ -129,7 +130,7 @@ def test_rows_that_no_view_shows_keep_what_they_have() -> None:
     fits = fits_of(model)
     assert fits.shown.tolist() == [12, 0]
     for degree in range(3):
-        own = own_coefficients(model.table, degree)
+        own = coefficients_of(model.table, degree)
         torch.testing.assert_close(fitted(fits, degree)[..., 1], own[..., 1])
 
 

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from gsx.backbones import sky
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.sky import not_sky, sky_behind
+from gsx.backbones.sky import Sky, not_sky, sky_behind
 from gsx.builtin import plugins
 from gsx.core.data.scene import PointCloud, Scene
-from gsx.core.data.sky import Sky
 from gsx.core.errors import ConfigError
 from gsx.core.gaussians.splats import Splats
+from gsx.core.training.importance import Probe
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render, splats_for
 from gsx.experiments.runs.compose import compose
@@ -100,7 +100,7 @@ def test_density_control_grows_prunes_and_resets_the_scene_alone() -> None:
 def test_adaptive_growth_leaves_the_sky_alone_though_it_draws_the_largest_errors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gsx.backbones.long_axis.drawn_errors", lambda model, *_: 1.0 + torch.arange(len(model.table)))
+    monkeypatch.setattr(Probe, "row_errors", lambda probe, views: 1.0 + torch.arange(len(probe.model.table)))
     backbone = with_sky(capacity="adaptive")
     done = backbone.control.densification.densify(backbone.control, backbone, 600)
     assert done["split"] == 1

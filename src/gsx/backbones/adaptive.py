@@ -27,7 +27,7 @@ from gsx.core.data.window import Window
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.core.training.importance import window_errors
+from gsx.core.training.importance import Probe
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
 from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
@@ -91,11 +91,10 @@ class Adaptive:
     def __init__(self, options: AdaptiveOptions, context: BackboneContext, growing: Growing, most: int) -> None:
         self.options, self.growing, self.most = options, growing, most
         self.context = context
-        self.background = context.scene.background.to(context.device)
 
     def begin(self, table: ParameterTable) -> None:
         """Nothing has been added or found yet."""
-        table.statistics["born"] = torch.zeros(len(table), device=next(iter(table.parameters.values())).device)
+        table.statistics["born"] = torch.zeros(len(table), device=table.device)
         table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
         table.record["removed_share"] = torch.zeros((), dtype=torch.float64)
 
@@ -161,16 +160,13 @@ class Adaptive:
     ) -> tuple[float, float]:
         """(dB by which validation windows are better drawn with one table than with another, its standard error)."""
         windows = self.windows(step)
-        views, floor = self.context.views, rounding_in(windows)
-        form, compared = views.raster_for(step), views.match_photo
+        floor, probe = rounding_in(windows), Probe(model=model, views=self.context.views, step=step)
 
-        def look() -> tuple[float, float]:
-            both = (
-                window_errors(model, rows, windows, form, self.background, step, compared) for rows in (table, before)
-            )
+        def measure() -> tuple[float, float]:
+            both = (probe.with_table(rows).window_errors(windows) for rows in (table, before))
             return decibels(*(errors.cpu() + floor for errors in both))
 
-        return self.context.on_rank0(look)
+        return self.context.on_rank0(measure)
 
     def without_idle_levels(self, model: Backbone[Any], step: int) -> dict[str, float]:
         """Remove the finest levels of detail while they gain less than the price; tell what all of them gain.
@@ -218,7 +214,7 @@ class Adaptive:
         found = worth_in_training(model, self.context, step)
         lasting = self.options.discount * found.error_share + found.rounding_share
         least = error_exponent(self.options.price) * lasting
-        idle = (found.shown > 0) & (found.squares < least)
+        idle = (found.views > 0) & (found.squares < least)
         count = min(int(idle.sum()), math.floor(AT_ONCE * len(idle)))
         doomed = torch.zeros_like(idle)
         doomed[torch.where(idle, found.squares, torch.inf).argsort(stable=True)[:count]] = True

@@ -25,6 +25,7 @@ from gsx.backbones.growth import clamp_scales, eligible, fresh_statistics, obser
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
+from gsx.backbones.sky import far_away
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -33,7 +34,7 @@ from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import Rendering, goes_compiled, touches
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
 
@@ -86,7 +87,7 @@ class Anchors:
         sh: tuple[int, int] = (0, 1),
     ) -> None:
         scene, points = context.scene, context.points()
-        self.options, self.representation, self.sh = options, representation, sh
+        self.options, self.representation, self.sh, self.scene = options, representation, sh, scene
         self.network_rates, self.extent, self.views = network_rates, scene.extent, context.views
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]
@@ -231,6 +232,10 @@ class Anchors:
         take_adam_step(self.table)
         if "quats" in self.table.parameters:
             make_identity_where_zero(self.table["quats"])
+
+    def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
+        """Marks splats that stand where a sky does."""
+        return far_away(means, self.scene)
 
     # -- files and logs ----------------------------------------------------------------------------------------
 

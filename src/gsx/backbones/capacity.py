@@ -15,7 +15,7 @@ from gsx.core.data.window import Window
 from gsx.core.ranges import Count, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import CAUTION, Backbone, BackboneContext
-from gsx.core.training.importance import Removal, some_of, worth_of_rows
+from gsx.core.training.importance import Probe, Removal, random_views
 from gsx.core.training.parameter_table import ParameterTable, detached_rows, keep_rows
 from gsx.core.training.schedule import Schedule
 
@@ -176,7 +176,7 @@ class Budget(Cap):
         views, last = len(self.context.scene.train), self.growing.passed(step) == 1
         looks = views if last else min(LOOKS, views)
         found = worth_in_training(model, self.context, step, looks)
-        shown = found.shown > 0  # of what no view asked shows nothing is known: others may show it
+        shown = found.views > 0  # of what no view asked shows nothing is known: others may show it
         count = excess if looks == views else round(excess * float(shown.double().mean()))
         kept = torch.ones_like(shown)
         kept[torch.where(shown, found.squares, torch.inf).argsort(stable=True)[:count]] = False
@@ -203,14 +203,9 @@ def error_exponent(price: float) -> float:
 
 def worth_in_training(model: Backbone[Any], context: BackboneContext, step: int, looks: int = LOOKS) -> Removal:
     """What training views, at most so many of them, lose without each row."""
-    views = some_of(context.views.at(step), looks, context.generator)
-    background, form = context.scene.background.to(context.device), context.views.raster_for(step)
-
-    def look() -> Removal:
-        compared = context.views.match_photo
-        return worth_of_rows(model, views, form, background, step, context.generator, compared).to("cpu")
-
-    return context.on_rank0(look).to(context.device)
+    views = random_views(context.views.at(step), looks, context.generator)
+    probe = Probe(model=model, views=context.views, step=step)
+    return context.on_rank0(lambda: probe.removal(views, context.generator).to("cpu")).to(context.device)
 
 
 def mark_newborn(table: ParameterTable, old: int) -> None:

@@ -9,7 +9,6 @@ constant colour could do. Reduced-3DGS (Papantonakis et al. 2024) takes means fo
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,19 +18,7 @@ from gsx.core.data.scene import View
 from gsx.core.gaussians.bands import BAND_0, harmonics_along
 from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, Drawn
-from gsx.core.training.importance import (
-    Compared,
-    Forming,
-    Look,
-    blending_squares,
-    by_row,
-    difference,
-    draws_of_each,
-    random_signs,
-    render_probe,
-    rounding_of,
-)
+from gsx.core.training.importance import Probe, ProbeRender, draws_per_view, random_signs, rounding_of
 from gsx.core.training.parameter_table import ParameterTable
 
 RIDGE = 1e-3
@@ -50,7 +37,7 @@ class ColourFits:
     """W Y c."""
     norms: Float[Tensor, "N"]
     """W |c|^2."""
-    own: Float[Tensor, "n 3 N"]
+    current: Float[Tensor, "n 3 N"]
     """Coefficients as they are."""
     shown: Float[Tensor, "N"]
     """How many views show the row."""
@@ -58,58 +45,50 @@ class ColourFits:
     """Squared error of the views, with that of the rounding of their photographs."""
 
 
-def colour_fits(
-    model: Backbone[Any],
-    views: Sequence[View],
-    form: Forming,
-    background: Float[Tensor, "3"],
-    step: int,
-    generator: torch.Generator,
-    degree: int,
-    compared: Compared,
-) -> ColourFits:
-    """What views say of the colours of a table with bands, for fits up to a degree."""
-    own = own_coefficients(model.table, degree)
-    count, n = len(model.table), len(own)
-    grams, products = own.new_zeros(n, n, count), own.new_zeros(n, 3, count)
-    norms, shown, error = own.new_zeros(count), own.new_zeros(count), 0.0
+def colour_fits(probe: Probe, views: Sequence[View], generator: torch.Generator, degree: int) -> ColourFits:
+    """Gathers what views say of the colours of a table with bands, for fits up to a degree."""
+    table = probe.model.table
+    current = coefficients_of(table, degree)
+    count, n = len(table), len(current)
+    grams, products = current.new_zeros(n, n, count), current.new_zeros(n, 3, count)
+    norms, shown, error = current.new_zeros(count), current.new_zeros(count), 0.0
     for view in views:
-        drawn, seen = render_probe(model, view.camera, form, background, step)
-        weights = weights_of(seen, view, draws_of_each(views), generator)
-        basis, colours = basis_of(drawn, seen, degree), colours_less_constant(model.table, drawn, seen)
+        render = probe.render(view.camera)
+        weights = weights_of(render, view, draws_per_view(views), generator)
+        basis, colours = basis_of(render, degree), colours_less_constant(table, render)
         weighted = weights * basis
-        grams += by_row(drawn, weighted[:, None] * basis, count)
-        products += by_row(drawn, weighted[:, None] * colours, count)
-        norms += by_row(drawn, weights * colours.square().sum(0), count)
-        shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view, compared).double().square().sum()) + rounding_of(view)
-    return ColourFits(grams=grams, products=products, norms=norms, own=own, shown=shown, error=error)
+        grams += render.by_row(weighted[:, None] * basis)
+        products += render.by_row(weighted[:, None] * colours)
+        norms += render.by_row(weights * colours.square().sum(0))
+        shown += render.visible_rows()
+        error += float(probe.squared_error(render.image, view)) + rounding_of(view)
+    return ColourFits(grams=grams, products=products, norms=norms, current=current, shown=shown, error=error)
 
 
-def own_coefficients(table: ParameterTable, degree: int) -> Float[Tensor, "n 3 N"]:
+def coefficients_of(table: ParameterTable, degree: int) -> Float[Tensor, "n 3 N"]:
     """Coefficients up to a degree less the constant ones, which are zero then."""
     rest = table["sh_rest"].detach()[:, : (degree + 1) ** 2 - 1]
     return torch.cat([torch.zeros_like(table["sh_dc"].detach()), rest], 1).permute(1, 2, 0)
 
 
-def weights_of(seen: Look, view: View, draws: int, generator: torch.Generator) -> Float[Tensor, "M"]:
-    """Squared blending weights of what a camera draws, summed over pixels that count."""
-    signs = (random_signs(seen.image.detach(), generator, view.counted()) for _ in range(draws))
-    return torch.stack([blending_squares(seen, one) for one in signs]).mean(0)
+def weights_of(render: ProbeRender, view: View, draws: int, generator: torch.Generator) -> Float[Tensor, "M"]:
+    """Estimates squared blending weights of each splat, summed over pixels that count."""
+    signs = (random_signs(render.image.detach(), generator, view.counted()) for _ in range(draws))
+    return torch.stack([render.blending_squares(one) for one in signs]).mean(0)
 
 
-def basis_of(drawn: Drawn, seen: Look, degree: int) -> Float[Tensor, "n M"]:
-    """Harmonics towards a camera."""
-    offsets = offsets_from(drawn.splats.means.detach(), seen.camera.centre)
+def basis_of(render: ProbeRender, degree: int) -> Float[Tensor, "n M"]:
+    """Evaluates harmonics of each splat towards the camera."""
+    offsets = offsets_from(render.splats.means.detach(), render.camera.centre)
     constant = torch.full_like(offsets[:, 0], BAND_0)[None]
     return torch.cat([constant, harmonics_along(offsets, degree)]) if degree else constant
 
 
-def colours_less_constant(table: ParameterTable, drawn: Drawn, seen: Look) -> Float[Tensor, "3 M"]:
-    """Colours as a camera sees them less what they are without bands."""
+def colours_less_constant(table: ParameterTable, render: ProbeRender) -> Float[Tensor, "3 M"]:
+    """Subtracts from colours as the camera sees them what they are without bands."""
     constant = table["sh_dc"].detach()[:, 0]
-    constant = constant if drawn.rows is None else constant[drawn.rows]
-    return (seen.colours.detach() - colour_of_constant(constant)).T
+    constant = constant if render.rows is None else constant[render.rows]
+    return (render.colours.detach() - colour_of_constant(constant)).T
 
 
 # -- solutions ---------------------------------------------------------------------------------------------------------
@@ -119,7 +98,7 @@ def fitted(fits: ColourFits, degree: int) -> Float[Tensor, "n 3 N"]:
     """Coefficients of a degree that change the pictures least, less the constant ones as they are."""
     n = (degree + 1) ** 2
     grams, products = fits.grams[:n, :n].permute(2, 0, 1), fits.products[:n].permute(2, 0, 1)
-    own = fits.own[:n].permute(2, 0, 1)
+    own = fits.current[:n].permute(2, 0, 1)
     parts = zip(grams.split(AT_ONCE), products.split(AT_ONCE), own.split(AT_ONCE), strict=True)
     return torch.cat([solved(*part) for part in parts]).permute(1, 2, 0)
 

@@ -26,7 +26,7 @@ class DensityControl:
     ) -> None:
         self.options, self.capacity, self.schedule, self.densification = options, capacity, schedule, how
         self.extent, self.generator = context.scene.extent, context.generator
-        self.context, self.background = context, context.scene.background.to(context.device)
+        self.context = context
         self.growing = growing_of(options, schedule)
         self.white = bool((context.scene.background == 1).all())
 

@@ -20,10 +20,9 @@ from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
-from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, sky_behind
+from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
-from gsx.core.data.sky import far_away
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
@@ -31,9 +30,9 @@ from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
-from gsx.core.training.importance import some_of
+from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
 from gsx.formats.splat_files import columns_of
@@ -220,15 +219,14 @@ class GS3D:
         if not highest:
             return {}
         other = sum(value[0].numel() for name, value in self.table.parameters.items() if not name.startswith("sh_"))
-        views = some_of(context.views.at(step), LOOKS, context.generator)
+        views = random_views(context.views.at(step), LOOKS, context.generator)
 
-        def look() -> Judged:
-            form, background = context.views.raster_for(step), context.scene.background.to(context.device)
-            compared = context.views.match_photo
-            fits = colour_fits(self, views, form, background, step, context.generator, highest - 1, compared)
+        def estimate() -> Judged:
+            probe = Probe(model=self, views=context.views, step=step)
+            fits = colour_fits(probe, views, context.generator, highest - 1)
             return judged(fits, price, numbers_of(highest, other)).to("cpu")
 
-        return lower_degrees(self.table, context.on_rank0(look).to(context.device), step, price)
+        return lower_degrees(self.table, context.on_rank0(estimate).to(context.device), step, price)
 
     def means_rate_steps(self) -> int:
         """Step at which the learning rate of the means has come down."""
@@ -253,6 +251,10 @@ class GS3D:
         self.set_rates(step)
         take_adam_step(self.table)
         make_identity_where_zero(self.table["quats"])
+
+    def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
+        """Marks splats that stand where a sky does."""
+        return far_away(means, self.context.scene)
 
     # -- files and logs ----------------------------------------------------------------------------------------
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from gsx.backbones.capacity_options import CapacityOptions
 from gsx.backbones.mip import MipOptions, checked_filter
+from gsx.backbones.sky import WHEN
 from gsx.core.ranges import Gradient, Interval, Range, Rate, Share, Steps
-from gsx.modules.occasions import WHEN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class GS3DOptions(CapacityOptions):
     sh_price: Annotated[float, Range(1e-6, 100)] = 0.8
     """dB that a doubling of all numbers of the model has to bring."""
     sky: str = "never"
-    """Whether Gaussians far away stand behind the scene (`core.data.sky`); auto: where photographs look past it."""
+    """Whether Gaussians far away stand behind the scene (`backbones.sky`); auto: where photographs look past it."""
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     rates: Rates
     density: Density

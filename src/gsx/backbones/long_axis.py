@@ -13,7 +13,7 @@ from gsx.backbones.sky import not_sky
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.importance import drawn_errors, some_of
+from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
 
 if TYPE_CHECKING:
@@ -87,13 +87,10 @@ class LongAxis:
         """As many as there is room for."""
         table = model.table
         context = control.context
-        views = some_of(context.views.at(step), self.views, control.generator)
-
-        def look() -> Tensor:
-            form, compared = context.views.raster_for(step), context.views.match_photo
-            return drawn_errors(model, views, form, control.background, step, compared).cpu()
-
-        score = context.on_rank0(look).to(context.device) * mean_absolute(table)
+        views = random_views(context.views.at(step), self.views, control.generator)
+        probe = Probe(model=model, views=context.views, step=step)
+        errors = context.on_rank0(lambda: probe.row_errors(views).cpu())
+        score = errors.to(context.device) * mean_absolute(table)
         wanted = (score > 0) & not_sky(table)
         chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
         count = int(chosen.sum())

@@ -70,7 +70,7 @@ def judged(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> Judged:
     squares = torch.stack([squared_change(fits, one) for one in lower] + [torch.zeros_like(fits.norms)])
     share = fits.error / max(1.0, float(fits.shown.sum()))
     degrees = least_degrees(squares / fits.shown.clamp_min(1), fits.shown, share, price, numbers)
-    coefficients = torch.zeros_like(fits.own)
+    coefficients = torch.zeros_like(fits.current)
     for degree, one in enumerate(lower):
         coefficients[: len(one)] += one * (degrees == degree)
     return Judged(degrees=degrees, coefficients=coefficients, highest=highest)

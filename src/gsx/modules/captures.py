@@ -13,7 +13,7 @@ from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.importance import render_probe, shown_weights
+from gsx.core.training.importance import Probe
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -188,14 +188,13 @@ def judge_distractors(run: Run) -> dict[str, float]:
 def showing_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
     """Which primitives are mostly shown where pixels of photographs do not count. What they show was learnt before
     these were found."""
-    model, form, step = run.backbone, run.views.raster_for(run.model_step), run.model_step
-    hidden, shown = run.background.new_zeros(2, len(model.table))
+    probe = Probe(model=run.backbone, views=run.views, step=run.model_step)
+    hidden, shown = run.background.new_zeros(2, len(run.backbone.table))
     for view in views:
         run.refuse_if_stopping()
         small = coarser(view, run.scene.reduction, SMALLER)
-        drawn, seen = render_probe(model, small.camera, form, run.background, step)
-        own, all_over = shown_weights(drawn, seen, small.counted(), len(model.table))
-        hidden, shown = hidden + own, shown + all_over
+        uncounted, total = probe.render(small.camera).blending_weights(small.counted())
+        hidden, shown = hidden + uncounted, shown + total
     return hidden > shown / 2
 
 

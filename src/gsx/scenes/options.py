@@ -46,7 +46,7 @@ class SceneOptions:
     """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
     0.2, least distances, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
-    """Points that are added where training views show none (gsx.core.data.filling); 0: none."""
+    """Points that are added where training views show none (gsx.scenes.filling); 0: none."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )

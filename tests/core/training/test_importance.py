@@ -12,17 +12,11 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.finer_raster import FinerRaster, finer_raster
 from gsx.core.training.importance import (
-    blending_squares,
-    difference,
-    error_sums,
-    look,
+    Probe,
     random_signs,
-    removal_changes,
-    shown_weights,
-    squared_changes,
+    render_with_leaves,
 )
 
 RULES = RasterSettings(evaluation="float64", accumulation="float64", alpha_min=1e-9, transmittance_stop=0, cull="tight")
@@ -41,6 +35,13 @@ class Shot:
 
     def max_zoom(self, camera: Camera) -> float:
         return 1.0
+
+
+class AsRendered:
+    """Training views whose photos show just what is rendered."""
+
+    def match_photo(self, image: Tensor, *_: object) -> Tensor:
+        return image
 
 
 def view_of(width: int, height: int) -> View:
@@ -74,10 +75,10 @@ def without(splats: Splats, row: int) -> Splats:
 def test_errors_are_shared_by_blending_weights() -> None:
     """Against renders in which one splat is white and all else black: these are its weights."""
     splats, view = cloud(5), view_of(12, 9)
-    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
-    off = difference(seen.rendering.image, view, lambda image, photograph, view, window: image)
+    seen = render_with_leaves(splats, plain(view.camera), RULES, BACKGROUND)
+    off = Probe(model=None, views=AsRendered(), step=1).difference(seen.rendering.image, view)
     error = (rasterize(splats, view.camera, RULES, background=BACKGROUND).image - view.image()).square().sum(0)
-    for row, found in enumerate(error_sums(seen, off)):
+    for row, found in enumerate(seen.error_sums(off)):
         white = torch.zeros(5, 3, dtype=torch.float64)
         white[row] = 1
         weights = rasterize(replace(splats, colours=white), view.camera, RULES).image[0]
@@ -90,11 +91,8 @@ def test_weights_are_summed_where_pixels_do_not_count_and_everywhere() -> None:
     splats, camera = cloud(3), view_of(24, 16).camera
     counted = torch.ones(16, 24, dtype=torch.bool)
     counted[3:9, 5:14] = False
-    seen, drawn = (
-        look(splats, plain(camera), RULES, BACKGROUND),
-        DrawnSplats(splats=splats, rows=torch.tensor([0, 1, 1])),
-    )
-    hidden, shown = shown_weights(drawn, seen, counted, 2)
+    seen = render_with_leaves(splats, plain(camera), RULES, BACKGROUND, torch.tensor([0, 1, 1]), 2)
+    hidden, shown = seen.blending_weights(counted)
     weights = []
     for number in range(3):
         painted = replace(splats, colours=torch.zeros_like(splats.colours).index_fill(0, torch.tensor([number]), 1.0))
@@ -102,7 +100,7 @@ def test_weights_are_summed_where_pixels_do_not_count_and_everywhere() -> None:
     by_row = torch.stack([weights[0], weights[1] + weights[2]])
     torch.testing.assert_close(shown, by_row.sum((1, 2)))
     torch.testing.assert_close(hidden, by_row[:, 3:9, 5:14].sum((1, 2)))
-    none, all_over = shown_weights(drawn, seen, None, 2)
+    none, all_over = seen.blending_weights(None)
     assert not none.any()
     torch.testing.assert_close(all_over, shown)
 
@@ -110,9 +108,9 @@ def test_weights_are_summed_where_pixels_do_not_count_and_everywhere() -> None:
 def test_what_the_picture_loses_without_a_splat() -> None:
     """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
     splats, view = cloud(4), view_of(2, 1)
-    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
+    seen = render_with_leaves(splats, plain(view.camera), RULES, BACKGROUND)
     patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
-    found = torch.stack([removal_changes(seen, signs).square() for signs in patterns]).mean(0)
+    found = torch.stack([seen.removal_changes(signs).square() for signs in patterns]).mean(0)
     for row in range(4):
         less = rasterize(without(splats, row), view.camera, RULES, background=BACKGROUND).image
         expected = float((less - seen.rendering.image.detach()).square().sum())
@@ -122,9 +120,9 @@ def test_what_the_picture_loses_without_a_splat() -> None:
 def test_blending_weights_squared() -> None:
     """Against renders in which one splat is white and all else black; two pixels, six values, all 64 signs."""
     splats, view = cloud(4), view_of(2, 1)
-    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
+    seen = render_with_leaves(splats, plain(view.camera), RULES, BACKGROUND)
     patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
-    found = torch.stack([blending_squares(seen, signs) for signs in patterns]).mean(0)
+    found = torch.stack([seen.blending_squares(signs) for signs in patterns]).mean(0)
     for row in range(4):
         white = torch.zeros(4, 3, dtype=torch.float64)
         white[row] = 1
@@ -151,9 +149,9 @@ def test_a_finer_raster_is_judged_as_it_is_reduced() -> None:
     """What goes with a splat, of a picture that is rendered twice as fine and reduced: against two such pictures."""
     splats, view = cloud(4), view_of(2, 1)
     raster = finer_raster(view.camera, Reduction(filter="area"), 2)
-    seen = look(splats, raster, RULES, BACKGROUND)
+    seen = render_with_leaves(splats, raster, RULES, BACKGROUND)
     patterns = [torch.tensor(signs).double().view(3, 1, 2) for signs in itertools.product((1, -1), repeat=6)]
-    found = torch.stack([removal_changes(seen, signs).square() for signs in patterns]).mean(0)
+    found = torch.stack([seen.removal_changes(signs).square() for signs in patterns]).mean(0)
     for row in range(4):
         less = raster.reduced(rasterize(without(splats, row), raster.camera, RULES, background=BACKGROUND).image)
         assert float(found[row]) == pytest.approx(float((less - seen.image.detach()).square().sum()), rel=1e-6)
@@ -163,9 +161,8 @@ def test_a_row_of_several_splats_goes_as_a_whole() -> None:
     """Two splats of one row, seen through each other by little: what both change together, not each by itself."""
     splats, view = cloud(4), view_of(12, 9)
     splats = replace(splats, log_opacities=splats.log_opacities - 4)  # so faint that what lies behind hardly matters
-    drawn = DrawnSplats(splats=splats, rows=torch.tensor([0, 0, 1, 1]))
-    seen = look(splats, plain(view.camera), RULES, BACKGROUND)
-    squares = squared_changes(drawn, seen, None, 2, 512, torch.Generator().manual_seed(2))
+    seen = render_with_leaves(splats, plain(view.camera), RULES, BACKGROUND, torch.tensor([0, 0, 1, 1]), 2)
+    squares = seen.squared_changes(None, 512, torch.Generator().manual_seed(2))
     whole = rasterize(splats, view.camera, RULES, background=BACKGROUND).image
     for row in range(2):
         kept = torch.tensor([0, 0, 1, 1]) != row

@@ -182,6 +182,22 @@ class Validating(Protocol):
 
 
 @runtime_checkable
+class Backdrop(Protocol):
+    """A backbone with splats behind the scene, which have no depth of their own."""
+
+    def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
+        """Marks splats that are too far away for any camera to tell their depth."""
+        ...
+
+
+def behind_scene(backbone: Backbone[Any], means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
+    """Marks splats behind the scene; none where the backbone has no backdrop."""
+    if isinstance(backbone, Backdrop):
+        return backbone.behind_scene(means)
+    return torch.zeros_like(means[:, 0], dtype=torch.bool)
+
+
+@runtime_checkable
 class WithOwnFile(Protocol):
     """A backbone whose published code writes splat files with more in them than standard ones."""
 

@@ -8,7 +8,8 @@ Both come from gradients of one render I of colours c_k by blending weights w_k,
   by that, and by a part linear in the error, which training has brought to nothing in the sum over views.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,145 +23,133 @@ from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.rasterizer.composite import sum_by_splat
-from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, Drawn
+from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.backbone import Backbone
 from gsx.core.training.finer_raster import FinerRaster
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.training_views import TrainingViews
 
 ROUNDING = 1 / (12 * 255**2)
-"""Squared error of a value that is rounded to 8 bits: what lies below it is no evidence."""
-Forming = Callable[[Camera], FinerRaster]
-"""How a camera's picture comes about at a step (`training.supersample`)."""
-Compared = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], View, Window | None], Float[Tensor, "3 H W"]]
-"""(render, photograph, view, window that both are of, None: all of it) -> the render as that photograph would show it
-(`TrainingViews.compared`). Errors are told of these; what a primitive does to a picture, of the render itself."""
+"""Squared error of a value that is rounded to 8 bits."""
+DRAWS = 32
+"""Least number of random sign pictures over all views."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Look:
-    """A render of M splats whose colours and log-opacities are leaves."""
+class ProbeRender:
+    """A render of M splats whose colours and log-opacities are leaves; the splats belong to N rows of a table."""
 
+    splats: Splats
     rendering: Rendering
     image: Float[Tensor, "3 H W"]
     """The picture: the render, reduced where that is finer."""
     colours: Float[Tensor, "M 3"]
     log_opacities: Float[Tensor, "M"]
     camera: Camera
-    """That the splats are drawn for."""
+    """The camera that the splats are drawn for."""
+    rows: Int[Tensor, "M"] | None = None
+    """Row of each splat; None: splat n is row n."""
+    count: int
+    """N."""
 
-    @property
-    def visible(self) -> Float[Tensor, "M"]:
-        """1 for splats that are on screen, 0 for others."""
-        screen, out = self.rendering.screen, torch.zeros_like(self.log_opacities).detach()
-        out[screen.ids[screen.visible]] = 1.0
-        return out
+    def by_row(self, values: Float[Tensor, "*K M"]) -> Float[Tensor, "*K N"]:
+        """Sums values of splats over the splats of each row."""
+        if self.rows is None:
+            return values
+        each = values.reshape(-1, values.shape[-1]).T
+        return sum_by_splat(each, self.rows, self.count).T.reshape(*values.shape[:-1], self.count)
+
+    def visible_rows(self) -> Bool[Tensor, "N"]:
+        """Marks rows of which a splat is on screen."""
+        screen, visible = self.rendering.screen, torch.zeros_like(self.log_opacities).detach()
+        visible[screen.ids[screen.visible]] = 1.0
+        return self.by_row(visible) > 0
+
+    def gradient(self, leaf: Tensor, upstream: Float[Tensor, "3 H W"]) -> Tensor:
+        """Sends an upstream gradient of the picture back to one of the leaves."""
+        return torch.autograd.grad(self.image, [leaf], upstream, retain_graph=True)[0]
+
+    def error_sums(self, difference: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+        """Sums squared differences over pixels by blending weights (Rota Bulo et al. 2024, for maxima over views).
+
+        Over splats they add up to the squared error where splats cover everything.
+        """
+        return self.gradient(self.colours, difference.square().sum(0, keepdim=True).expand(3, -1, -1) / 3).sum(1)
+
+    def removal_changes(self, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+        """Estimates the change of the picture without each splat, summed over its values with random signs.
+
+        The mean square, of one or of a sum of several, is the squared change of the picture without these splats.
+        Alphas at their upper bound count as if there were none.
+        """
+        return self.gradient(self.log_opacities, signs)
+
+    def blending_squares(self, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
+        """Estimates the sum over pixels of each splat's squared blending weights, as the mean over random signs."""
+        return self.gradient(self.colours, signs).square().mean(1)
+
+    def squared_changes(
+        self, counted: Bool[Tensor, "H W"] | None, draws: int, generator: torch.Generator
+    ) -> Float[Tensor, "N"]:
+        """Estimates the squared change of the picture without each row, in the mean over random signs."""
+        total = self.log_opacities.new_zeros(self.count).detach()
+        for _ in range(draws):
+            signs = random_signs(self.image.detach(), generator, counted)
+            total += self.by_row(self.removal_changes(signs)).square() / draws
+        return total
+
+    def blending_weights(self, counted: Bool[Tensor, "H W"] | None) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """Sums blending weights of each row over (pixels that do not count, all pixels)."""
+        hidden = torch.zeros_like(self.image[0]) if counted is None else (~counted).to(self.image)
+        upstream = torch.stack([hidden, torch.ones_like(hidden), torch.zeros_like(hidden)])
+        uncounted, total = self.by_row(self.gradient(self.colours, upstream)[:, :2].T)
+        return uncounted, total
 
 
-def look(splats: Splats, raster: FinerRaster, rules: RasterSettings, background: Float[Tensor, "3"]) -> Look:
-    """Render splats for a camera, as it is rendered at that step."""
+def render_with_leaves(
+    splats: Splats,
+    raster: FinerRaster,
+    rules: RasterSettings,
+    background: Float[Tensor, "3"],
+    rows: Int[Tensor, "M"] | None = None,
+    count: int | None = None,
+) -> ProbeRender:
+    """Renders splats, of `count` rows of a table, for a camera; without `rows` splat n is row n."""
     values = {name: value.detach().requires_grad_() for name, value in vars(splats).items()}  # compiled as in training
-    colours, log_opacities = values["colours"], values["log_opacities"]
     rendering = rasterize(replace(splats, **values), raster.camera, rules, background=background)
-    image = raster.reduced(rendering.image)
-    leaves = {"colours": colours, "log_opacities": log_opacities}
-    return Look(rendering=rendering, image=image, camera=raster.drawn_for, **leaves)
-
-
-def difference(
-    image: Float[Tensor, "3 H W"], view: View, compared: Compared, window: Window | None = None
-) -> Float[Tensor, "3 H W"]:
-    """A render of all of a view or of a window, as the photograph would show it, less that photograph; 0 where that
-    does not count."""
-    part, counted = window or Window(0, 0, *view.camera.size), view.counted()
-    photograph = part.cut(view.image()).to(image)
-    off = compared(image.detach(), photograph, view, window) - photograph
-    return blacked(off, None if counted is None else counted[part.pixels])
-
-
-def rounding_of(view: View, window: Window | None = None) -> float:
-    """Squared error of a photograph's rounding to 8 bits, summed over the values that count, of all or of a window."""
-    part, counted = window or Window(0, 0, *view.camera.size), view.counted()
-    return 3 * ROUNDING * (part.width * part.height if counted is None else int(counted[part.pixels].sum()))
-
-
-def error_sums(seen: Look, off: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
-    """Sum over pixels of blending weight times squared difference, summed over channels: they add up to the squared
-    error where splats cover everything (Rota Bulo et al. 2024, for maxima over views)."""
-    upstream = off.square().sum(0, keepdim=True).expand(3, -1, -1) / 3
-    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], upstream, retain_graph=True)
-    return gradient.sum(1)
+    return ProbeRender(
+        splats=splats,
+        rendering=rendering,
+        image=raster.reduced(rendering.image),
+        colours=values["colours"],
+        log_opacities=values["log_opacities"],
+        camera=raster.drawn_for,
+        rows=rows,
+        count=len(splats) if count is None else count,
+    )
 
 
 def random_signs(
     image: Float[Tensor, "3 H W"], generator: torch.Generator, counted: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "3 H W"]:
-    """1 or -1 for each value of a picture; 0 where it does not count."""
+    """Draws 1 or -1 for each value of a picture; 0 where it does not count."""
     return blacked(torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1, counted)
 
 
-def removal_changes(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
-    """By how much the picture changes without each of the splats, summed over its values with random signs. The mean of
-    the square, of one or of a sum of several, is the sum over values of the squared change without these splats.
-
-    Alphas at their upper bound count as if there were none.
-    """
-    (change,) = torch.autograd.grad(seen.image, [seen.log_opacities], signs, retain_graph=True)
-    return change
+def draws_per_view(views: Sequence[View]) -> int:
+    """Returns how often signs are drawn for each of the views."""
+    return max(1, DRAWS // len(views))
 
 
-def blending_squares(seen: Look, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
-    """The square of each splat's blending weights summed over pixels with random signs, in the mean over channels. Its
-    mean is the sum over pixels of the squared weights."""
-    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], signs, retain_graph=True)
-    return gradient.square().mean(1)
+def random_views(views: Sequence[View], count: int, generator: torch.Generator) -> list[View]:
+    """Picks at most `count` of the views at random."""
+    return [views[index] for index in torch.randperm(len(views), generator=generator)[:count].tolist()]
 
 
-# -- by row of a model's table -----------------------------------------------------------------------------------------
-
-
-def by_row(drawn: Drawn, values: Float[Tensor, "*K M"], count: int) -> Float[Tensor, "*K N"]:
-    """Sums of what was found of the splats of each of so many rows."""
-    if drawn.rows is None:
-        return values
-    each = values.reshape(-1, values.shape[-1]).T
-    return sum_by_splat(each, drawn.rows, count).T.reshape(*values.shape[:-1], count)
-
-
-def render_probe(
-    model: Backbone[Any], camera: Camera, form: Forming, background: Float[Tensor, "3"], step: int
-) -> tuple[Drawn, Look]:
-    """(what the model draws for a camera, its render)."""
-    raster = form(camera)
-    with torch.no_grad():
-        drawn = model.draw(raster.drawn_for, step)
-    return drawn, look(drawn.splats, raster, model.raster, background)
-
-
-def drawn_errors(
-    model: Backbone[Any],
-    views: Sequence[View],
-    form: Forming,
-    background: Float[Tensor, "3"],
-    step: int,
-    compared: Compared,
-) -> Float[Tensor, "N"]:
-    """Of each row the squared error that it draws in the views, by blending weights."""
-    sums = background.new_zeros(len(model.table))
-    for view in views:
-        drawn, seen = render_probe(model, view.camera, form, background, step)
-        sums += by_row(drawn, error_sums(seen, difference(seen.image, view, compared)), len(sums))
-    return sums
-
-
-def shown_weights(
-    drawn: Drawn, seen: Look, counted: Bool[Tensor, "H W"] | None, count: int
-) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-    """Blending weights of each row summed over pixels of a picture: (those that do not count, all)."""
-    hidden = torch.zeros_like(seen.image[0]) if counted is None else (~counted).to(seen.image)
-    upstream = torch.stack([hidden, torch.ones_like(hidden), torch.zeros_like(hidden)])
-    (gradient,) = torch.autograd.grad(seen.image, [seen.colours], upstream, retain_graph=True)
-    own, all_over = by_row(drawn, gradient[:, :2].T, count)
-    return own, all_over
+def rounding_of(view: View, window: Window | None = None) -> float:
+    """Squared error of a photo's rounding to 8 bits, summed over the values that count, of all or of a window."""
+    part, counted = window or Window(0, 0, *view.camera.size), view.counted()
+    return 3 * ROUNDING * (part.width * part.height if counted is None else int(counted[part.pixels].sum()))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -169,103 +158,98 @@ class Removal:
 
     squares: Float[Tensor, "N"]
     """Squared changes of the picture without them, in the mean over the views that show the row; 0 where none does."""
-    shown: Float[Tensor, "N"]
-    """How many views show it."""
+    views: Float[Tensor, "N"]
+    """Number of views that show each row."""
     error_share: float
     """Squared error of the views over the rows that they show, summed over views."""
     rounding_share: float
-    """The like of photographs' own rounding: what no model can do better than."""
+    """The same of the rounding of the photos: no model can do better."""
 
     def to(self, device: torch.device | str) -> "Removal":
-        """On a device."""
-        return replace(self, squares=self.squares.to(device), shown=self.shown.to(device))
+        """Moves it to a device."""
+        return replace(self, squares=self.squares.to(device), views=self.views.to(device))
 
 
-DRAWS = 32
-"""Of random signs, at least, over all views."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Probe:
+    """Renders a model of training views as a step does, and compares the renders with the photos."""
 
+    model: Backbone[Any]
+    views: TrainingViews
+    step: int
+    """Step whose rules the model is drawn by."""
+    raster_step: int = 0
+    """Step whose rules pictures are rendered by; 0: `step`."""
 
-def draws_of_each(views: Sequence[View]) -> int:
-    """How often signs are drawn for each of the views."""
-    return max(1, DRAWS // len(views))
+    @property
+    def background(self) -> Float[Tensor, "3"]:
+        """The scene's background on the model's device."""
+        return self.views.scene.background.to(self.model.table.device)
 
+    def with_table(self, table: ParameterTable) -> "Probe":
+        """Returns a probe of the same model with another table; the model itself stays as it is."""
+        model = copy.copy(self.model)
+        model.table = table
+        return replace(self, model=model)
 
-def worth_of_rows(
-    model: Backbone[Any],
-    views: Sequence[View],
-    form: Forming,
-    background: Float[Tensor, "3"],
-    step: int,
-    generator: torch.Generator,
-    compared: Compared,
-) -> Removal:
-    """What the pictures of the views lose without each row."""
-    count, draws = len(model.table), draws_of_each(views)
-    squares, shown, error, rounding = background.new_zeros(count), background.new_zeros(count), 0.0, 0.0
-    for view in views:
-        drawn, seen = render_probe(model, view.camera, form, background, step)
-        squares += squared_changes(drawn, seen, view.counted(), count, draws, generator)
-        shown += by_row(drawn, seen.visible, count) > 0
-        error += float(difference(seen.image, view, compared).double().square().sum())
-        rounding += rounding_of(view)
-    all_shown = max(1.0, float(shown.sum()))
-    shares = {"error_share": error / all_shown, "rounding_share": rounding / all_shown}
-    return Removal(squares=squares / shown.clamp_min(1), shown=shown, **shares)
+    def raster(self, camera: Camera) -> FinerRaster:
+        """Returns the raster that a camera's picture is rendered on."""
+        return self.views.raster_for(self.raster_step or self.step)(camera)
 
+    def render(self, camera: Camera) -> ProbeRender:
+        """Renders what the model draws for a camera."""
+        raster, model = self.raster(camera), self.model
+        with torch.no_grad():
+            drawn = model.draw(raster.drawn_for, self.step)
+        return render_with_leaves(drawn.splats, raster, model.raster, self.background, drawn.rows, len(model.table))
 
-def squared_changes(
-    drawn: Drawn,
-    seen: Look,
-    counted: Bool[Tensor, "H W"] | None,
-    count: int,
-    draws: int,
-    generator: torch.Generator,
-) -> Float[Tensor, "N"]:
-    """Squared change of a picture without each row, in the mean over draws of signs."""
-    total = seen.log_opacities.new_zeros(count).detach()
-    for _ in range(draws):
-        signs = random_signs(seen.image.detach(), generator, counted)
-        total += by_row(drawn, removal_changes(seen, signs), count).square() / draws
-    return total
+    def difference(
+        self, image: Float[Tensor, "3 H W"], view: View, window: Window | None = None
+    ) -> Float[Tensor, "3 H W"]:
+        """Subtracts a photo, or a window of it, from a render as the photo would show it; 0 where it does not count."""
+        part, counted = window or Window(0, 0, *view.camera.size), view.counted()
+        photo = part.cut(view.image()).to(image)
+        return blacked(
+            self.views.match_photo(image.detach(), photo, view, window) - photo,
+            None if counted is None else counted[part.pixels],
+        )
 
+    def squared_error(
+        self, image: Float[Tensor, "3 H W"], view: View, window: Window | None = None
+    ) -> Float[Tensor, ""]:
+        """Sums the squared difference of a render and a photo, float64."""
+        return self.difference(image, view, window).double().square().sum()
 
-def some_of(views: Sequence[View], count: int, generator: torch.Generator) -> list[View]:
-    """At most so many of the views, at random."""
-    return [views[index] for index in torch.randperm(len(views), generator=generator)[:count].tolist()]
+    def row_errors(self, views: Sequence[View]) -> Float[Tensor, "N"]:
+        """Sums the squared error that each row draws in the views, by blending weights."""
+        sums = self.background.new_zeros(len(self.model.table))
+        for view in views:
+            render = self.render(view.camera)
+            sums += render.by_row(render.error_sums(self.difference(render.image, view)))
+        return sums
 
+    def removal(self, views: Sequence[View], generator: torch.Generator) -> Removal:
+        """Estimates what the pictures of the views lose without each row."""
+        squares, shown = self.background.new_zeros(2, len(self.model.table))
+        error = rounding = 0.0
+        for view in views:
+            render = self.render(view.camera)
+            squares += render.squared_changes(view.counted(), draws_per_view(views), generator)
+            shown += render.visible_rows()
+            error += float(self.squared_error(render.image, view))
+            rounding += rounding_of(view)
+        total = max(1.0, float(shown.sum()))
+        shares = {"error_share": error / total, "rounding_share": rounding / total}
+        return Removal(squares=squares / shown.clamp_min(1), views=shown, **shares)
 
-@torch.no_grad()
-def window_errors(
-    model: Backbone[Any],
-    table: ParameterTable,
-    windows: Mapping[View, Window],
-    form: Forming,
-    background: Float[Tensor, "3"],
-    step: int,
-    compared: Compared,
-) -> Float[Tensor, "W"]:
-    """Squared error in windows of views, each summed over its values, of the model as it would be with that table."""
-    own, model.table = model.table, table
-    try:
-        errors = [
-            window_error(model, view, window, form, background, step, compared) for view, window in windows.items()
-        ]
-    finally:
-        model.table = own
-    return torch.stack(errors)
+    @torch.no_grad()
+    def window_errors(self, windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
+        """Sums the squared error in each window of a view."""
+        return torch.stack([self.window_error(view, window) for view, window in windows.items()])
 
-
-def window_error(
-    model: Backbone[Any],
-    view: View,
-    window: Window,
-    form: Forming,
-    background: Float[Tensor, "3"],
-    step: int,
-    compared: Compared,
-) -> Float[Tensor, ""]:
-    """Squared error in a window of a view."""
-    splats = model.draw(form(view.camera).drawn_for, step).splats
-    raster = form(window.of(view.camera))
-    image = raster.reduced(rasterize(splats, raster.camera, model.raster, background=background).image)
-    return difference(image, view, compared, window).double().square().sum()
+    def window_error(self, view: View, window: Window) -> Float[Tensor, ""]:
+        """Sums the squared error in a window of a view."""
+        splats = self.model.draw(self.raster(view.camera).drawn_for, self.step).splats
+        raster = self.raster(window.of(view.camera))
+        rendering = rasterize(splats, raster.camera, self.model.raster, background=self.background)
+        return self.squared_error(raster.reduced(rendering.image), view, window)

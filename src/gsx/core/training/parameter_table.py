@@ -92,6 +92,11 @@ class ParameterTable:
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))
 
+    @property
+    def device(self) -> torch.device:
+        """The device of all tensors."""
+        return next(iter(self.parameters.values())).device
+
     def __getitem__(self, name: str) -> Tensor:
         return ChainMap[str, Tensor](self.parameters, self.columns, self.statistics)[name]  # type: ignore[arg-type]
 
@@ -275,7 +280,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     if "sh_dc" in like.parameters and "parameters.sh_dc" not in tensors:  # as it was called once
         tensors = {name.replace(".sh_constant", ".sh_dc"): value for name, value in tensors.items()}
     found = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
-    device = next(iter(like.parameters.values())).device
+    device = like.device
     rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
     written = {name[len(RECORD) :]: value.to(device) for name, value in tensors.items() if name.startswith(RECORD)}

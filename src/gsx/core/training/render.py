@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.sky import far_away
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, TiledRendering, rasterize_tiled
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.backbone import behind_scene
 from gsx.core.training.finer_raster import finer_raster, times_as_fine
 from gsx.core.training.run import Run
 
@@ -43,13 +43,13 @@ def render(
 
     Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
     `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
-    `depth`: with that, as finely as it was rendered; where something stands behind the scene (`core.data.sky`), depth
+    `depth`: with that, as finely as it was rendered; where something stands behind the scene (`Backdrop`), depth
     and alpha are those of the scene alone: what shines through a wall does not move it away.
     """
     times = supersample or times_as_fine(camera, run.scene.train, run.views.supersample_at(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
-    far = far_away(drawn.means, run.scene) if depth else None
+    far = behind_scene(run.backbone, drawn.means) if depth else None
     if far is not None and bool(far.any()):
         tiled = with_depth_of_scene(drawn, far, raster.camera, run, pixels)
     else:

@@ -20,7 +20,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
-from gsx.core.training.importance import window_errors
+from gsx.core.training.importance import Probe
 from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import shared_colour, zero_grad
 from gsx.core.training.photographs import numbers_of
@@ -96,12 +96,8 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
     """Squared error in each validation window by the rules of a step, the same on all ranks."""
     if not windows:
         return torch.zeros(0, dtype=torch.float64)
-    model, form, compared = run.backbone, run.views.raster_for(step), run.views.match_photo
-
-    def look() -> Tensor:
-        return window_errors(model, model.table, windows, form, run.background, run.model_step, compared).cpu()
-
-    return run.ranks.broadcast(look)
+    probe = Probe(model=run.backbone, views=run.views, step=run.model_step, raster_step=step)
+    return run.ranks.broadcast(lambda: probe.window_errors(windows).cpu())
 
 
 def veto(run: Run, step: StepResult, plugins: Plugins) -> str:

@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from statistics import fmean
 
 import torch
@@ -30,9 +29,8 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.finer_raster import raster_at
 from gsx.core.training.guard import Guard
-from gsx.core.training.importance import ROUNDING, Forming, draws_of_each, render_probe, squared_changes
+from gsx.core.training.importance import ROUNDING, Probe, draws_per_view
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
@@ -142,18 +140,17 @@ def pictures_of(view: View) -> list[tuple[Camera, Bool[Tensor, "H W"] | None]]:
     return [(view.camera, counted), (closer, finer[window.pixels])]
 
 
-def forming(run: Run) -> Forming:
-    """How the run's pictures come about."""
-    return partial(raster_at, scene=run.scene, supersample=run.views.supersample_at(run.model_step))
+def probe_of(run: Run) -> Probe:
+    """Returns a probe of the run's model as it stands."""
+    return Probe(model=run.backbone, views=run.views, step=run.model_step)
 
 
 def worth_of(run: Run, views: Sequence[View], generator: torch.Generator) -> Float[Tensor, "N"]:
     """What pictures lose without each row: squared changes of values, summed over views and windows."""
-    worth, form = torch.zeros(len(run.backbone.table), device=run.device), forming(run)
+    worth, probe = torch.zeros(len(run.backbone.table), device=run.device), probe_of(run)
     for view in views:
         for camera, counted in pictures_of(view):
-            drawn, seen = render_probe(run.backbone, camera, form, run.background, run.model_step)
-            worth += squared_changes(drawn, seen, counted, len(worth), draws_of_each(views), generator)
+            worth += probe.render(camera).squared_changes(counted, draws_per_view(views), generator)
     return worth
 
 
@@ -169,11 +166,10 @@ def colours_of_lower_degrees(
     run: Run, views: Sequence[View], generator: torch.Generator
 ) -> list[Float[Tensor, "n 3 N"]]:
     """For each degree below the model's own the coefficients that change the pictures of views least."""
-    highest, (model, step) = degree_of_run(run), (run.backbone, run.model_step)
+    highest = degree_of_run(run)
     if highest < 1:
         return []
-    compared = run.views.match_photo
-    fits = colour_fits(model, views, forming(run), run.background, step, generator, highest - 1, compared)
+    fits = colour_fits(probe_of(run), views, generator, highest - 1)
     return [fitted(fits, degree) for degree in range(highest)]
 
 

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.data.sky import far_away
 from gsx.core.rasterizer import rasterize_tiled
 from gsx.core.shapes import Float
+from gsx.core.training.backbone import behind_scene
 from gsx.core.training.render import coverage_and_depth, render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import Pictures, colour_ramp
@@ -40,7 +40,7 @@ def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Ten
     """(blending-weighted sum of camera z, coverage) of all but what stands behind the scene: drawn in place of colours,
     for which loops are compiled already."""
     splats = splats_for(run, camera)
-    both = coverage_and_depth(splats, far_away(splats.means, run.scene), camera)
+    both = coverage_and_depth(splats, behind_scene(run.backbone, splats.means), camera)
     shown = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
     coverage, summed, _ = rasterize_tiled(shown, camera, run.raster, pixels=pixels).image
     return summed, coverage

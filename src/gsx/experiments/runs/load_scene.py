@@ -7,7 +7,6 @@ from typing import Any
 import torch
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.filling import filled
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home, file_count
@@ -18,6 +17,7 @@ from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
+from gsx.scenes.filling import filled
 from gsx.scenes.origin import around_origin, origin_of
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsx.core.data import filling
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.filling import filled, gaps_of, in_front, in_view
 from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.scenes import filling
+from gsx.scenes.filling import filled, gaps_of, in_front, in_view
 
 EYES = [(x, -6.0, z) for x in (-1.0, 0.0, 1.0) for z in (-0.5, 0.5)]
 

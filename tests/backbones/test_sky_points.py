@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsx.backbones.sky import DISTANCE, directions, none_above, sky_of
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
-from gsx.core.data.sky import DISTANCE, directions, none_above, sky_of
 
 LOWEST = 0.1
 """Sine of the elevation above which nothing of the scene is seen."""
