@@ -27,7 +27,6 @@ from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.importance import Probe, Removal
-from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
@@ -327,7 +326,7 @@ def test_the_rate_follows_the_gain(had: float, price: float, rate: float, monkey
     judge = Adaptive(AdaptiveOptions(price=price, discount=1 / 3, rate=0.1), small_context(scene), PUBLISHED, 0)
     half = small_gs3d(small_scene(spread(25)), options=options_of("adaptive")).table
     errors = {50: torch.full((4,), 1e9).double(), 25: torch.full((4,), had * 1e9).double()}
-    monkeypatch.setattr("gsx.backbones.adaptive.window_errors", lambda model, table, *more: errors[len(table)])
+    monkeypatch.setattr(Probe, "window_errors", lambda probe, windows: errors[len(probe.model.table)])
     found = judge.judge(model, lambda table: half, 700)
     assert judge.rate(model.table) == pytest.approx(rate, rel=1e-5)
     assert found["gain"] == pytest.approx(10 * math.log10(had) / 3, abs=1e-5)
@@ -468,11 +467,11 @@ def test_finest_levels_that_gain_too_little_are_removed(
     model.table.columns["level"] = torch.tensor([0] * 8 + [1] * 16 + [2] * 16, dtype=torch.int16)
     factors = {0: coarse, 1: middle, 2: fine}
 
-    def errors(model: GS3D, table: ParameterTable, *more: object) -> Tensor:
-        missing = [factors[level] for level in factors if not bool((table["level"] == level).any())]
+    def errors(probe: Probe, windows: object) -> Tensor:
+        missing = [factors[level] for level in factors if not bool((probe.model.table["level"] == level).any())]
         return torch.full((4,), 1e9 * math.prod(missing)).double()
 
-    monkeypatch.setattr("gsx.backbones.adaptive.window_errors", errors)
+    monkeypatch.setattr(Probe, "window_errors", errors)
     judge = Adaptive(AdaptiveOptions(price=0.1, discount=1 / 3), small_context(scene), PUBLISHED, 0)
     found = judge.without_idle_levels(model, 700)
     assert model.table["level"].unique().tolist() == left

@@ -14,7 +14,6 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.finer_raster import FinerRaster, finer_raster
 from gsx.core.training.importance import (
-    Probe,
     random_signs,
     render_with_leaves,
 )
@@ -35,13 +34,6 @@ class Shot:
 
     def max_zoom(self, camera: Camera) -> float:
         return 1.0
-
-
-class AsRendered:
-    """Training views whose photos show just what is rendered."""
-
-    def match_photo(self, image: Tensor, *_: object) -> Tensor:
-        return image
 
 
 def view_of(width: int, height: int) -> View:
@@ -76,7 +68,7 @@ def test_errors_are_shared_by_blending_weights() -> None:
     """Against renders in which one splat is white and all else black: these are its weights."""
     splats, view = cloud(5), view_of(12, 9)
     seen = render_with_leaves(splats, plain(view.camera), RULES, BACKGROUND)
-    off = Probe(model=None, views=AsRendered(), step=1).difference(seen.rendering.image, view)
+    off = seen.image.detach() - view.image()
     error = (rasterize(splats, view.camera, RULES, background=BACKGROUND).image - view.image()).square().sum(0)
     for row, found in enumerate(seen.error_sums(off)):
         white = torch.zeros(5, 3, dtype=torch.float64)
